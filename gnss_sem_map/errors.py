@@ -1,0 +1,13 @@
+"""Errors of the map: what is wrong, where, what was found and expected, and what to do, in one line."""
+
+
+class SemMapError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class ConfigError(SemMapError, ValueError):
+    """A setting that is unknown, out of range or contradicts another."""
+
+
+class DataError(SemMapError, ValueError):
+    """A drive, a map or a label file that is not what it must be."""

@@ -1,0 +1,156 @@
+"""One drive: what every sensor reported, each measurement with its own stamp.
+
+Scans and images are read when they are needed; everything else is small and in memory. Measurements are joined by
+stamp, or by the frame number in the file name, never by their position in a list.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The returns of one sweep, in the lidar frame."""
+
+    xyz: NDArray[np.float32]
+    """(n, 3) m."""
+    intensity: NDArray[np.float32]
+    """(n,) in 0..1."""
+    stamps: NDArray[np.float64] | None
+    """(n,) s, when each point was measured; None: the file is already motion-compensated to the scan's stamp."""
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        if self.xyz.shape != (n, 3) or self.intensity.shape != (n,):
+            raise DataError(f"points: found shapes {self.xyz.shape} and {self.intensity.shape}, expected (n, 3) and (n,)")
+        if self.stamps is not None and self.stamps.shape != (n,):
+            raise DataError(f"points: found {self.stamps.shape} stamps for {n} points, expected one each")
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One LiDAR sweep: its number, its stamp, and how to read it."""
+
+    number: int
+    """Frame number, from the file name."""
+    stamp: float
+    """s since the log's epoch; mid sweep."""
+    read: Callable[[], Points] = field(repr=False)
+    """Raises DataError when the file is damaged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One camera image: its number, its stamp, and how to read it."""
+
+    number: int
+    """Frame number, from the file name."""
+    stamp: float
+    """s since the log's epoch, as the camera reports it (see `Calibration.camera_time_offset_s`)."""
+    read: Callable[[], NDArray[np.uint8]] = field(repr=False)
+    """The RGB pixels, (h, w, 3); raises DataError when the file is damaged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where the sensors sit, and how the camera sees."""
+
+    T_imu_lidar: NDArray[np.float64]
+    """(4, 4)."""
+    T_camera_lidar: NDArray[np.float64] | None = None
+    """(4, 4); the camera looks along z, x right, y down. None: no camera."""
+    K: NDArray[np.float64] | None = None
+    """(3, 3) intrinsics of the rectified camera, px."""
+    image_size: tuple[int, int] | None = None
+    """(width, height), px."""
+    p_imu_antenna: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """(3,) m: the GNSS antenna in the imu frame."""
+    camera_time_offset_s: float = 0.0
+    """Moment of exposure minus image stamp."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("T_imu_lidar", self.T_imu_lidar), ("T_camera_lidar", self.T_camera_lidar)):
+            if value is not None and not is_rigid(value):
+                raise DataError(
+                    f"calibration: {name} is no rigid transform (found shape {np.shape(value)},"
+                    " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
+                )
+        if self.K is not None and (self.K.shape != (3, 3) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0):
+            raise DataError(f"calibration: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths")
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether points can be projected into an image."""
+        return self.T_camera_lidar is not None and self.K is not None and self.image_size is not None
+
+
+def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
+    """Whether a matrix is a 4 x 4 rigid transform: finite, orthonormal rotation of determinant +1."""
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], (0, 0, 0, 1)):
+        return False
+    R = T[:3, :3]
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
+
+
+@dataclass(frozen=True)
+class Skip:
+    """Something that was expected, is not there or not usable, and was left out."""
+
+    what: str
+    where: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class SensorLog:
+    """A drive: every measurement with its stamp, and the calibration that joins the sensors."""
+
+    name: str
+    epoch_ns: int
+    """Unix time of stamp zero."""
+    calibration: Calibration
+    scans: tuple[Scan, ...]
+    """Sorted by stamp."""
+    images: tuple[Image, ...]
+    """Sorted by stamp; empty for a drive without a camera."""
+    frame: LocalFrame | None = None
+    """Origin of the map; None when the drive has no georeference."""
+    imu: ImuSamples | None = None
+    gnss: GnssFixes | None = None
+    given: Trajectory | None = None
+    """Poses that came with the drive; where they are there, nothing is smoothed."""
+    reference: Trajectory | None = None
+    """What the drive's own navigation system says, to compare with; never used as input."""
+    skips: tuple[Skip, ...] = ()
+
+    def __post_init__(self) -> None:
+        for what, items in (("scans", self.scans), ("images", self.images)):
+            stamps = [item.stamp for item in items]
+            if any(b <= a for a, b in zip(stamps, stamps[1:], strict=False)):
+                raise DataError(f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first")
+        if self.given is None and (self.imu is None or self.gnss is None):
+            raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
+
+    @cached_property
+    def _image_stamps(self) -> list[float]:
+        return [image.stamp for image in self.images]
+
+    def image_at(self, stamp: float, within_s: float) -> Image | None:
+        """The image nearest in time to `stamp`, or None when none is within `within_s` seconds."""
+        stamps = self._image_stamps
+        after = bisect.bisect_left(stamps, stamp)
+        near = [self.images[i] for i in (after - 1, after) if 0 <= i < len(stamps)]
+        best = min(near, key=lambda image: abs(image.stamp - stamp), default=None)
+        return best if best is not None and abs(best.stamp - stamp) <= within_s else None

@@ -1,0 +1,271 @@
+"""The map: a set of voxels with class evidence, in which Bayes' rule (eq. 6) is addition.
+
+Evidence is kept as integer sums of log-likelihoods, so adding is exact: any order of scans, any chunking and any
+merge give the same map, bit for bit. `VoxelTable` collects, `VoxelMap` is the value that comes out, and
+`SemanticMap` is a map with a decision for every voxel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map import voxel_kernels
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels import UNLABELLED, LabelSet
+from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, FIRST_SUM, UNITS_PER_NAT
+
+SMALLEST_TABLE_BITS = 18
+HIGHEST_LOAD = 0.7
+
+
+class MappingSettings(BaseModel):
+    """How points become voxels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
+    nearest_m: float = Field(1.0, ge=0, description="Returns nearer to the LiDAR than this are left out (the car itself).")
+    farthest_m: float = Field(120.0, gt=0, description="Returns farther from the LiDAR than this are left out.")
+
+
+class State(IntEnum):
+    """Where the label of a voxel comes from."""
+
+    UNOBSERVED = 0
+    """No camera saw it: no label."""
+    OBSERVED = 1
+    """The label is what the fused images say."""
+    INFERRED = 2
+    """No camera saw it; its label comes from its surroundings."""
+    REFINED = 3
+    """Refinement changed the label that the images gave."""
+    REMOVED = 4
+    """Part of a moving vehicle: kept as a layer, not shown in the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelMap:
+    """Voxels with their evidence; `a + b` merges, `a[mask]` selects."""
+
+    voxel_size_m: float
+    label_set: LabelSet
+    keys: NDArray[np.int64]
+    """(v,) packed indices, sorted, unique."""
+    evidence: NDArray[np.int32]
+    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no camera saw the voxel."""
+    hits: NDArray[np.uint32]
+    """(v,) LiDAR points that fell into the voxel."""
+
+    def __post_init__(self) -> None:
+        v, c = len(self.keys), len(self.label_set.names)
+        if self.evidence.shape != (v, c) or self.hits.shape != (v,):
+            raise DataError(
+                f"voxel map: found {v} keys, evidence {self.evidence.shape}, hits {self.hits.shape};"
+                f" expected ({v}, {c}) and ({v},)"
+            )
+        if v > 1 and not (self.keys[1:] > self.keys[:-1]).all():
+            raise DataError("voxel map: keys are not sorted and unique")
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __add__(self, other: VoxelMap) -> VoxelMap:
+        """Both maps' evidence, voxel by voxel; raises DataError for another voxel size or class set."""
+        if self.voxel_size_m != other.voxel_size_m or self.label_set.names != other.label_set.names:
+            raise DataError(
+                f"cannot add a map of {other.voxel_size_m} m voxels and classes {list(other.label_set.names)} to one of"
+                f" {self.voxel_size_m} m and {list(self.label_set.names)}; build both with the same settings"
+            )
+        keys, places = np.unique(np.concatenate([self.keys, other.keys]), return_inverse=True)
+        evidence = np.zeros((len(keys), self.evidence.shape[1]), np.int64)
+        hits = np.zeros(len(keys), np.int64)
+        for part, where in ((self, places[: len(self)]), (other, places[len(self) :])):
+            evidence[where] += part.evidence
+            hits[where] += part.hits
+        if (evidence < -voxel_kernels.EVIDENCE_LIMIT).any() or (hits > np.iinfo(np.uint32).max).any():
+            raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
+        return replace(self, keys=keys, evidence=evidence.astype(np.int32), hits=hits.astype(np.uint32))
+
+    def __getitem__(self, selection: NDArray[np.bool_]) -> VoxelMap:
+        """The voxels where a boolean mask holds."""
+        return replace(
+            self, keys=self.keys[selection], evidence=self.evidence[selection], hits=self.hits[selection]
+        )
+
+    @cached_property
+    def indices(self) -> NDArray[np.int32]:
+        """(v, 3) integer voxel coordinates."""
+        return unpack(self.keys)
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """(v, 3) m, in the map frame."""
+        return (self.indices + 0.5) * self.voxel_size_m
+
+    @cached_property
+    def observed(self) -> NDArray[np.bool_]:
+        """(v,) whether any camera saw the voxel."""
+        return self.evidence.any(axis=1)
+
+    @cached_property
+    def labels(self) -> NDArray[np.int8]:
+        """(v,) most probable class (eq. 7), -1 where no camera saw the voxel."""
+        return np.where(self.observed, self.evidence.argmax(axis=1), UNLABELLED).astype(np.int8)
+
+    @cached_property
+    def probabilities(self) -> NDArray[np.float32]:
+        """(v, c) class probabilities (eq. 6, normalised); even where no camera saw the voxel."""
+        return softmax(self.evidence.astype(np.float32) / UNITS_PER_NAT)
+
+    def places(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Row of each of these keys in the map, or -1."""
+        found = np.empty(len(keys), np.int64)
+        voxel_kernels.find(self.keys, keys, found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class SemanticMap:
+    """A voxel map with a decision for every voxel: its class, how sure, and where that comes from."""
+
+    voxels: VoxelMap
+    labels: NDArray[np.int8]
+    """(v,) class index, -1 unlabelled."""
+    confidence: NDArray[np.float32]
+    """(v,) probability of the label; 0 where unlabelled."""
+    states: NDArray[np.uint8]
+    """(v,) of `State`."""
+
+    def __post_init__(self) -> None:
+        for name, values in (("labels", self.labels), ("confidence", self.confidence), ("states", self.states)):
+            if values.shape != (len(self.voxels),):
+                raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
+
+    @classmethod
+    def of(cls, voxels: VoxelMap) -> SemanticMap:
+        """The map as fusion leaves it, before any refinement."""
+        probability = voxels.probabilities.max(axis=1, initial=0.0)
+        return cls(
+            voxels=voxels,
+            labels=voxels.labels,
+            confidence=np.where(voxels.observed, probability, 0).astype(np.float32),
+            states=np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8),
+        )
+
+    def __len__(self) -> int:
+        return len(self.voxels)
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_]:
+        """(v,) voxels with a label that belong to the map: all but the removed ones."""
+        return (self.labels >= 0) & (self.states != State.REMOVED)
+
+
+class VoxelTable:
+    """Collects scans into voxels: a hash table that grows, and never loses anything."""
+
+    def __init__(self, voxel_size_m: float, label_set: LabelSet, probability_floor: float = 0.05) -> None:
+        """`probability_floor`: no class gets less than this from one look, in whole percent (real_data: 0.05)."""
+        if not voxel_size_m > 0:
+            raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
+        self.voxel_size_m, self.label_set = voxel_size_m, label_set
+        self._floor_percent = round(100 * probability_floor)
+        self._words = (2 + len(label_set.names) + 1 + 1) // 2
+        self._count = 0
+        self._allocate(SMALLEST_TABLE_BITS)
+        self._log_table = log_table(len(label_set.names), self._floor_percent)
+
+    def _allocate(self, bits: int) -> None:
+        self._bits = bits
+        self._rows = np.zeros((1 << bits, self._words), np.int64)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def keys_of(self, p_map: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Voxel key of every point (n, 3); raises DataError for a point that no key can hold."""
+        return keys_of(p_map, self.voxel_size_m)
+
+    def add(
+        self,
+        keys: NDArray[np.int64],
+        pixels: NDArray[np.int32] | None = None,
+        classes: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Add the points of one scan: their voxel keys (n,) and, where a camera saw them, what it saw.
+
+        `pixels` (n,) is the row of `classes` that each point saw, -1 for none; `classes` (p, c + 1) are uint8
+        probabilities, `other` last. Raises DataError when a voxel's evidence would overflow.
+        """
+        if pixels is None or classes is None:
+            pixels = np.full(len(keys), -1, np.int32)
+            classes = np.zeros((1, len(self.label_set.names) + 1), np.uint8)
+        while self._count + len(keys) > HIGHEST_LOAD * len(self._rows):
+            old = self._rows
+            self._allocate(self._bits + 1)
+            voxel_kernels.rehash(old, self._rows, self._bits)
+        count = voxel_kernels.fuse(
+            self._rows, self._rows.view(np.int32), self._bits, self._count,
+            keys, pixels, classes, self._log_table, self._floor_percent,
+        )  # fmt: skip
+        if count < 0:
+            raise DataError("a voxel was seen so often that its evidence overflows; does the vehicle stand for hours?")
+        self._count = count
+
+    def to_map(self) -> VoxelMap:
+        """Everything collected so far, sorted by key."""
+        rows = self._rows[self._rows[:, 0] != 0]
+        rows = rows[np.argsort(rows[:, 0])]
+        ints = rows.view(np.int32)
+        c = len(self.label_set.names)
+        return VoxelMap(
+            voxel_size_m=self.voxel_size_m,
+            label_set=self.label_set,
+            keys=rows[:, 0].copy(),
+            evidence=ints[:, FIRST_SUM : FIRST_SUM + c].copy(),
+            hits=ints[:, FIRST_SUM + c].astype(np.uint32),
+        )
+
+
+def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:
+    """Voxel key of every point (n, 3) m; raises DataError for a point that is NaN or beyond +-2^20 voxels."""
+    keys = np.empty(len(p_map), np.int64)
+    bad = voxel_kernels.pack_keys(p_map, voxel_size_m, keys)
+    if bad >= 0:
+        raise DataError(
+            f"point {bad} of {len(p_map)} at {p_map[bad].tolist()} m is not inside the map, which reaches"
+            f" {AXIS_OFFSET * voxel_size_m / 1000:.0f} km from its origin; check the poses"
+        )
+    return keys
+
+
+def unpack(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Integer voxel coordinates (v, 3) of packed keys."""
+    axes = (keys >> (2 * AXIS_BITS), keys >> AXIS_BITS, keys)
+    return np.stack([(axis & AXIS_MASK) - AXIS_OFFSET for axis in axes], axis=-1).astype(np.int32)
+
+
+def pack(indices: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Packed keys of integer voxel coordinates (v, 3); they sort like (x, y, z)."""
+    x, y, z = (np.asarray(indices, np.int64) + AXIS_OFFSET).T
+    return np.asarray((x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z)
+
+
+def log_table(number_of_classes: int, floor_percent: int) -> NDArray[np.int32]:
+    """round(1024 ln i) for every integer that a floored, normalised uint8 probability can meet."""
+    largest = number_of_classes * max(100 * 255, floor_percent * 255 * number_of_classes)
+    numbers = np.arange(largest + 1, dtype=np.float64)
+    numbers[0] = 1.0
+    return np.rint(UNITS_PER_NAT * np.log(numbers)).astype(np.int32)
+
+
+def softmax(log_scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Probabilities from log scores, row by row."""
+    shifted = np.exp(log_scores - log_scores.max(axis=1, keepdims=True))
+    return np.asarray(shifted / shifted.sum(axis=1, keepdims=True), np.float32)

@@ -1,0 +1,13 @@
+"""What can go wrong in `factor_graphs`: the measurements, or the estimation."""
+
+
+class FactorGraphError(Exception):
+    """Any error that this package raises on purpose."""
+
+
+class MeasurementError(FactorGraphError, ValueError):
+    """The data given cannot be used: shape, order, span or content."""
+
+
+class EstimationError(FactorGraphError, RuntimeError):
+    """The data are usable, but no trustworthy trajectory came out of them."""

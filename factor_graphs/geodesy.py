@@ -1,0 +1,84 @@
+"""The map frame on the Earth: east, north, up at a point of WGS 84, with its gravity and rotation."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import Transformer
+
+from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
+
+# WGS 84 (NIMA TR8350.2): semi-major axis m, flattening, GM m³/s², rotation rad/s
+SEMI_MAJOR_AXIS = 6378137.0
+FLATTENING = 1 / 298.257223563
+GRAVITATIONAL_CONSTANT = 3.986004418e14
+EARTH_RATE = 7.292115e-5
+# Somigliana's formula: normal gravity at the equator m/s², and its growth towards the pole
+EQUATORIAL_GRAVITY = 9.7803253359
+SOMIGLIANA_K = 0.00193185265241
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """The map frame: axes east, north, up, origin at a point of WGS 84 (height above the ellipsoid).
+
+    Raises MeasurementError for a point that is not on Earth.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+    def __post_init__(self) -> None:
+        values = (self.lat_deg, self.lon_deg, self.alt_m)
+        if not np.isfinite(values).all() or abs(self.lat_deg) > 90 or abs(self.lon_deg) > 360:
+            raise MeasurementError(
+                f"LocalFrame at lat {self.lat_deg}°, lon {self.lon_deg}°, alt {self.alt_m} m; "
+                "expected |lat| <= 90, |lon| <= 360, all finite"
+            )
+
+    def to_map(self, lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike) -> Array:
+        """Geodetic coordinates, each (n,), -> points in the map frame (n, 3) m."""
+        lon, lat, alt = np.broadcast_arrays(*(np.asarray(c, np.float64) for c in (lon_deg, lat_deg, alt_m)))
+        return np.stack(_to_map(self).transform(lon, lat, alt), axis=-1)
+
+    def to_geodetic(self, points: ArrayLike) -> tuple[Array, Array, Array]:
+        """Points in the map frame (n, 3) m -> lat_deg, lon_deg, alt_m, each (n,)."""
+        east, north, up = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        lon, lat, alt = _to_map(self).transform(east, north, up, direction="INVERSE")
+        return lat, lon, alt
+
+    @property
+    def gravity(self) -> float:
+        """Normal gravity, m/s², at the origin: Somigliana's formula, second order in height."""
+        sin2 = np.sin(np.radians(self.lat_deg)) ** 2
+        e2 = FLATTENING * (2 - FLATTENING)
+        on_ellipsoid = EQUATORIAL_GRAVITY * (1 + SOMIGLIANA_K * sin2) / np.sqrt(1 - e2 * sin2)
+        a, f = SEMI_MAJOR_AXIS, FLATTENING
+        m = EARTH_RATE**2 * a**3 * (1 - f) / GRAVITATIONAL_CONSTANT
+        h = self.alt_m / a
+        return float(on_ellipsoid * (1 - 2 * (1 + f + m - 2 * f * sin2) * h + 3 * h**2))
+
+    @property
+    def earth_rate(self) -> Array:
+        """Rotation of the Earth, rad/s, in the map frame: (3,)."""
+        lat = np.radians(self.lat_deg)
+        return EARTH_RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
+
+    @property
+    def utm_epsg(self) -> int:
+        """EPSG code of the UTM zone (WGS 84) that the origin's longitude lies in."""
+        zone = int((self.lon_deg + 180) % 360 // 6) + 1
+        return (32600 if self.lat_deg >= 0 else 32700) + zone
+
+
+@lru_cache(maxsize=16)
+def _to_map(frame: LocalFrame) -> Transformer:
+    return Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={frame.lat_deg:.12f} +lon_0={frame.lon_deg:.12f} +h_0={frame.alt_m:.6f}"
+    )

@@ -1,0 +1,192 @@
+"""What the sensors said: IMU samples and GNSS fixes, checked and frozen, and how raw rows become them.
+
+A constructor refuses whatever is wrong. `clean_imu` and `clean_gnss` take rows as a logger wrote them,
+repair what has one obvious repair, and report every row that they dropped.
+"""
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """Specific force and angular rate in the imu frame (x forward, y left, z up), each value at its stamp.
+
+    `stamps` (n,) s, strictly increasing; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s.
+    Raises MeasurementError for another shape, for a value that is not finite, and for stamps out of order.
+    """
+
+    stamps: Array
+    specific_force: Array
+    angular_rate: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "ImuSamples")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
+@dataclass(frozen=True, eq=False)
+class GnssFixes:
+    """Antenna positions in the map frame with the receiver's own standard deviations.
+
+    `stamps` (m,) s, strictly increasing; `positions` (m, 3) m; `stddevs` (m, 3) m, positive. No fix at all
+    is a legal value. Raises MeasurementError as `ImuSamples` does, and for a stddev that is not positive.
+    """
+
+    stamps: Array
+    positions: Array
+    stddevs: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "GnssFixes")
+        if np.any(self.stddevs <= 0):
+            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
+            raise MeasurementError(
+                f"GnssFixes.stddevs[{row}] is {self.stddevs[row]} m; expected positive values"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssFixes":
+        return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows])
+
+
+class ImuNoise(BaseModel):
+    """How good an IMU is, in continuous time; the defaults are a good consumer MEMS unit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    accelerometer_noise_density: float = Field(2e-3, gt=0, description="White noise, m/s²/√Hz.")
+    gyroscope_noise_density: float = Field(1.7e-4, gt=0, description="White noise, rad/s/√Hz.")
+    accelerometer_bias_walk: float = Field(2e-4, gt=0, description="Random walk of the bias, m/s³/√Hz.")
+    gyroscope_bias_walk: float = Field(5e-6, gt=0, description="Random walk of the bias, rad/s²/√Hz.")
+    accelerometer_bias_stddev: float = Field(0.1, gt=0, description="Unknown bias at the start, m/s².")
+    gyroscope_bias_stddev: float = Field(5e-3, gt=0, description="Unknown bias at the start, rad/s.")
+
+    def scaled(self, factor: float) -> "ImuNoise":
+        """The same unit with `factor` times the white noise and the bias walk."""
+        grown = [
+            "accelerometer_noise_density",
+            "gyroscope_noise_density",
+            "accelerometer_bias_walk",
+            "gyroscope_bias_walk",
+        ]
+        return self.model_copy(update={name: getattr(self, name) * factor for name in grown})
+
+
+@dataclass(frozen=True, eq=False)
+class Repairs:
+    """What cleaning did to the rows of one sensor: how many were dropped and why, and where data are missing.
+
+    `gaps` (g, 2): first and last stamp, s, of every step longer than twice the usual one.
+    """
+
+    sensor: str
+    rows: int
+    not_finite: int = 0
+    repeated: int = 0
+    out_of_order: int = 0
+    gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    @property
+    def dropped(self) -> int:
+        """Number of rows that are not in the cleaned data."""
+        return self.not_finite + self.repeated
+
+    def __str__(self) -> str:
+        parts = [
+            (self.not_finite, "not finite, dropped"),
+            (self.repeated, "repeated, dropped"),
+            (self.out_of_order, "out of order, sorted"),
+            (len(self.gaps), f"gaps, longest {np.ptp(self.gaps, axis=1).max(initial=0.0):.2f} s"),
+        ]
+        return f"{self.sensor}: {self.rows} rows" + "".join(f"; {n} {what}" for n, what in parts if n)
+
+
+def clean_imu(
+    stamps: ArrayLike, specific_force: ArrayLike, angular_rate: ArrayLike
+) -> tuple[ImuSamples, Repairs]:
+    """Raw IMU rows -> samples in order of time, once each, and the report of what was repaired.
+
+    `stamps` (n,) s; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s. Rows that are not finite
+    are dropped (GTSAM would integrate them), so is every row after the first with the same stamp.
+    Raises MeasurementError for another shape and when fewer than two rows are left.
+    """
+    columns, repairs = _clean("IMU", stamps, specific_force, angular_rate)
+    if len(columns[0]) < 2:
+        raise MeasurementError(f"{repairs}: {len(columns[0])} left, expected at least 2")
+    return ImuSamples(*columns), repairs
+
+
+def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> tuple[GnssFixes, Repairs]:
+    """Raw fixes -> fixes in order of time, once each, and the report of what was repaired.
+
+    `stamps` (m,) s; `positions` (m, 3) m in the map frame; `stddevs` (m, 3) m. Raises MeasurementError for
+    another shape and for a stddev that is not positive.
+    """
+    columns, repairs = _clean("GNSS", stamps, positions, stddevs)
+    return GnssFixes(*columns), repairs
+
+
+def gaps(stamps: Array, longer_than: float = 2.0) -> Array:
+    """First and last stamp, s, of every step longer than `longer_than` usual (median) steps: (g, 2)."""
+    steps = np.diff(stamps)
+    wide = np.flatnonzero(steps > longer_than * np.median(steps)) if len(steps) else np.empty(0, dtype=int)
+    return np.column_stack([stamps[wide], stamps[wide + 1]])
+
+
+def _clean(sensor: str, stamps: ArrayLike, *vectors: ArrayLike) -> tuple[list[Array], Repairs]:
+    columns = [np.asarray(c, dtype=np.float64) for c in (stamps, *vectors)]
+    n = len(columns[0]) if columns[0].ndim == 1 else -1
+    if n < 0 or any(c.shape != (n, 3) for c in columns[1:]):
+        raise MeasurementError(
+            f"{sensor} rows have shapes {[c.shape for c in columns]}; expected (n,), (n, 3), (n, 3)"
+        )
+    finite = np.logical_and.reduce([np.isfinite(c).reshape(n, -1).all(axis=1) for c in columns])
+    columns = [c[finite] for c in columns]
+    out_of_order = int(np.count_nonzero(np.diff(columns[0]) < 0))
+    _, first = np.unique(columns[0], return_index=True)
+    repeated = len(columns[0]) - len(first)
+    columns = [c[first] for c in columns]
+    missing = int(n - np.count_nonzero(finite))
+    return columns, Repairs(sensor, n, missing, repeated, out_of_order, gaps(columns[0]))
+
+
+def _freeze(value: ImuSamples | GnssFixes) -> None:
+    for f in fields(value):
+        array = np.array(getattr(value, f.name), dtype=np.float64)
+        array.setflags(write=False)
+        object.__setattr__(value, f.name, array)
+
+
+def _check(value: ImuSamples | GnssFixes, what: str) -> None:
+    n = len(value.stamps) if value.stamps.ndim == 1 else -1
+    for f in fields(value):
+        array = getattr(value, f.name)
+        expected = (n,) if f.name == "stamps" else (n, 3)
+        if array.shape != expected:
+            raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
+        if not np.isfinite(array).all():
+            row = int(np.argwhere(~np.isfinite(array))[0, 0])
+            raise MeasurementError(
+                f"{what}.{f.name}[{row}] is not finite; drop such rows with clean_imu/clean_gnss"
+            )
+    backwards = np.flatnonzero(np.diff(value.stamps) <= 0)
+    if len(backwards):
+        row = int(backwards[0])
+        raise MeasurementError(
+            f"{what}.stamps go from {value.stamps[row]} to {value.stamps[row + 1]} s at row {row + 1}; "
+            "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss"
+        )

@@ -1,0 +1,198 @@
+"""Where the vehicle was: poses over stamps, at any stamp in between, and on disk."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.errors import MeasurementError
+
+Array = NDArray[np.float64]
+
+TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
+_UPPER = np.triu_indices(6)
+_COVARIANCE_COLUMNS = [f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
+_METADATA = {
+    "frame": "pose of the imu frame (x forward, y left, z up) in the map frame (east, north, up)",
+    "units": "stamp_s s; x y z m; qx qy qz qw unit quaternion, scalar last; vx vy vz m/s in the map frame",
+    "covariance": "of (rx ry rz rad, tx ty tz m): T = T_estimate Exp(tangent), axes of the imu frame",
+}
+
+
+class _Segments(NamedTuple):
+    """Position as a cubic and rotation as a turn about a fixed axis, from each knot to the next."""
+
+    cubic: Array  # (k, 4, 3): coefficients of u⁰ to u³, u from 0 to 1 over the segment
+    rotation: Array  # (k, 3, 3, 3): R = [0] + sin(u a) [1] + (1 - cos(u a)) [2] (Rodrigues)
+    angle: Array  # (k,) rad
+    duration: Array  # (k,) s
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the imu frame in the map frame over time.
+
+    `stamps` (k,) s, strictly increasing; `T_map_imu` (k, 4, 4); `velocities` (k, 3) m/s in the map frame,
+    or None; `covariances` (k, 6, 6) or None, of the tangent (rotation rx ry rz in rad, translation tx ty tz
+    in m, both in imu axes) with T = T_estimate Exp(tangent): the order of GTSAM's Pose3. Raises
+    MeasurementError for another shape, values that are not finite, and stamps out of order.
+    """
+
+    stamps: Array
+    T_map_imu: Array
+    velocities: Array | None = None
+    covariances: Array | None = None
+
+    def __post_init__(self) -> None:
+        k = len(self.stamps)
+        for name, shape in (
+            ("stamps", (k,)), ("T_map_imu", (k, 4, 4)), ("velocities", (k, 3)), ("covariances", (k, 6, 6))
+        ):  # fmt: skip
+            given = getattr(self, name)
+            if given is None:
+                continue
+            array = np.array(given, dtype=np.float64)
+            array.setflags(write=False)
+            if k == 0 or array.shape != shape or not np.isfinite(array).all():
+                raise MeasurementError(
+                    f"Trajectory.{name} has shape {array.shape}; expected {shape}, not empty, all finite"
+                )
+            object.__setattr__(self, name, array)
+        if np.any(np.diff(self.stamps) <= 0):
+            raise MeasurementError(
+                "Trajectory.stamps must be strictly increasing; sort them and drop repeats"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def start(self) -> float:
+        """First stamp, s."""
+        return float(self.stamps[0])
+
+    @property
+    def end(self) -> float:
+        """Last stamp, s."""
+        return float(self.stamps[-1])
+
+    @property
+    def positions(self) -> Array:
+        """Positions of the imu in the map frame, (k, 3) m."""
+        return self.T_map_imu[:, :3, 3]
+
+    @property
+    def position_stddevs(self) -> Array:
+        """Standard deviations of the positions along east, north, up, (k, 3) m."""
+        if self.covariances is None:
+            raise MeasurementError("this trajectory has no covariances")
+        R = self.T_map_imu[:, :3, :3]
+        variances: Array = np.einsum("kij,kjl,kil->ki", R, self.covariances[:, 3:, 3:], R)
+        return np.sqrt(variances)
+
+    def at(self, stamps: ArrayLike, extrapolate_s: float = 0.0) -> Array:
+        """Poses at any stamps (j,) s -> T_map_imu (j, 4, 4), exact at the knots.
+
+        Position: cubic Hermite where velocities are known, else linear; rotation: constant rate (slerp).
+        Up to `extrapolate_s` beyond either end the last velocity and rate go on. Raises MeasurementError
+        when a stamp lies farther outside.
+        """
+        t = np.asarray(stamps, dtype=np.float64)
+        self._check_span(t, extrapolate_s)
+        segments = self._segments
+        i = np.clip(np.searchsorted(self.stamps, t, side="right") - 1, 0, len(self) - 1)
+        u = (t - self.stamps[i]) / segments.duration[i]
+        turn = u * segments.angle[i]
+        c, r = segments.cubic[i], segments.rotation[i]
+        u = np.clip(u, 0.0, None)[:, None]
+        T = np.zeros((len(t), 4, 4))
+        T[:, :3, :3] = r[:, 0] + np.sin(turn)[:, None, None] * r[:, 1]
+        T[:, :3, :3] += (1 - np.cos(turn))[:, None, None] * r[:, 2]
+        T[:, :3, 3] = c[:, 0] + u * (c[:, 1] + u * (c[:, 2] + u * c[:, 3]))
+        before = np.minimum(t - self.start, 0.0)[:, None]
+        T[:, :3, 3] += before * segments.cubic[0, 1] / segments.duration[0]
+        T[:, 3, 3] = 1.0
+        return T
+
+    def _check_span(self, t: Array, extrapolate_s: float) -> None:
+        if t.ndim != 1 or not np.isfinite(t).all():
+            raise MeasurementError(f"stamps have shape {t.shape}; expected (j,), all finite")
+        if len(t) and (t.min() < self.start - extrapolate_s or t.max() > self.end + extrapolate_s):
+            raise MeasurementError(
+                f"stamps {t.min():.3f}..{t.max():.3f} s leave the trajectory "
+                f"{self.start:.3f}..{self.end:.3f} s by more than {extrapolate_s:g} s; drop them"
+            )
+
+    @cached_property
+    def _segments(self) -> _Segments:
+        k, p, R = len(self), self.positions, self.T_map_imu[:, :3, :3]
+        # one more segment, after the last knot, makes that knot exact and carries the extrapolation
+        h = np.append(np.diff(self.stamps), 1.0)
+        step = np.vstack([np.diff(p, axis=0), np.zeros((1, 3))])
+        cubic = np.zeros((k, 4, 3))
+        cubic[:, 0] = p
+        cubic[:, 1] = step
+        if self.velocities is not None:
+            v0, v1 = self.velocities * h[:, None], np.roll(self.velocities, -1, axis=0) * h[:, None]
+            cubic[:, 1], cubic[:, 2], cubic[:, 3] = v0, 3 * step - 2 * v0 - v1, v0 + v1 - 2 * step
+        elif k > 1:
+            cubic[-1, 1] = step[-2] / h[-2]
+        cubic[-1, 2:] = 0.0
+        turn = np.zeros((k, 3))
+        turn[:-1] = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()
+        if k > 1:
+            turn[-1] = turn[-2] / h[-2]
+        angle = np.linalg.norm(turn, axis=1)
+        x, y, z = (turn / np.maximum(angle, 1e-300)[:, None]).T
+        zero = np.zeros(k)
+        K = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+        return _Segments(cubic, np.stack([R, R @ K, R @ K @ K], axis=1), angle, h)
+
+    def save(self, path: Path | str) -> None:
+        """Write the trajectory as a Parquet table, units and frame in its schema metadata."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        quat_xyzw = Rotation.from_matrix(self.T_map_imu[:, :3, :3]).as_quat()
+        columns = dict(zip(("stamp_s", "x", "y", "z"), (self.stamps, *self.positions.T), strict=True))
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), quat_xyzw.T, strict=True))
+        if self.velocities is not None:
+            columns |= dict(zip(("vx", "vy", "vz"), self.velocities.T, strict=True))
+        if self.covariances is not None:
+            columns |= dict(zip(_COVARIANCE_COLUMNS, self.covariances[:, *_UPPER].T, strict=True))
+        table = pa.table({name: np.ascontiguousarray(c) for name, c in columns.items()})
+        pq.write_table(table.replace_schema_metadata(_METADATA), path)
+
+    @staticmethod
+    def load(path: Path | str) -> "Trajectory":
+        """Read a trajectory that `save` wrote; raises MeasurementError when the file is not such a table."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            table = pq.read_table(path)
+        except pa.ArrowInvalid as error:
+            raise MeasurementError(f"{path}: not a Parquet file ({error})") from error
+        pose = ("stamp_s", "x", "y", "z", "qx", "qy", "qz", "qw")
+        missing = [name for name in pose if name not in table.column_names]
+        if missing:
+            raise MeasurementError(f"{path}: no column {', '.join(missing)}; expected {', '.join(pose)}")
+        stamps, *position_and_quat = (table[name].to_numpy() for name in pose)
+        T = np.tile(np.eye(4), (len(stamps), 1, 1))
+        T[:, :3, 3] = np.column_stack(position_and_quat[:3])
+        T[:, :3, :3] = Rotation.from_quat(np.column_stack(position_and_quat[3:])).as_matrix()
+        velocities = covariances = None
+        if "vx" in table.column_names:
+            velocities = np.column_stack([table[name].to_numpy() for name in ("vx", "vy", "vz")])
+        if _COVARIANCE_COLUMNS[0] in table.column_names:
+            covariances = np.zeros((len(stamps), 6, 6))
+            covariances[:, *_UPPER] = np.column_stack(
+                [table[name].to_numpy() for name in _COVARIANCE_COLUMNS]
+            )
+            lower = _UPPER[::-1]
+            covariances[:, *lower] = covariances[:, *_UPPER]
+        return Trajectory(stamps, T, velocities, covariances)

@@ -1,0 +1,1 @@
+"""The map and the trajectory as files that CloudCompare, QGIS, evo and a browser open as they are."""

@@ -1,0 +1,158 @@
+"""The map as a point cloud, one point per voxel: PLY to look at, LAZ with coordinates and class codes."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.export.utm import to_utm
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.voxel_map import SemanticMap, State, unpack
+
+if TYPE_CHECKING:
+    import laspy
+
+PLY_VERTEX = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+     ("label", "u1"), ("confidence", "<f4"), ("hits", "<u4"), ("state", "u1")]
+)  # fmt: skip
+PLY_TYPES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
+PLY_UNLABELLED = 255
+UNLABELLED_COLOUR = (150, 150, 150)
+LAZ_SCALE_M = 0.001
+LAZ_CHUNK = 1_000_000
+"""Points converted at a time, so that memory does not grow with the map."""
+NEVER_CLASSIFIED, UNCLASSIFIED = 0, 1  # ASPRS codes: nobody looked, and looked without a result
+EXTRA_BYTES = (
+    ("sem_label", "uint16", "SemanticKITTI raw id, 0: none"),
+    ("confidence", "float32", "probability of the class"),
+    ("hits", "uint32", "LiDAR points in the voxel"),
+    ("state", "uint8", "origin of the class, 4: removed"),
+)
+
+
+def colours(semantic_map: SemanticMap) -> NDArray[np.uint8]:
+    """Colour of every voxel's class, grey where it has none: (v, 3) RGB."""
+    palette = np.vstack([semantic_map.voxels.label_set.colours, UNLABELLED_COLOUR]).astype(np.uint8)
+    return palette[semantic_map.labels]  # -1 is the last row
+
+
+def visible(semantic_map: SemanticMap) -> NDArray[np.bool_]:
+    """Voxels that a picture shows: `shown`, or all but the removed ones in a map that no camera labelled."""
+    if (semantic_map.labels >= 0).any():
+        return semantic_map.shown
+    return np.asarray(semantic_map.states != State.REMOVED)
+
+
+def write_ply(semantic_map: SemanticMap, path: Path | str, frame: LocalFrame | None = None) -> None:
+    """Write the visible voxels as a binary PLY: centre, colour, class, confidence, hits and state.
+
+    Coordinates are float32 metres of the map frame (east, north, up), rounded by less than 1 mm within 8 km
+    of the origin; the comments say where `frame` puts that origin and which class each `label` is (255:
+    none). Raises DataError when the file cannot be written.
+    """
+    chosen = visible(semantic_map)
+    voxels = semantic_map.voxels[chosen]
+    vertices = np.empty(len(voxels), PLY_VERTEX)
+    vertices["x"], vertices["y"], vertices["z"] = voxels.centres.T
+    vertices["red"], vertices["green"], vertices["blue"] = colours(semantic_map)[chosen].T
+    labels = semantic_map.labels[chosen]
+    vertices["label"] = np.where(labels < 0, PLY_UNLABELLED, labels)
+    vertices["confidence"] = semantic_map.confidence[chosen]
+    vertices["hits"] = voxels.hits
+    vertices["state"] = semantic_map.states[chosen]
+    with replacing(path) as file:
+        file.write(_ply_header(semantic_map, len(vertices), frame))
+        file.write(vertices.data)
+
+
+def _ply_header(semantic_map: SemanticMap, count: int, frame: LocalFrame | None) -> bytes:
+    label_set = semantic_map.voxels.label_set
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment gnss-sem-map {version('gnss-sem-map')}",
+        f"comment map frame: x east, y north, z up, metres; voxel {semantic_map.voxels.voxel_size_m} m",
+    ]
+    if frame is not None:
+        lines.append(
+            "comment origin (WGS 84, ellipsoidal height):"
+            f" lat_deg {frame.lat_deg:.10f} lon_deg {frame.lon_deg:.10f} alt_m {frame.alt_m:.4f}"
+        )
+    lines += [f"comment label {i}: {_plain(name)}" for i, name in enumerate(label_set.names)]
+    lines += [f"comment label {PLY_UNLABELLED}: unlabelled", f"element vertex {count}"]
+    lines += [f"property {PLY_TYPES[PLY_VERTEX[name].str]} {name}" for name in PLY_VERTEX.names or ()]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
+def _plain(name: str) -> str:
+    """A class name as one line of printable ASCII, whatever the user's class file holds."""
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
+
+
+def write_laz(semantic_map: SemanticMap, frame: LocalFrame, path: Path | str) -> None:
+    """Write every voxel as LAZ (LAS 1.4, point format 7) in the UTM zone of the map's origin.
+
+    Heights are above the WGS 84 ellipsoid. `classification` holds the class set's ASPRS codes, 0 where no
+    camera looked and 1 where looking gave no class; removed voxels keep their class and are flagged
+    `withheld`. Extra bytes: `sem_label` (SemanticKITTI raw id), `confidence`, `hits`, `state`. Raises
+    DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system as OGC WKT 1).
+    """
+    import laspy
+
+    header = _las_header(semantic_map.voxels.label_set, frame)
+    edges = [*range(0, len(semantic_map), LAZ_CHUNK), len(semantic_map)]
+    with (
+        replacing(path) as file,
+        laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
+    ):
+        for start, end in pairwise(edges):
+            writer.write_points(_las_points(semantic_map, frame, header, slice(start, end)))
+
+
+def _las_header(label_set: LabelSet, frame: LocalFrame) -> laspy.LasHeader:
+    import laspy
+    from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
+    from pyproj import CRS
+
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"
+    header.scales = np.full(3, LAZ_SCALE_M)
+    header.offsets = np.floor(to_utm(frame, np.zeros((1, 3)))[0])
+    header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in EXTRA_BYTES])
+    # LAS 1.4 asks for WKT 1; laspy's own add_crs writes WKT 2, which older readers refuse
+    header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(frame.utm_epsg).to_wkt("WKT1_GDAL")))
+    header.global_encoding.wkt = True
+    lookup = ClassificationLookupVlr()
+    for code, name in zip(label_set.asprs_codes.tolist(), label_set.names, strict=True):
+        lookup[code] = _plain(name)[:15]
+    header.vlrs.append(lookup)
+    return header
+
+
+def _las_points(
+    semantic_map: SemanticMap, frame: LocalFrame, header: laspy.LasHeader, part: slice
+) -> laspy.ScaleAwarePointRecord:
+    import laspy
+
+    voxels, label_set = semantic_map.voxels, semantic_map.voxels.label_set
+    labels, states = semantic_map.labels[part], semantic_map.states[part]
+    points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
+    centres = (unpack(voxels.keys[part]).astype(np.float64) + 0.5) * voxels.voxel_size_m
+    points.x, points.y, points.z = to_utm(frame, centres).T
+    points.red, points.green, points.blue = 257 * colours(semantic_map)[part].T.astype(np.uint16)  # to 16 bit
+    points.return_number[:] = 1
+    points.number_of_returns[:] = 1
+    unlabelled = np.where(states == State.UNOBSERVED, NEVER_CLASSIFIED, UNCLASSIFIED)
+    points.classification = np.where(labels < 0, unlabelled, label_set.asprs_codes[labels])
+    points.withheld = states == State.REMOVED
+    points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
+    points.confidence, points.hits, points.state = semantic_map.confidence[part], voxels.hits[part], states
+    return points

@@ -1,0 +1,76 @@
+"""A short street as a semantic map, a track along it, and where on Earth it lies."""
+
+import numpy as np
+import pytest
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.labels import LabelSet, label_set
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, pack
+
+VOXEL_M = 0.2
+LABELS = label_set()
+ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION = range(5)
+
+
+def semantic_map(
+    indices: np.ndarray, labels: np.ndarray, states: np.ndarray | None = None, classes: LabelSet = LABELS
+) -> SemanticMap:
+    """A map that holds these voxels (v, 3), each once, with these labels (v,)."""
+    keys, first = np.unique(pack(indices), return_index=True)
+    labels = np.asarray(labels, np.int8)[first]
+    rng = np.random.default_rng(7)
+    evidence = np.zeros((len(keys), len(classes.names)), np.int32)
+    evidence[labels >= 0] = -2000
+    evidence[np.arange(len(keys))[labels >= 0], labels[labels >= 0]] = -100
+    hits = rng.integers(1, 500, len(keys)).astype(np.uint32)
+    seen = np.where(labels >= 0, State.OBSERVED, State.UNOBSERVED)
+    return SemanticMap(
+        voxels=VoxelMap(VOXEL_M, classes, keys, evidence, hits),
+        labels=labels,
+        confidence=np.where(labels >= 0, rng.uniform(0.5, 1, len(keys)), 0).astype(np.float32),
+        states=np.asarray(seen if states is None else np.asarray(states)[first], np.uint8),
+    )
+
+
+def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> np.ndarray:
+    """Indices (n, 3) of all voxels of a box, given in metres."""
+    axes = [np.arange(round(low / VOXEL_M), round(high / VOXEL_M)) for low, high in (x, y, z)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture(scope="session")
+def street() -> SemanticMap:
+    """60 m of road eastward, kerb, wall in the north, trees, a car, a removed car, unseen ground."""
+    parts = [
+        (box((0, 60), (-4, 4), (0, 0.2)), ROAD, State.OBSERVED),
+        (box((0, 60), (4, 6), (0, 0.4)), SIDEWALK, State.REFINED),
+        (box((5, 50), (6, 6.4), (0, 8)), BUILDING, State.OBSERVED),
+        (box((10, 13), (-9, -6), (0, 5)), VEGETATION, State.INFERRED),
+        (box((20, 24), (1.6, 3.6), (0.2, 1.6)), VEHICLE, State.OBSERVED),
+        (box((40, 44), (-3, -1.2), (0.2, 1.6)), VEHICLE, State.REMOVED),
+        (box((0, 60), (-6, -4), (0, 0.2)), -1, State.UNOBSERVED),
+    ]
+    return semantic_map(
+        np.concatenate([indices for indices, _, _ in parts]),
+        np.concatenate([np.full(len(indices), label) for indices, label, _ in parts]),
+        np.concatenate([np.full(len(indices), state) for indices, _, state in parts]),
+    )
+
+
+@pytest.fixture(scope="session")
+def track() -> Trajectory:
+    """Eastward along the street at 10 m/s, one metre above it, turning a little."""
+    stamps = np.linspace(0.05, 5.9, 40)
+    T = np.tile(np.eye(4), (40, 1, 1))
+    yaw = 0.1 * np.sin(stamps)
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(yaw)
+    T[:, 1, 0], T[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    T[:, :3, 3] = np.column_stack([10 * stamps, 0.2 * np.sin(stamps), np.full(40, 1.1)])
+    return Trajectory(stamps, T)
+
+
+@pytest.fixture(scope="session")
+def karlsruhe() -> LocalFrame:
+    """Where KITTI was recorded; half a degree west of its UTM zone's central meridian."""
+    return LocalFrame(49.0, 8.4, 115.0)

@@ -1,0 +1,147 @@
+"""PLY as plyfile reads it, LAZ as laspy reads it, coordinates as the textbook computes them."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import plyfile
+import pytest
+from pyproj import Geod, Proj
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap
+
+
+def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, tmp_path: Path) -> None:
+    write_ply(street, tmp_path / "map.ply")
+    vertices = plyfile.PlyData.read(tmp_path / "map.ply")["vertex"]
+    shown = street.shown
+    assert 0 < shown.sum() < len(street)
+    read = np.column_stack([vertices[axis] for axis in "xyz"])
+    np.testing.assert_allclose(read, street.voxels.centres[shown], atol=1e-5)
+    np.testing.assert_array_equal(vertices["label"], street.labels[shown])
+    np.testing.assert_array_equal(vertices["confidence"], street.confidence[shown])
+    np.testing.assert_array_equal(vertices["hits"], street.voxels.hits[shown])
+    np.testing.assert_array_equal(vertices["state"], street.states[shown])
+    rgb = np.column_stack([vertices[c] for c in ("red", "green", "blue")])
+    np.testing.assert_array_equal(rgb, street.voxels.label_set.colours[street.labels[shown]])
+
+
+def test_the_ply_says_its_frame_and_its_classes(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    write_ply(street, tmp_path / "map.ply", karlsruhe)
+    comments = "\n".join(plyfile.PlyData.read(tmp_path / "map.ply").comments)
+    assert "lat_deg 49.0000000000 lon_deg 8.4000000000 alt_m 115.0000" in comments
+    assert "label 3: building" in comments
+
+
+def test_a_map_that_no_camera_saw_is_still_worth_a_file(street: SemanticMap, tmp_path: Path) -> None:
+    dark = VoxelMap(
+        0.2, street.voxels.label_set, street.voxels.keys, 0 * street.voxels.evidence, street.voxels.hits
+    )
+    write_ply(SemanticMap.of(dark), tmp_path / "map.ply")
+    vertices = plyfile.PlyData.read(tmp_path / "map.ply")["vertex"]
+    assert len(vertices.data) == len(street)
+    assert (vertices["label"] == 255).all()
+
+
+def test_class_names_cannot_break_out_of_the_header(street: SemanticMap, tmp_path: Path) -> None:
+    old = street.voxels.label_set
+    names = ("road\nend_header", "trottoir d'été", *old.names[2:])
+    spiteful = LabelSet("x", names, old.colours, old.semantic_kitti_ids, old.asprs_codes, {})
+    voxels = VoxelMap(0.2, spiteful, street.voxels.keys, street.voxels.evidence, street.voxels.hits)
+    hostile = SemanticMap(voxels, street.labels, street.confidence, street.states)
+    write_ply(hostile, tmp_path / "map.ply")
+    write_laz(hostile, LocalFrame(49.0, 8.4, 115.0), tmp_path / "map.laz")
+    assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == street.shown.sum()
+    assert len(laspy.read(tmp_path / "map.laz").points) == len(street)
+
+
+def test_the_laz_holds_every_voxel_and_reads_back_equal(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    write_laz(street, karlsruhe, tmp_path / "map.laz")
+    las = laspy.read(tmp_path / "map.laz")
+    assert (str(las.header.version), las.header.point_format.id) == ("1.4", 7)
+    assert len(las.points) == len(street)
+    unlabelled = street.labels < 0
+    ids = np.where(unlabelled, 0, street.voxels.label_set.semantic_kitti_ids[street.labels])
+    codes = np.where(unlabelled, 0, street.voxels.label_set.asprs_codes[street.labels])
+    np.testing.assert_array_equal(las["sem_label"], ids)
+    np.testing.assert_array_equal(las.classification, codes)
+    np.testing.assert_array_equal(las["confidence"], street.confidence)
+    np.testing.assert_array_equal(las["hits"], street.voxels.hits)
+    np.testing.assert_array_equal(las["state"], street.states)
+    np.testing.assert_array_equal(np.asarray(las.withheld), street.states == State.REMOVED)
+    np.testing.assert_array_equal(
+        las.red[~unlabelled] >> 8, street.voxels.label_set.colours[street.labels[~unlabelled], 0]
+    )
+    assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
+    assert las.header.number_of_points_by_return[0] == len(street)
+
+
+@pytest.mark.parametrize(
+    ("frame", "epsg"),
+    [
+        (LocalFrame(49.0, 8.4, 115.0), 32632),
+        (LocalFrame(-33.9, 151.2, 20.0), 32756),
+        (LocalFrame(0.00001, -179.99, -5.0), 32601),
+        (LocalFrame(64.1, -21.9, 60.0), 32627),
+    ],
+)
+def test_the_laz_lies_in_the_zone_and_hemisphere_of_the_origin(
+    frame: LocalFrame, epsg: int, street: SemanticMap, tmp_path: Path
+) -> None:
+    write_laz(street, frame, tmp_path / "map.laz")
+    las = laspy.read(tmp_path / "map.laz")
+    crs = las.header.parse_crs()
+    assert crs is not None
+    assert crs.to_epsg() == epsg
+    assert las.header.global_encoding.wkt
+    expected = utm_by_geodesic(street.voxels.centres, frame, epsg)
+    np.testing.assert_allclose(las.xyz, expected, atol=0.002)
+
+
+def utm_by_geodesic(p_map: np.ndarray, frame: LocalFrame, epsg: int) -> np.ndarray:
+    """Independent of cart and topocentric steps: along the geodesic from the origin, then PROJ's tmerc.
+
+    Over 100 m the tangent plane and the ellipsoid differ by d²/2R < 1 mm, and the geodesic runs on the
+    ellipsoid, below points at height h by the factor 1 + h/R.
+    """
+    east, north, up = p_map.T
+    radius = 6_371_000.0
+    distance = np.hypot(east, north) / (1 + (frame.alt_m + up) / radius)
+    start = np.ones(len(p_map))
+    lon, lat, _ = Geod(ellps="WGS84").fwd(
+        frame.lon_deg * start, frame.lat_deg * start, np.degrees(np.arctan2(east, north)), distance
+    )
+    false_northing = 10_000_000 if epsg // 100 == 327 else 0
+    tmerc = Proj(
+        f"+proj=tmerc +lat_0=0 +lon_0={6 * (epsg % 100) - 183} +k=0.9996"
+        f" +x_0=500000 +y_0={false_northing} +ellps=WGS84"
+    )
+    easting, northing = tmerc(lon, lat)
+    return np.column_stack([easting, northing, frame.alt_m + up + (east**2 + north**2) / (2 * radius)])
+
+
+def test_a_map_larger_than_one_chunk_is_written_whole(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_laz(street, karlsruhe, tmp_path / "whole.laz")
+    monkeypatch.setattr("gnss_sem_map.export.point_cloud.LAZ_CHUNK", 1000)
+    write_laz(street, karlsruhe, tmp_path / "chunked.laz")
+    whole, chunked = (laspy.read(tmp_path / name).points.array for name in ("whole.laz", "chunked.laz"))
+    np.testing.assert_array_equal(whole, chunked)
+
+
+def test_an_empty_map_gives_empty_files_that_still_open(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
+    write_ply(empty, tmp_path / "map.ply")
+    write_laz(empty, karlsruhe, tmp_path / "map.laz")
+    assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == 0
+    assert len(laspy.read(tmp_path / "map.laz").points) == 0

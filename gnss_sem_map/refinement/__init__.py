@@ -1,0 +1,203 @@
+"""Refinement (section 3.3): what the whole map knows that no single view does.
+
+Every step turns log scores (v, c) into better ones, can be switched off, and reports what it changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.labels import UNLABELLED, LabelSet
+from gnss_sem_map.refinement import count_grid, vehicles
+from gnss_sem_map.refinement.count_grid import CountGridSettings
+from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
+from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, softmax
+
+__all__ = ["RefinementReport", "RefinementSettings", "Step", "VehicleObject", "refine", "with_removed"]
+
+Scores = NDArray[np.float32]
+"""(v, c) log scores; their softmax is the class distribution."""
+
+REJECTED_NAT = 1.0
+"""A voxel that is no vehicle after all gets this much less for it than for its least probable class."""
+
+
+class RefinementSettings(BaseModel):
+    """What is refined, and how: `paper` is section 3.3 to the letter, `evidence` what holds on real data."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    building_vegetation: Literal["evidence", "paper", "off"] = Field(
+        default="evidence",
+        description="Count grids (section 3.3.1): weigh a column's labels, or overwrite them.",
+    )
+    vehicles: Literal["evidence", "paper", "off"] = Field(
+        default="evidence",
+        description="Vehicles (section 3.3.2): support by object and motion by evidence, or eq. 12 and 13.",
+    )
+    count_exponent: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="n looks at a voxel count as n to this power: they repeat each other's errors. 1 is eq. 6.",
+    )
+    columns: CountGridSettings = Field(default=CountGridSettings(), description="Numbers of the count grids.")
+    support: VehicleSettings = Field(default=VehicleSettings(), description="Numbers of the vehicle rules.")
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step of the refinement did."""
+
+    name: str
+    changes: Mapping[tuple[str, str], int]
+    """(from, to) class -> voxels; `removed` for those that left the shown map."""
+    skipped: str = ""
+    """Why it was not done; empty when it was."""
+
+    @property
+    def changed(self) -> int:
+        """Voxels that changed."""
+        return sum(self.changes.values())
+
+
+@dataclass(frozen=True, eq=False)
+class RefinementReport:
+    """What every step changed, and every object that was judged."""
+
+    steps: tuple[Step, ...]
+    objects: tuple[VehicleObject, ...] = ()
+
+
+def refine(
+    voxels: VoxelMap, settings: RefinementSettings | None = None, removed: VoxelMap | None = None
+) -> tuple[SemanticMap, RefinementReport]:
+    """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled.
+
+    `removed` holds the points of moving vehicles that were kept out of `voxels`; they come back as a layer of
+    REMOVED voxels wherever nothing else stands.
+    """
+    settings = settings or RefinementSettings()
+    scores = _discounted(voxels, settings.count_exponent)
+    scores, columns = _correct_columns(voxels, scores, settings)
+    scores, moving, objects, judged = _judge_vehicles(voxels, scores, settings)
+    refined = _decide(voxels, scores, moving)
+    if removed is not None:
+        refined = with_removed(refined, removed)
+    return refined, RefinementReport((columns, judged), objects)
+
+
+def _discounted(voxels: VoxelMap, exponent: float) -> Scores:
+    """Evidence in nat; n looks at a voxel count as n^exponent (hits stand for looks)."""
+    weights = np.maximum(voxels.hits, 1).astype(np.float32) ** np.float32(exponent - 1)
+    return voxels.evidence.astype(np.float32) * (weights / np.float32(UNITS_PER_NAT))[:, None]
+
+
+def _labels(voxels: VoxelMap, scores: Scores) -> NDArray[np.int8]:
+    return np.where(voxels.observed, scores.argmax(axis=1), UNLABELLED).astype(np.int8)
+
+
+def _correct_columns(voxels: VoxelMap, scores: Scores, settings: RefinementSettings) -> tuple[Scores, Step]:
+    """Building against vegetation, column by column (eq. 8 to 11)."""
+    name, mode = "building and vegetation", settings.building_vegetation
+    classes = _classes(voxels.label_set, "building", "vegetation")
+    if mode == "off" or len(classes) < 2:
+        return scores, Step(name, {}, "switched off" if mode == "off" else "the class set lacks one of them")
+    first, second = classes
+    labels = _labels(voxels, scores)
+    if mode == "paper":
+        log_odds = count_grid.paper_log_odds(voxels.keys, labels, (first, second), settings.columns)
+    else:
+        own = scores[:, first] - scores[:, second]
+        log_odds = count_grid.evidence_log_odds(
+            voxels.keys, labels, own, (first, second), settings.columns, voxels.voxel_size_m
+        )
+    refined = count_grid.decide(scores, np.isin(labels, classes), (first, second), log_odds)
+    return refined, Step(name, _changes(voxels.label_set, labels, _labels(voxels, refined)))
+
+
+def _judge_vehicles(
+    voxels: VoxelMap, scores: Scores, settings: RefinementSettings
+) -> tuple[Scores, NDArray[np.bool_], tuple[VehicleObject, ...], Step]:
+    """Which voxels are vehicles, and, in mode `paper`, which of those moved."""
+    name, mode, nothing = "vehicles", settings.vehicles, np.zeros(len(voxels), np.bool_)
+    classes = _classes(voxels.label_set, "vehicle", "road")
+    if mode == "off" or len(classes) < 2:
+        return (
+            scores,
+            nothing,
+            (),
+            Step(name, {}, "switched off" if mode == "off" else "the class set lacks one of them"),
+        )
+    labels = _labels(voxels, scores)
+    if mode == "paper":
+        found = vehicles.paper(
+            voxels.indices, labels, classes[0], classes[1], settings.support, voxels.voxel_size_m
+        )
+        gone = found.moving | found.rejected
+        return scores, gone, found.objects, Step(name, _changes(voxels.label_set, labels, labels, gone))
+    heights = height_over_ground(voxels.centres)
+    found = vehicles.supported(
+        voxels.indices, labels, heights, classes[0], classes[1], settings.support, voxels.voxel_size_m
+    )
+    refined = scores.copy()
+    refined[found.rejected, classes[0]] = scores[found.rejected].min(axis=1) - REJECTED_NAT
+    return (
+        refined,
+        nothing,
+        found.objects,
+        Step(name, _changes(voxels.label_set, labels, _labels(voxels, refined))),
+    )
+
+
+def _decide(voxels: VoxelMap, scores: Scores, moving: NDArray[np.bool_]) -> SemanticMap:
+    labels = _labels(voxels, scores)
+    states = np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8)
+    states[labels != voxels.labels] = State.REFINED
+    states[moving] = State.REMOVED
+    confidence = np.where(voxels.observed, softmax(scores).max(axis=1, initial=0.0), 0).astype(np.float32)
+    return SemanticMap(voxels, labels, confidence, states)
+
+
+def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
+    """The map with a layer of REMOVED voxels, of class vehicle, wherever nothing of the static map stands.
+
+    Raises DataError for another voxel size or class set.
+    """
+    alone = removed[static.voxels.places(removed.keys) < 0]
+    voxels = static.voxels + alone
+    kept, added = voxels.places(static.voxels.keys), voxels.places(alone.keys)
+    vehicle = _classes(voxels.label_set, "vehicle")
+    labels, confidence = np.full(len(voxels), UNLABELLED, np.int8), np.zeros(len(voxels), np.float32)
+    states = np.full(len(voxels), State.REMOVED, np.uint8)
+    labels[kept], confidence[kept], states[kept] = static.labels, static.confidence, static.states
+    labels[added] = vehicle[0] if vehicle else UNLABELLED
+    confidence[added] = alone.probabilities[:, vehicle[0]] if vehicle else 0.0
+    return SemanticMap(voxels, labels, confidence, states)
+
+
+def _classes(label_set: LabelSet, *names: str) -> tuple[int, ...]:
+    """The classes of these names that the set has."""
+    return tuple(label_set.index(name) for name in names if name in label_set.names)
+
+
+def _changes(
+    label_set: LabelSet,
+    before: NDArray[np.int8],
+    after: NDArray[np.int8],
+    removed: NDArray[np.bool_] | None = None,
+) -> dict[tuple[str, str], int]:
+    """How many voxels went from which class to which; class names end with `removed`."""
+    names = [*label_set.names, "removed"]
+    targets = after if removed is None else np.where(removed, len(names) - 1, after)
+    differ = targets != before
+    pairs, counts = np.unique(np.stack([before[differ], targets[differ]]), axis=1, return_counts=True)
+    return {(names[a], names[b]): int(n) for (a, b), n in zip(pairs.T, counts, strict=True)}

@@ -1,0 +1,167 @@
+"""Count grids (section 3.3.1): a column of voxels is building or vegetation as a whole, more or less."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import int64, njit
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import gammaln
+
+from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK
+
+WHOLE_COLUMN = 1 << 21
+"""Layer height, in voxels, that holds every column in one layer."""
+LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
+"""A map's own word on its errors is believed within these: to agree with itself is not to be right."""
+
+
+class CountGridSettings(BaseModel):
+    """How the voxels above and below speak for building or vegetation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cell_m: float = Field(
+        default=1.0, gt=0, le=20, description="Edge of a cell of the count grid, m (the paper: one voxel)."
+    )
+    reach_m: float = Field(
+        default=4.0,
+        gt=0,
+        description="Voxels at most about this much higher or lower count, m: a crown is no facade.",
+    )
+    own_limit_nat: float = Field(
+        default=1.0,
+        ge=0,
+        description="A voxel's own evidence for one against the other counts at most this much, nat.",
+    )
+    pseudo_counts: float = Field(
+        default=3.0,
+        gt=1,
+        description="Overdispersion: a column's share of right labels is Beta with this many pseudo-counts.",
+    )
+    error_rate: float = Field(
+        default=0.2,
+        gt=0,
+        lt=0.5,
+        description="Mode `paper`: share of building and vegetation voxels that are labelled wrongly.",
+    )
+
+
+def count_grid(
+    keys: NDArray[np.int64],
+    labels: NDArray[np.int8],
+    classes: tuple[int, int],
+    cell_voxels: int,
+    layer_voxels: int = WHOLE_COLUMN,
+    reach_layers: int = 0,
+) -> NDArray[np.int32]:
+    """How many voxels of each of two classes stand in every voxel's column (eq. 8): (v, 2).
+
+    `keys` (v,) sorted packed voxels, `labels` (v,). A column is a square of `cell_voxels`, whole or, with
+    `layer_voxels`, the layers within `reach_layers` of the voxel's own.
+    """
+    counts = np.zeros((len(keys), 2), np.int32)
+    if len(keys):
+        z = (keys & AXIS_MASK) // layer_voxels
+        y = ((keys >> AXIS_BITS) & AXIS_MASK) // cell_voxels
+        _count(
+            keys, labels, classes[0], classes[1], cell_voxels, layer_voxels, reach_layers,
+            int(y.min()), int(y.max() - y.min()) + 1, int(z.min()), int(z.max() - z.min()) + 1, counts,
+        )  # fmt: skip
+    return counts
+
+
+@njit(cache=True, nogil=True)
+def _count(  # type: ignore[no-untyped-def]
+    keys, labels, a, b, cell, layer, reach, first_y, ny, first_z, nz, counts
+):
+    """One slab of cells at a time: sorted keys keep its voxels together, and the grid (y, z) small."""
+    grid = np.zeros((ny, nz, 2), np.int32)
+    start = 0
+    while start < len(keys):
+        slab = (keys[start] >> (2 * AXIS_BITS)) // cell
+        end = start
+        while end < len(keys) and (keys[end] >> (2 * AXIS_BITS)) // cell == slab:
+            if labels[end] == a or labels[end] == b:
+                y = ((keys[end] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
+                z = (keys[end] & AXIS_MASK) // layer - first_z
+                grid[y, z, int64(labels[end] == b)] += 1
+            end += 1
+        for i in range(start, end):
+            y = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
+            z = (keys[i] & AXIS_MASK) // layer - first_z
+            for k in range(max(z - reach, 0), min(z + reach + 1, nz)):
+                counts[i, 0] += grid[y, k, 0]
+                counts[i, 1] += grid[y, k, 1]
+        for i in range(start, end):
+            y = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
+            grid[y, (keys[i] & AXIS_MASK) // layer - first_z, :] = 0
+        start = end
+
+
+def paper_log_odds(
+    keys: NDArray[np.int64], labels: NDArray[np.int8], classes: tuple[int, int], settings: CountGridSettings
+) -> NDArray[np.float64]:
+    """Log odds of the first class against the second for every voxel's column (eq. 8 to 10): (v,).
+
+    The paper names neither factor of eq. 9. Here the prior is each class's share of the voxels of both, and
+    the likelihood says that every voxel of a column is an independent witness, wrong at `error_rate`.
+    """
+    first, second = count_grid(keys, labels, classes, cell_voxels=1).T
+    total = [np.count_nonzero(labels == c) for c in classes]
+    prior = np.log((total[0] + 1) / (total[1] + 1))
+    return np.asarray(prior + (first - second) * np.log(1 / settings.error_rate - 1), np.float64)
+
+
+def evidence_log_odds(
+    keys: NDArray[np.int64],
+    labels: NDArray[np.int8],
+    own: NDArray[np.float32],
+    classes: tuple[int, int],
+    settings: CountGridSettings,
+    voxel_size_m: float,
+) -> NDArray[np.float64]:
+    """Log odds of the first class against the second for every voxel, from its column and itself: (v,).
+
+    `own` (v,) nat is what the voxel's own evidence says.
+
+    Prior: flat. Likelihood of the *other* voxels' labels: beta-binomial. In a column of one class the share
+    of right labels is not a constant but itself random, Beta(a, b), since one bad view spoils a column as a
+    whole; so a hundred voxels of one opinion count far less than a hundred witnesses. a + b is a setting, and
+    a and b follow from how often two voxels of one column of this map disagree, which is 2 a b / ((a + b) (a
+    + b + 1)). With a = 2, b = 1 the log odds are ln((n1 + 1) / (n2 + 1)).
+    """
+    cell = max(round(settings.cell_m / voxel_size_m), 1)
+    reach = max(round(settings.reach_m / settings.cell_m), 0)
+    counts = count_grid(keys, labels, classes, cell, cell, reach).astype(np.float64)
+    a, b = _beta_of(counts[np.isin(labels, classes)], settings.pseudo_counts)
+    others = [np.maximum(counts[:, k] - (labels == classes[k]), 0) for k in (0, 1)]
+    columns = (
+        gammaln(others[0] + a) + gammaln(others[1] + b) - gammaln(others[0] + b) - gammaln(others[1] + a)
+    )
+    return np.asarray(np.clip(own, -settings.own_limit_nat, settings.own_limit_nat) + columns)
+
+
+def _beta_of(counts: NDArray[np.float64], pseudo_counts: float) -> tuple[float, float]:
+    """Beta(a, b) of a column's share of right labels, from how often pairs of its voxels disagree."""
+    pairs = counts.sum(1) - 1
+    # every voxel of n counts once: n voxels with n1 n2 / n of the pairs that disagree
+    disagreeing = 2 * counts[:, 0] * counts[:, 1] / np.maximum(counts.sum(1), 1)
+    disagreement = disagreeing[pairs > 0].sum() / max(pairs[pairs > 0].sum(), 1.0)
+    product = disagreement * (pseudo_counts + 1) / (2 * pseudo_counts)
+    error_rate = np.clip((1 - np.sqrt(max(1 - 4 * product, 0.0))) / 2, LEAST_ERROR_RATE, MOST_ERROR_RATE)
+    return pseudo_counts * (1 - error_rate), pseudo_counts * error_rate
+
+
+def decide(
+    scores: NDArray[np.float32],
+    candidates: NDArray[np.bool_],
+    classes: tuple[int, int],
+    log_odds: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Log scores (v, c) where the candidates' two classes differ by the log odds; the better keeps its score."""
+    refined = scores.copy()
+    best = scores[:, classes].max(axis=1)
+    refined[candidates, classes[0]] = (best + np.minimum(log_odds, 0))[candidates]
+    refined[candidates, classes[1]] = (best - np.maximum(log_odds, 0))[candidates]
+    return refined

@@ -1,0 +1,169 @@
+"""Vehicles in the map: which voxels are one (support by road), and, the paper's way, which of them moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy import ndimage
+
+from gnss_sem_map.refinement.dbscan import NOISE, dbscan
+
+
+class VehicleSettings(BaseModel):
+    """What a vehicle looks like in the map."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    eps_m: float = Field(
+        default=0.5, gt=0, le=3, description="Voxels of one vehicle are at most this far apart, m (DBSCAN)."
+    )
+    min_voxels: int = Field(
+        default=3,
+        ge=1,
+        description="A voxel with this many within `eps_m`, itself included, is inside a vehicle (DBSCAN).",
+    )
+    road_reach_m: float = Field(
+        default=1.0, ge=0, description="A voxel is over road when road is this near in x and y, m."
+    )
+    road_share: float = Field(
+        default=0.3, ge=0, le=1, description="A vehicle stands with more than this share over road."
+    )
+    lowest_m: float = Field(default=0.15, description="Lower than this over the ground is no vehicle, m.")
+    highest_m: float = Field(default=3.5, description="Higher than this over the ground is no vehicle, m.")
+    largest_parked_voxels: int = Field(
+        default=1500, ge=1, description="Mode `paper`: a group of this many voxels moved (eta_D of eq. 13)."
+    )
+    longest_parked_m: float = Field(
+        default=6.0, gt=0, description="Mode `paper`: a group this long moved, m (eta_L of eq. 13)."
+    )
+
+
+class Motion(StrEnum):
+    """What became of an object."""
+
+    PARKED = "parked"
+    MOVING = "moving"
+    STOPPED_AND_LEFT = "stopped and left"
+    UNKNOWN = "unknown"
+    UNSUPPORTED = "unsupported"
+    """No vehicle at all: its voxels fall back to their second-best class."""
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleObject:
+    """One group of vehicle voxels and what was decided about it."""
+
+    number: int
+    motion: Motion
+    reason: str
+    voxels: int
+    centre: NDArray[np.float64]
+    """(3,) m, in the map frame."""
+    length_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleDecision:
+    """What the rules say about every voxel, and the objects that they found."""
+
+    rejected: NDArray[np.bool_]
+    """(v,) called vehicle, but are none."""
+    moving: NDArray[np.bool_]
+    """(v,) belong to something that moved."""
+    objects: tuple[VehicleObject, ...]
+
+
+def paper(
+    indices: NDArray[np.int32], labels: NDArray[np.int8], vehicle: int, road: int, settings: VehicleSettings,
+    voxel_size_m: float,
+) -> VehicleDecision:  # fmt: skip
+    """Eq. 12 and 13 to the letter: no vehicle without road in its column, and large or long groups moved.
+
+    `indices` (v, 3) and `labels` (v,). A group's length is its extent along its principal axis in x and y;
+    voxels that DBSCAN calls noise are no group and stay.
+    """
+    is_vehicle = labels == vehicle
+    over_road = is_vehicle & _over(indices, indices[labels == road], reach_voxels=0.0)
+    members = np.flatnonzero(over_road)
+    clusters = dbscan(indices[members], settings.eps_m / voxel_size_m, settings.min_voxels)
+    moving = np.zeros(len(labels), np.bool_)
+    objects = []
+    for number, group in enumerate(_groups(clusters)):
+        voxels = members[group]
+        length = _length(indices[voxels]) * voxel_size_m
+        moved = len(voxels) >= settings.largest_parked_voxels or length >= settings.longest_parked_m
+        moving[voxels] = moved
+        reason = f"{len(voxels)} voxels, {length:.1f} m long (eq. 13)"
+        motion = Motion.MOVING if moved else Motion.PARKED
+        objects.append(_describe(number, motion, reason, indices[voxels], length, voxel_size_m))
+    return VehicleDecision(is_vehicle & ~over_road, moving, tuple(objects))
+
+
+def supported(
+    indices: NDArray[np.int32], labels: NDArray[np.int8], heights: NDArray[np.float32], vehicle: int, road: int,
+    settings: VehicleSettings, voxel_size_m: float,
+) -> VehicleDecision:  # fmt: skip
+    """Road support by object: a vehicle stands as a whole on or beside road, and at a vehicle's height.
+
+    `heights` (v,) m over ground. Eq. 12 asks every voxel for road in its own column, but under a parked car
+    there is none: the car hides it. Here a group is a vehicle when enough of it is within `road_reach_m` of
+    road.
+    """
+    is_vehicle = labels == vehicle
+    at_height = (heights >= settings.lowest_m) & (heights <= settings.highest_m)
+    members = np.flatnonzero(is_vehicle & at_height)
+    over_road = _over(indices[members], indices[labels == road], settings.road_reach_m / voxel_size_m)
+    clusters = dbscan(indices[members], settings.eps_m / voxel_size_m, settings.min_voxels)
+    kept = np.zeros(len(labels), np.bool_)
+    objects = []
+    for number, group in enumerate(_groups(clusters)):
+        voxels, share = members[group], over_road[group].mean()
+        stands = share > settings.road_share
+        kept[voxels] = stands
+        motion, reason = (
+            Motion.UNKNOWN if stands else Motion.UNSUPPORTED,
+            f"{share:.0%} of its voxels are over road",
+        )
+        length = _length(indices[voxels]) * voxel_size_m
+        objects.append(_describe(number, motion, reason, indices[voxels], length, voxel_size_m))
+    return VehicleDecision(is_vehicle & ~kept, np.zeros(len(labels), np.bool_), tuple(objects))
+
+
+def _describe(
+    number: int, motion: Motion, reason: str, indices: NDArray[np.int32], length_m: float, voxel_size_m: float
+) -> VehicleObject:
+    centre = (indices.mean(axis=0) + 0.5) * voxel_size_m
+    return VehicleObject(number, motion, reason, len(indices), centre, float(length_m))
+
+
+def _groups(clusters: NDArray[np.int32]) -> list[NDArray[np.int64]]:
+    """The members of every cluster, noise left out."""
+    order = np.argsort(clusters, kind="stable")
+    starts = np.searchsorted(clusters[order], np.arange(clusters.max(initial=NOISE) + 1))
+    return np.split(order, starts)[1:]
+
+
+def _length(indices: NDArray[np.int32]) -> float:
+    """Extent along the principal axis in x and y, in voxels; one voxel is one long."""
+    xy = indices[:, :2] - indices[:, :2].mean(axis=0)
+    along = xy @ np.linalg.eigh(xy.T @ xy)[1][:, -1]
+    return float(np.ptp(along)) + 1.0
+
+
+def _over(indices: NDArray[np.int32], road: NDArray[np.int32], reach_voxels: float) -> NDArray[np.bool_]:
+    """Which voxels (v, 3) have a road voxel (r, 3) within a distance in x and y."""
+    if len(indices) == 0 or len(road) == 0:
+        return np.zeros(len(indices), np.bool_)
+    margin = int(reach_voxels)
+    lowest = indices[:, :2].min(axis=0) - margin
+    extent = indices[:, :2].max(axis=0) + margin + 1 - lowest
+    near = ((road[:, :2] >= lowest) & (road[:, :2] < lowest + extent)).all(axis=1)
+    grid = np.zeros(extent, np.bool_)
+    grid[tuple((road[near, :2] - lowest).T)] = True
+    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
+    grid = ndimage.binary_dilation(grid, structure=x**2 + y**2 <= reach_voxels**2 + 1e-9)
+    return np.asarray(grid[tuple((indices[:, :2] - lowest).T)])

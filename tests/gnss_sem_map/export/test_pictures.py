@@ -1,0 +1,103 @@
+"""Pictures show what the map holds, where it is, for a courtyard as for a long drive."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.pictures import hollows, write_topview
+from gnss_sem_map.labels import label_set
+from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack
+
+NAMES = label_set().names
+
+
+def strip(length_m: float) -> SemanticMap:
+    """A road eastward with a hedge along its north side, 0.2 m voxels."""
+    x = np.arange(round(length_m / 0.2))
+    road = np.array([(i, j, 0) for i in x for j in range(20)])
+    hedge = np.array([(i, j, k) for i in x for j in (20, 21) for k in range(3)])
+    indices = np.concatenate([road, hedge])
+    evidence = np.full((len(indices), len(NAMES)), -3000, np.int32)
+    evidence[: len(road), NAMES.index("road")] = -10
+    evidence[len(road) :, NAMES.index("vegetation")] = -10
+    order = np.argsort(pack(indices))
+    hits = np.ones(len(indices), np.uint32)
+    return SemanticMap.of(VoxelMap(0.2, label_set(), pack(indices)[order], evidence[order], hits))
+
+
+def near(image: np.ndarray, name: str, tolerance: float = 0.35) -> np.ndarray:
+    """Where the image (h, w, 3) RGB shows a class: its colour, lighter or darker."""
+    colour = label_set().colours[NAMES.index(name)].astype(float)
+    colour /= np.linalg.norm(colour)
+    norm = np.maximum(np.linalg.norm(image.astype(float), axis=2), 1e-9)
+    return np.asarray((image @ colour / norm > 1 - 0.02 * tolerance) & (image.min(axis=2) < 200))
+
+
+def read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image[..., ::-1]
+
+
+@pytest.mark.parametrize("length_m", [40, 2000])
+def test_north_is_up_and_the_hedge_lies_north_of_the_road(length_m: float, tmp_path: Path) -> None:
+    write_topview(strip(length_m), tmp_path / "topview.png", title="a street")
+    image = read(tmp_path / "topview.png")
+    height, width = image.shape[:2]
+    assert 900 <= width <= 2000
+    framed = image[: height - 90]  # without the legend
+    road, hedge = (np.argwhere(near(framed, name)) for name in ("road", "vegetation"))
+    assert len(road) > 2 * len(hedge) > 0
+    assert hedge[:, 0].max() < road[:, 0].min()
+    assert np.ptp(road[:, 1]) > 0.85 * width
+
+
+def test_the_legend_names_the_classes_that_are_there_and_no_others(
+    street: SemanticMap, tmp_path: Path
+) -> None:
+    write_topview(street, tmp_path / "street.png")
+    write_topview(strip(40), tmp_path / "strip.png")
+    swatches = [read(tmp_path / name)[-80:] for name in ("street.png", "strip.png")]
+    colours = label_set().colours
+    shown = [
+        [name for name, c in zip(NAMES, colours, strict=True) if (s == c).all(axis=2).any()] for s in swatches
+    ]
+    assert shown == [list(NAMES), ["road", "vegetation"]]
+
+
+def test_the_track_is_drawn_on_the_road_that_it_follows(
+    street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    write_topview(street, tmp_path / "without.png")
+    write_topview(street, tmp_path / "with.png", trajectory=track)
+    without, drawn = (read(tmp_path / name)[:-100] for name in ("without.png", "with.png"))
+    changed = (without != drawn).any(axis=2)
+    assert near(without, "road")[changed].mean() > 0.9
+    assert changed.any(axis=0).sum() > 0.9 * without.shape[1]
+
+
+def test_the_removed_car_is_not_in_the_picture(street: SemanticMap, tmp_path: Path) -> None:
+    write_topview(street, tmp_path / "topview.png")
+    image = read(tmp_path / "topview.png")[:-100]
+    columns = np.flatnonzero(near(image, "vehicle").any(axis=0))
+    assert np.ptp(columns) < 0.1 * image.shape[1]
+
+
+def test_an_empty_map_is_refused_in_one_line(street: SemanticMap, tmp_path: Path) -> None:
+    empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
+    with pytest.raises(DataError, match="no voxels to draw"):
+        write_topview(empty, tmp_path / "topview.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_hollows_are_deep_beside_a_step_and_nowhere_else() -> None:
+    depth = np.full((5, 8), 10.0)
+    depth[:, 4:] = 4.0
+    found = hollows(depth, reach=1, most=3.0)
+    expected = np.zeros((5, 8))
+    expected[:, 3] = 3.0 / 4
+    np.testing.assert_allclose(found, expected)

@@ -1,0 +1,107 @@
+"""The map from above, against a dictionary of columns; the GeoTIFF, as rasterio and pyproj see it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.raster import GEOTIFF_NODATA, NOTHING, top_view, write_topview_geotiff
+from gnss_sem_map.export.utm import from_utm, to_utm
+from gnss_sem_map.voxel_map import SemanticMap
+
+AT_THE_EDGE_OF_A_ZONE = LocalFrame(60.0, 6.02, 40.0)  # convergence -2.6 degrees
+
+
+def highest(semantic_map: SemanticMap, per_cell: int) -> dict[tuple[int, int], tuple[int, int]]:
+    """(column, row) in cells from the origin -> index along z and label of the highest shown voxel."""
+    best: dict[tuple[int, int], tuple[int, int]] = {}
+    for (x, y, z), label, shown in zip(
+        semantic_map.voxels.indices.tolist(), semantic_map.labels.tolist(), semantic_map.shown, strict=True
+    ):
+        cell = (x // per_cell, y // per_cell)
+        if shown and (cell not in best or z >= best[cell][0]):
+            best[cell] = (z, label)
+    return best
+
+
+@pytest.mark.parametrize(("longest_side", "per_cell"), [(10_000, 1), (300, 1), (299, 2), (75, 4), (30, 10)])
+def test_the_top_view_is_the_highest_voxel_of_every_column(
+    street: SemanticMap, longest_side: int, per_cell: int
+) -> None:
+    view = top_view(street, longest_side)
+    expected = highest(street, per_cell)
+    assert view.cell_m == pytest.approx(0.2 * per_cell)
+    assert (view.labels != NOTHING).sum() == len(expected)
+    for (column, row), (z, label) in expected.items():
+        i = round(view.north / view.cell_m) - 1 - row
+        j = column - round(view.west / view.cell_m)
+        assert view.heights[i, j] == pytest.approx(0.2 * (z + 1), abs=1e-5)
+        if per_cell == 1:
+            assert view.labels[i, j] == label
+
+
+@pytest.mark.parametrize(
+    "frame", [LocalFrame(49.0, 8.4, 115.0), AT_THE_EDGE_OF_A_ZONE, LocalFrame(-33.9, 151.2, 0)]
+)
+def test_rasterio_finds_every_class_where_pyproj_says_it_is(
+    frame: LocalFrame, street: SemanticMap, tmp_path: Path
+) -> None:
+    write_topview_geotiff(street, frame, tmp_path / "topview_class.tif")
+    view = top_view(street, 10_000)
+    rows, columns = np.nonzero(inside_one_class(view.labels))
+    assert len(rows) > 5000
+    east, north = view.west + (columns + 0.5) * 0.2, view.north - (rows + 0.5) * 0.2
+    utm = to_utm(frame, np.column_stack([east, north, view.heights[rows, columns]]))
+    with rasterio.open(tmp_path / "topview_class.tif") as tiff:
+        assert tiff.crs.to_epsg() == frame.utm_epsg
+        found = np.array([value for (value,) in tiff.sample(utm[:, :2])])
+    np.testing.assert_array_equal(found, view.labels[rows, columns])
+
+
+def inside_one_class(labels: np.ndarray) -> np.ndarray:
+    """Cells whose eight neighbours are of their class: half a pixel of rounding cannot change what lies there."""
+    padded = np.pad(labels, 1, constant_values=NOTHING)
+    neighbours = [
+        padded[1 + i : 1 + i + labels.shape[0], 1 + j : 1 + j + labels.shape[1]]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+    ]
+    return np.asarray((labels != NOTHING) & np.all([n == labels for n in neighbours], axis=0))
+
+
+def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path: Path) -> None:
+    write_topview_geotiff(street, AT_THE_EDGE_OF_A_ZONE, tmp_path / "topview_class.tif")
+    with rasterio.open(tmp_path / "topview_class.tif") as tiff:
+        classes = tiff.read(1)
+    labels = top_view(street, 10_000).labels
+    for label in range(5):
+        assert (classes == label).sum() == pytest.approx((labels == label).sum(), rel=0.02)
+    assert set(np.unique(classes)) == {0, 1, 2, 3, 4, GEOTIFF_NODATA}
+
+
+def test_the_geotiff_says_what_its_values_mean(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    write_topview_geotiff(street, karlsruhe, tmp_path / "topview_class.tif")
+    label_set = street.voxels.label_set
+    with rasterio.open(tmp_path / "topview_class.tif") as tiff:
+        assert (tiff.dtypes, tiff.nodata, tiff.compression.name) == (("uint8",), GEOTIFF_NODATA, "deflate")
+        assert tiff.overviews(1) == [2]
+        assert tiff.colormap(1)[3][:3] == tuple(label_set.colours[3])
+        assert tiff.tags(1)["class_3"] == "building"
+        assert tiff.res == pytest.approx((0.2, 0.2))
+
+
+def test_utm_there_and_back_is_the_identity(street: SemanticMap) -> None:
+    centres = street.voxels.centres[::100]
+    for frame in (AT_THE_EDGE_OF_A_ZONE, LocalFrame(-33.9, 151.2, 0)):
+        np.testing.assert_allclose(from_utm(frame, to_utm(frame, centres)), centres, atol=1e-6)
+
+
+def test_an_empty_map_has_no_top_view(street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path) -> None:
+    empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
+    with pytest.raises(DataError, match="no voxels to draw"):
+        write_topview_geotiff(empty, karlsruhe, tmp_path / "topview_class.tif")

@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError
 
 OTHER = "other"
 """The name of the evidence that belongs to none of the map's classes."""
@@ -46,19 +46,23 @@ class LabelSet:
         count = len(self.names)
         if not 2 <= count <= 64 or len(set(self.names)) != count or OTHER in self.names:
             raise ConfigError(
-                f"class set {self.name!r}: found classes {list(self.names)}, expected 2 to 64 different names, none of them 'other'"
+                f"class set {self.name!r}: found classes {list(self.names)},"
+                " expected 2 to 64 different names, none of them 'other'"
             )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
             if unknown:
                 raise ConfigError(
-                    f"class set {self.name!r}: the table of {source!r} maps to {unknown}, expected one of {list(self.names)}"
+                    f"class set {self.name!r}: the table of {source!r} maps to {unknown},"
+                    f" expected one of {list(self.names)}"
                 )
 
     def index(self, name: str) -> int:
         """Position of a class; raises ConfigError, with the nearest name, where there is none."""
         if name not in self.names:
-            raise ConfigError(f"class set {self.name!r} has no class {name!r}{_did_you_mean(name, self.names)}")
+            raise ConfigError(
+                f"class set {self.name!r} has no class {name!r}{_did_you_mean(name, self.names)}"
+            )
         return self.names.index(name)
 
     def table_from(self, source_names: Sequence[str], source: str | None = None) -> NDArray[np.float32]:
@@ -84,7 +88,9 @@ class LabelSet:
         if len(targets) == 1:
             target = targets.pop()
             return len(self.names) if target == OTHER else self.names.index(target)
-        everything = sorted({n for s in known if s in self.sources for n in taxonomy(s).names} | set(self.names))
+        everything = sorted(
+            {n for s in known if s in self.sources for n in taxonomy(s).names} | set(self.names)
+        )
         if not targets:
             raise ConfigError(
                 f"class {name!r} is unknown to the class set {self.name!r}{_did_you_mean(name, everything)};"
@@ -181,12 +187,3 @@ def _read(name_or_file: str | Path) -> dict[str, Any]:
 def _did_you_mean(name: str, known: Sequence[str]) -> str:
     close = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {close[0]!r}?" if close else f"; known are {list(known)[:12]}"
-
-
-def to_label_set(
-    probabilities: NDArray[Any], class_names: Sequence[str], target: LabelSet, where: str = "class probabilities"
-) -> NDArray[np.float32]:
-    """Sum (h, w, s) class probabilities by name into the map's classes and `other`: (h, w, c + 1), float32."""
-    if probabilities.ndim != 3 or probabilities.shape[2] != len(class_names):
-        raise DataError(f"{where}: found shape {probabilities.shape} for {len(class_names)} class names, expected (h, w, {len(class_names)})")
-    return np.asarray(probabilities, np.float32) @ target.table_from(class_names)

@@ -10,12 +10,13 @@ import bisect
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 
@@ -34,15 +35,24 @@ class Points:
     def __post_init__(self) -> None:
         n = len(self.xyz)
         if self.xyz.shape != (n, 3) or self.intensity.shape != (n,):
-            raise DataError(f"points: found shapes {self.xyz.shape} and {self.intensity.shape}, expected (n, 3) and (n,)")
+            raise DataError(
+                f"points: found shapes {self.xyz.shape} and {self.intensity.shape}, expected (n, 3) and (n,)"
+            )
         if self.stamps is not None and self.stamps.shape != (n,):
             raise DataError(f"points: found {self.stamps.shape} stamps for {n} points, expected one each")
+
+    def __getitem__(self, selection: NDArray[np.bool_]) -> Points:
+        """The points where a boolean mask (n,) holds."""
+        stamps = None if self.stamps is None else self.stamps[selection]
+        return Points(self.xyz[selection], self.intensity[selection], stamps)
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One LiDAR sweep: its number, its stamp, and how to read it."""
+    """One LiDAR sweep: its name and number, its stamp, and how to read it."""
 
+    name: str
+    """File name without its ending: what the sweep's labels are named after."""
     number: int
     """Frame number, from the file name."""
     stamp: float
@@ -88,7 +98,9 @@ class Calibration:
                     " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
                 )
         if self.K is not None and (self.K.shape != (3, 3) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0):
-            raise DataError(f"calibration: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths")
+            raise DataError(
+                f"calibration: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths"
+            )
 
     @property
     def has_camera(self) -> bool:
@@ -129,6 +141,8 @@ class SensorLog:
     """Origin of the map; None when the drive has no georeference."""
     imu: ImuSamples | None = None
     gnss: GnssFixes | None = None
+    imu_noise: ImuNoise | None = None
+    """None: the estimator's default."""
     given: Trajectory | None = None
     """Poses that came with the drive; where they are there, nothing is smoothed."""
     reference: Trajectory | None = None
@@ -138,8 +152,10 @@ class SensorLog:
     def __post_init__(self) -> None:
         for what, items in (("scans", self.scans), ("images", self.images)):
             stamps = [item.stamp for item in items]
-            if any(b <= a for a, b in zip(stamps, stamps[1:], strict=False)):
-                raise DataError(f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first")
+            if any(b <= a for a, b in pairwise(stamps)):
+                raise DataError(
+                    f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first"
+                )
         if self.given is None and (self.imu is None or self.gnss is None):
             raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
 

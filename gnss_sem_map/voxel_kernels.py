@@ -50,7 +50,7 @@ def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _home(key, bits):  # type: ignore[no-untyped-def]
+def _home(key, bits):
     """Row where the search for a key begins: the top bits of a multiplicative hash."""
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h ^= h >> uint64(32)
@@ -59,7 +59,7 @@ def _home(key, bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_or_insert(rows, bits, key):  # type: ignore[no-untyped-def]
+def _find_or_insert(rows, bits, key):
     mask = len(rows) - 1
     slot = _home(key, bits)
     while rows[slot, 0] != key and rows[slot, 0] != 0:
@@ -68,7 +68,7 @@ def _find_or_insert(rows, bits, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def pack_keys(p_map, voxel_size_m, keys):  # type: ignore[no-untyped-def]
+def pack_keys(p_map, voxel_size_m, keys):
     """Voxel key of every point; returns the first point that is NaN or beyond the addressable volume, or -1."""
     for i in range(len(p_map)):
         key = int64(0)
@@ -84,7 +84,7 @@ def pack_keys(p_map, voxel_size_m, keys):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def fuse(rows, ints, bits, count, keys, pixels, classes, log_table, floor_percent):  # type: ignore[no-untyped-def]
+def fuse(rows, ints, bits, count, keys, pixels, classes, log_table, floor_percent):
     """Add one scan to the table (eq. 6, as a sum of logarithms); returns the new number of voxels, or -1 on overflow.
 
     `pixels[i]` is the row of `classes` (p, c + 1; uint8 probabilities, `other` last) that point i saw, or -1. The
@@ -122,7 +122,7 @@ def fuse(rows, ints, bits, count, keys, pixels, classes, log_table, floor_percen
 
 
 @njit(cache=True, nogil=True)
-def rehash(old, new, new_bits):  # type: ignore[no-untyped-def]
+def rehash(old, new, new_bits):
     """Move every voxel of a table into a larger, empty one."""
     for i in range(len(old)):
         if old[i, 0] != 0:
@@ -132,7 +132,7 @@ def rehash(old, new, new_bits):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def transform_along(xyz, stamps, first_stamp, step_s, poses, out):  # type: ignore[no-untyped-def]
+def transform_along(xyz, stamps, first_stamp, step_s, poses, out):
     """Move every point with the pose at its own stamp, blended linearly between closely spaced poses (k, 3, 4)."""
     last = len(poses) - 2
     for i in range(len(xyz)):
@@ -151,7 +151,7 @@ def transform_along(xyz, stamps, first_stamp, step_s, poses, out):  # type: igno
 
 
 @njit(cache=True, nogil=True)
-def project(p_map, P, nearest_m, half_rows, half_columns, u, v, depth, zbuffer):  # type: ignore[no-untyped-def]
+def project(p_map, P, nearest_m, half_rows, half_columns, u, v, depth, zbuffer):
     """Pixel and depth of every point (eq. 3, 4), -1 outside; the z-buffer keeps the nearest depth in a window."""
     height, width = zbuffer.shape
     zbuffer[:, :] = np.inf
@@ -172,7 +172,7 @@ def project(p_map, P, nearest_m, half_rows, half_columns, u, v, depth, zbuffer):
 
 
 @njit(cache=True, nogil=True)
-def visible(u, v, depth, zbuffer, tolerance_ratio, tolerance_m, shrink, class_width, class_height, pixels):  # type: ignore[no-untyped-def]
+def visible(u, v, depth, zbuffer, tolerance_ratio, tolerance_m, shrink, class_width, class_height, pixels):
     """Row of the class image that each point sees, or -1 where it is outside or something nearer hides it."""
     count = 0
     for i in range(len(u)):
@@ -185,7 +185,7 @@ def visible(u, v, depth, zbuffer, tolerance_ratio, tolerance_m, shrink, class_wi
 
 
 @njit(cache=True, nogil=True)
-def find(keys, wanted, places):  # type: ignore[no-untyped-def]
+def find(keys, wanted, places):
     """Place of every wanted key in sorted `keys`, or -1; neighbours in a scan are often the same voxel."""
     previous_key, previous_place = int64(-1), int64(-1)
     for i in range(len(wanted)):

@@ -1,7 +1,7 @@
 """The map: a set of voxels with class evidence, in which Bayes' rule (eq. 6) is addition.
 
-Evidence is kept as integer sums of log-likelihoods, so adding is exact: any order of scans, any chunking and any
-merge give the same map, bit for bit. `VoxelTable` collects, `VoxelMap` is the value that comes out, and
+Evidence is kept as integer sums of log-likelihoods, so adding is exact: any order of scans, any chunking and
+any merge give the same map, bit for bit. `VoxelTable` collects, `VoxelMap` is the value that comes out, and
 `SemanticMap` is a map with a decision for every voxel.
 """
 
@@ -30,8 +30,12 @@ class MappingSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
-    nearest_m: float = Field(1.0, ge=0, description="Returns nearer to the LiDAR than this are left out (the car itself).")
-    farthest_m: float = Field(120.0, gt=0, description="Returns farther from the LiDAR than this are left out.")
+    nearest_m: float = Field(
+        1.0, ge=0, description="Returns nearer to the LiDAR than this are left out (the car itself)."
+    )
+    farthest_m: float = Field(
+        120.0, gt=0, description="Returns farther from the LiDAR than this are left out."
+    )
 
 
 class State(IntEnum):
@@ -106,12 +110,12 @@ class VoxelMap:
     @cached_property
     def centres(self) -> NDArray[np.float64]:
         """(v, 3) m, in the map frame."""
-        return (self.indices + 0.5) * self.voxel_size_m
+        return (self.indices + np.float64(0.5)) * self.voxel_size_m
 
     @cached_property
     def observed(self) -> NDArray[np.bool_]:
         """(v,) whether any camera saw the voxel."""
-        return self.evidence.any(axis=1)
+        return np.asarray(self.evidence.any(axis=1))
 
     @cached_property
     def labels(self) -> NDArray[np.int8]:
@@ -121,7 +125,7 @@ class VoxelMap:
     @cached_property
     def probabilities(self) -> NDArray[np.float32]:
         """(v, c) class probabilities (eq. 6, normalised); even where no camera saw the voxel."""
-        return softmax(self.evidence.astype(np.float32) / UNITS_PER_NAT)
+        return softmax(self.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT))
 
     def places(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Row of each of these keys in the map, or -1."""
@@ -143,7 +147,11 @@ class SemanticMap:
     """(v,) of `State`."""
 
     def __post_init__(self) -> None:
-        for name, values in (("labels", self.labels), ("confidence", self.confidence), ("states", self.states)):
+        for name, values in (
+            ("labels", self.labels),
+            ("confidence", self.confidence),
+            ("states", self.states),
+        ):
             if values.shape != (len(self.voxels),):
                 raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
 
@@ -164,7 +172,7 @@ class SemanticMap:
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
         """(v,) voxels with a label that belong to the map: all but the removed ones."""
-        return (self.labels >= 0) & (self.states != State.REMOVED)
+        return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
 
 
 class VoxelTable:
@@ -215,7 +223,9 @@ class VoxelTable:
             keys, pixels, classes, self._log_table, self._floor_percent,
         )  # fmt: skip
         if count < 0:
-            raise DataError("a voxel was seen so often that its evidence overflows; does the vehicle stand for hours?")
+            raise DataError(
+                "a voxel was seen so often that its evidence overflows; does the vehicle stand for hours?"
+            )
         self._count = count
 
     def to_map(self) -> VoxelMap:
@@ -262,7 +272,7 @@ def log_table(number_of_classes: int, floor_percent: int) -> NDArray[np.int32]:
     largest = number_of_classes * max(100 * 255, floor_percent * 255 * number_of_classes)
     numbers = np.arange(largest + 1, dtype=np.float64)
     numbers[0] = 1.0
-    return np.rint(UNITS_PER_NAT * np.log(numbers)).astype(np.int32)
+    return np.asarray(np.rint(UNITS_PER_NAT * np.log(numbers)), np.int32)
 
 
 def softmax(log_scores: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,0 +1,101 @@
+"""All settings of a run: one frozen model per stage, YAML in and out, `a.b=c` on the command line."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from factor_graphs.smoothing import SmootherSettings
+from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.labelling import LabellingSettings
+from gnss_sem_map.refinement import RefinementSettings
+from gnss_sem_map.voxel_map import MappingSettings
+
+
+class Settings(BaseModel):
+    """Everything that can be chosen about a run; each part stands beside the stage that it drives."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    classes: str = Field("urban", description="Class set of the map: a shipped one, or a YAML file.")
+    trajectory: SmootherSettings = Field(
+        default_factory=SmootherSettings, description="GNSS and IMU smoothing."
+    )
+    mapping: MappingSettings = Field(MappingSettings(), description="Points to voxels.")
+    labelling: LabellingSettings = Field(LabellingSettings(), description="Pixels to points.")
+    refinement: RefinementSettings = Field(
+        default_factory=RefinementSettings, description="Batch refinement."
+    )
+
+    def to_yaml(self) -> str:
+        """These settings as a file that `load` reads back."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
+    """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one."""
+    content = _read(file) if file is not None else {}
+    for override in overrides:
+        _apply(content, override)
+    try:
+        return Settings.model_validate(content)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, str(file) if file else "--set")) from None
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(file.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot read the settings ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file}: not YAML ({str(error).splitlines()[0]})") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(
+            f"{file}: found {type(content).__name__}, expected sections {sorted(Settings.model_fields)}"
+        )
+    return content
+
+
+def _apply(content: dict[str, Any], override: str) -> None:
+    key, equals, value = override.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"--set {override!r}: expected section.name=value")
+    *sections, name = key.split(".")
+    for section in sections:
+        content = content.setdefault(section, {})
+        if not isinstance(content, dict):
+            raise ConfigError(f"--set {override!r}: {section!r} is a value, not a section")
+    try:
+        content[name] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"--set {override!r}: the value is not YAML") from None
+
+
+def _explain(error: ValidationError, where: str) -> str:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = _keys_beside(first["loc"])
+        close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known are {known}"
+        return f"{where}: unknown setting {place!r}; {hint}"
+    return f"{where}: {place}: {first['msg']} (found {first['input']!r})"
+
+
+def _keys_beside(place: Sequence[int | str]) -> list[str]:
+    """The keys that stand beside an unknown one: those of the innermost section."""
+    model: Any = Settings
+    for part in place[:-1]:
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            return []
+        model = model.model_fields[str(part)].annotation
+    is_section = isinstance(model, type) and issubclass(model, BaseModel)
+    return sorted(model.model_fields) if is_section else []

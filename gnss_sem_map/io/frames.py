@@ -1,0 +1,50 @@
+"""Files numbered by frame: the number in the name is the key, the position in the folder means nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+
+
+def numbered(folder: Path, suffix: str) -> dict[int, Path]:
+    """The files of a folder by the frame number in their name, in order; empty when there is no such folder."""
+    if not folder.is_dir():
+        return {}
+    found = {int(path.stem): path for path in folder.glob(f"*{suffix}") if path.stem.isdecimal()}
+    return dict(sorted(found.items()))
+
+
+def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:
+    """Rows of little-endian float32 (n, columns); raises DataError for a file that is cut short or empty."""
+    try:
+        size = path.stat().st_size
+        if size == 0 or size % (4 * columns):
+            raise DataError(
+                f"{path}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more than 0"
+            )
+        return np.fromfile(path, "<f4").reshape(-1, columns)
+    except OSError as error:
+        raise DataError(f"{path}: cannot read the scan ({error.strerror})") from None
+
+
+def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3); raises DataError for a damaged file or another (width, height) than the calibration's."""
+    import cv2
+
+    try:
+        content = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DataError(f"{path}: cannot read the image ({error.strerror})") from None
+    pixels = cv2.imdecode(content, cv2.IMREAD_COLOR) if content.size else None
+    if pixels is None:
+        raise DataError(f"{path}: damaged image; expected PNG or JPEG")
+    if size is not None and (pixels.shape[1], pixels.shape[0]) != size:
+        raise DataError(
+            f"{path}: found {pixels.shape[1]} x {pixels.shape[0]} pixels, expected {size[0]} x {size[1]} as in the"
+            " calibration; is this the right camera, and the rectified image?"
+        )
+    return np.ascontiguousarray(pixels[:, :, ::-1])

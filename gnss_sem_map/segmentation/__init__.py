@@ -1,0 +1,82 @@
+"""Image in, class probabilities out: what a segmenter is, and how one is opened.
+
+Cheap to import: torch, transformers and onnxruntime are imported by the segmenter that needs them, when it is opened.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import parse_qsl
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.sensor_log import Image
+
+
+class Segmenter(Protocol):
+    """Whatever gives every pixel of a camera image its class probabilities."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """The source's own names, one per channel; `LabelSet.table_from` maps them to the map's classes."""
+        ...
+
+    def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
+        """Probabilities (h, w, c): uint8 as round(255 p), or float32 in 0..1; all zero where nothing is known.
+
+        (h, w) is the image's size, or that size divided by an integer and rounded down. Raises DataError.
+        """
+        ...
+
+
+class MissingLabels(DataError):
+    """The segmenter has nothing for this one frame; the map goes on without its labels."""
+
+
+SCHEMES = {
+    "labels": "labels:FOLDER[?ids=train_id|label_id&taxonomy=cityscapes]",
+}
+"""How a segmenter is asked for, by the word before the colon."""
+
+
+def open_segmenter(
+    spec: str, label_set: LabelSet, device: str = "auto", expected_size: tuple[int, int] | None = None
+) -> Segmenter:
+    """Open a segmenter from its one-line description, and try what can be tried before the drive begins.
+
+    `spec` is one of `SCHEMES`; `expected_size` (width, height) is the camera's, px; `device` is auto, cpu, cuda or a
+    torch device. Raises ConfigError for a wrong description, DataError for files that are not what they must be.
+    """
+    scheme, place, options = _parse(spec)
+    match scheme:
+        case "labels":
+            from gnss_sem_map.segmentation.cached import CachedLabels
+
+            _only(options, spec, "ids", "taxonomy")
+            return CachedLabels(Path(place), label_set, expected_size, **options)
+    raise ConfigError(
+        f"segmenter {spec!r}: unknown kind {scheme!r}; expected one of {list(SCHEMES.values())}"
+    )
+
+
+def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
+    scheme, colon, rest = spec.partition(":")
+    place, mark, query = rest.partition("?")
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    if scheme in SCHEMES and (not colon or not place):
+        raise ConfigError(f"segmenter {spec!r}: found nothing after {scheme!r}; expected {SCHEMES[scheme]}")
+    if mark and not options:
+        raise ConfigError(
+            f"segmenter {spec!r}: found no options after '?', expected name=value joined by '&'"
+        )
+    return scheme, place, options
+
+
+def _only(options: dict[str, str], spec: str, *allowed: str) -> None:
+    unknown = sorted(set(options) - set(allowed))
+    if unknown:
+        raise ConfigError(f"segmenter {spec!r}: unknown options {unknown}; expected some of {list(allowed)}")

@@ -1,0 +1,141 @@
+"""The first guess: where the vehicle was, how fast, and which way it looked, before any graph.
+
+Position and velocity come from a constant-velocity Kalman smoother over the fixes, roll and pitch from
+the mean specific force, heading from the gyroscope tied to the course. A good start matters: from straight
+lines between fixes the optimiser stays in a wrong valley after a long outage.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.intervals import ImuIntervals
+from factor_graphs.measurements import GnssFixes
+
+Array = NDArray[np.float64]
+
+# Random acceleration of the constant-velocity model, m/s²/√Hz: brisk driving.
+CRUISE_NOISE_DENSITY = 1.5
+# Course says nothing about heading below this speed, m/s, nor this far, s, from a fix.
+MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
+# The gyroscope's heading is tied to the course over this long, s.
+HEADING_WINDOW_S = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudePrior:
+    """What is known of the attitude at the IMU's first stamp: a rotation and its standard deviations.
+
+    `R_map_imu` (3, 3); `stddevs` (3,) rad about the imu's x, y, z. Raises MeasurementError when it is no
+    rotation or a stddev is not positive.
+    """
+
+    R_map_imu: Array
+    stddevs: Array
+
+    def __post_init__(self) -> None:
+        R, stddevs = np.asarray(self.R_map_imu, dtype=np.float64), np.asarray(self.stddevs, dtype=np.float64)
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise MeasurementError(f"AttitudePrior.R_map_imu is no rotation: {R.tolist()}")
+        if stddevs.shape != (3,) or not np.all(stddevs > 0):
+            raise MeasurementError(f"AttitudePrior.stddevs is {stddevs}; expected three positive values, rad")
+        object.__setattr__(self, "R_map_imu", R)
+        object.__setattr__(self, "stddevs", stddevs)
+
+
+def first_guess(
+    intervals: ImuIntervals, fixes: GnssFixes, p_imu_antenna: Array, attitude: AttitudePrior | None = None
+) -> tuple[Array, Array]:
+    """Poses (k, 4, 4) and velocities (k, 3) of the imu at the keyframes."""
+    positions, velocities = constant_velocity(fixes, intervals)
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    T[:, :3, :3] = attitudes(intervals, fixes, velocities, attitude)
+    T[:, :3, 3] = positions - T[:, :3, :3] @ p_imu_antenna
+    return T, velocities
+
+
+def constant_velocity(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array, Array]:
+    """Positions and velocities of the antenna at the keyframes, (k, 3) each: Kalman filter and RTS smoother.
+
+    The axes are independent of each other, but filtered together.
+    """
+    from filterpy.kalman import KalmanFilter
+
+    kalman = KalmanFilter(dim_x=6, dim_z=3)
+    kalman.x = np.concatenate([fixes.positions[0], np.zeros(3)])
+    kalman.P = np.diag(np.repeat([1e4, 4e2], 3))
+    kalman.H = np.eye(3, 6)
+    stamps = intervals.keyframes
+    fix_at = dict(zip(intervals.keyframe_of(fixes.stamps).tolist(), range(len(fixes)), strict=True))
+    means, covariances, Fs, Qs = [], [], [], []
+    for i, dt in enumerate(np.diff(stamps, prepend=stamps[0])):
+        F = np.eye(6)
+        F[:3, 3:] = dt * np.eye(3)
+        Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], CRUISE_NOISE_DENSITY**2 * np.eye(3))
+        kalman.predict(F=F, Q=Q)
+        if i in fix_at:
+            kalman.update(fixes.positions[fix_at[i]], R=np.diag(fixes.stddevs[fix_at[i]] ** 2))
+        means.append(kalman.x)
+        covariances.append(kalman.P)
+        Fs.append(F)
+        Qs.append(Q)
+    smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs[1:] + Fs[:1], Qs[1:] + Qs[:1])[
+        0
+    ]
+    return smoothed[:, :3], smoothed[:, 3:]
+
+
+def attitudes(
+    intervals: ImuIntervals, fixes: GnssFixes, velocities: Array, attitude: AttitudePrior | None = None
+) -> Array:
+    """Rotations R_map_imu (k, 3, 3) at the keyframes: level, and heading as gyroscope and course agree."""
+    level = levelled(intervals) if attitude is None else _without_heading(attitude.R_map_imu)
+    turn = (intervals.angular_rate @ level[2]) * intervals.durations
+    turned = np.concatenate([[0.0], np.cumsum(turn)])[intervals.bounds]
+    speed = np.hypot(velocities[:, 0], velocities[:, 1])
+    age = np.abs(_nearest(fixes.stamps, intervals.keyframes) - intervals.keyframes)
+    weight = np.where((speed > MIN_COURSE_SPEED) & (age < MAX_COURSE_AGE), np.minimum(speed, 10.0), 0.0)
+    ahead = np.exp(1j * (np.arctan2(velocities[:, 1], velocities[:, 0]) - turned))
+    if attitude is not None:
+        weight[0] = 1 / attitude.stddevs[2]
+        ahead[0] = np.exp(1j * np.arctan2(attitude.R_map_imu[1, 0], attitude.R_map_imu[0, 0]))
+    heading = turned + np.angle(_smooth(intervals.keyframes, ahead, weight))
+    return (Rotation.from_euler("z", heading[:, None]) * Rotation.from_matrix(level)).as_matrix()
+
+
+def levelled(intervals: ImuIntervals) -> Array:
+    """The rotation (3, 3), heading zero, that turns the mean specific force upwards."""
+    mean = np.average(intervals.specific_force, axis=0, weights=intervals.durations)
+    pitch, roll = np.arctan2(-mean[0], np.hypot(mean[1], mean[2])), np.arctan2(mean[1], mean[2])
+    return Rotation.from_euler("ZYX", [0.0, pitch, roll]).as_matrix()
+
+
+def _without_heading(R: Array) -> Array:
+    return Rotation.from_euler("z", -np.arctan2(R[1, 0], R[0, 0])).as_matrix() @ R
+
+
+def _smooth(stamps: Array, directions: NDArray[np.complex128], weights: Array) -> NDArray[np.complex128]:
+    """Weighted mean of unit numbers over a Gaussian window; the nearest known where the window is empty."""
+    if not weights.any():
+        return np.ones(len(stamps), dtype=complex)
+    step = max(0.1, float(np.median(np.diff(stamps))))
+    cell = ((stamps - stamps[0]) / step).astype(int)
+    total = np.zeros((3, cell[-1] + 1))
+    np.add.at(total.T, cell, np.column_stack([weights, weights * directions.real, weights * directions.imag]))
+    total = gaussian_filter1d(total, HEADING_WINDOW_S / step, axis=1, mode="constant", truncate=4.0)
+    known = np.flatnonzero(total[0] > 1e-3 * total[0].max())
+    nearest = _nearest(known, np.arange(total.shape[1]))
+    smoothed: NDArray[np.complex128] = (total[1] + 1j * total[2])[nearest][cell]
+    return smoothed
+
+
+def _nearest(known: NDArray[Any], wanted: NDArray[Any]) -> NDArray[Any]:
+    """The value of `known`, sorted, nearest to each one wanted."""
+    right = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(known[left] - wanted) <= np.abs(known[right] - wanted), known[left], known[right])

@@ -1,0 +1,116 @@
+"""From keyframes to every IMU stamp: propagated from one keyframe, closed on the next.
+
+The IMU leads from each keyframe to the next and misses it by a little. That misclosure is spread over the
+interval as a cubic in position and a constant turn in attitude: for white noise on force and rate this is
+the most probable path between the two ends, and there is no step at a keyframe.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.intervals import ImuIntervals
+from factor_graphs.measurements import ImuNoise
+from factor_graphs.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+def densify(
+    intervals: ImuIntervals, keyframes: Trajectory, biases: Array, noise: list[ImuNoise], frame: LocalFrame
+) -> Trajectory:
+    """The trajectory at every node of the intervals: all IMU stamps and all keyframes.
+
+    `keyframes` (k) with velocities and covariances; `biases` (k, 6), accelerometer then gyroscope; `noise`
+    of each of the k - 1 intervals.
+    """
+    assert keyframes.velocities is not None
+    which = np.repeat(np.arange(len(keyframes) - 1), np.diff(intervals.bounds))
+    last, spans = intervals.bounds[1:] - 1, np.diff(intervals.keyframes)[:, None]
+    u = ((intervals.nodes[:-1] - intervals.keyframes[which]) / spans[which, 0])[:, None]
+    bias = (1 - u) * biases[which] + u * biases[which + 1]
+    R, R_end = _turn(intervals, keyframes.T_map_imu[:, :3, :3], intervals.angular_rate - bias[:, 3:], frame)
+    v, v_end, p, p_end = _move(
+        intervals, keyframes, R, intervals.specific_force - bias[:, :3], which, u, frame
+    )
+
+    turn = Rotation.from_matrix(np.swapaxes(R_end, 1, 2) @ keyframes.T_map_imu[1:, :3, :3]).as_rotvec()
+    dv, dp = (keyframes.velocities[1:] - v_end[last]) * spans, keyframes.positions[1:] - p_end[last]
+    square, cube = (3 * dp - dv)[which], (dv - 2 * dp)[which]
+    T = np.concatenate([np.tile(np.eye(4), (len(p), 1, 1)), keyframes.T_map_imu[-1:]])
+    T[:-1, :3, :3] = R @ Rotation.from_rotvec(u * turn[which]).as_matrix()
+    T[:-1, :3, 3] = p + u**2 * (square + u * cube)
+    v = v + u * (2 * square + 3 * u * cube) / spans[which]
+    velocities = np.concatenate([v, keyframes.velocities[-1:]])
+    return Trajectory(intervals.nodes, T, velocities, _covariances(keyframes, T, noise, which, u[:, 0]))
+
+
+def _turn(intervals: ImuIntervals, R_keyframes: Array, rate: Array, frame: LocalFrame) -> tuple[Array, Array]:
+    """Attitude at the start of every step (n, 3, 3), and at the end of every interval (k - 1, 3, 3)."""
+    dt, bounds = intervals.durations[:, None], intervals.bounds
+    turns = Rotation.from_rotvec(rate * dt).as_matrix()
+    earth = Rotation.from_rotvec(-frame.earth_rate * dt).as_matrix()
+    R, now = np.empty((len(dt), 3, 3)), R_keyframes[:-1].copy()
+    for step in range(int(np.max(np.diff(bounds)))):
+        active = np.flatnonzero(bounds[:-1] + step < bounds[1:])
+        at = bounds[active] + step
+        R[at] = now[active]
+        now[active] = earth[at] @ now[active] @ turns[at]
+    return R, now
+
+
+def _move(
+    intervals: ImuIntervals,
+    keyframes: Trajectory,
+    R: Array,
+    force: Array,
+    which: NDArray[np.intp],
+    u: Array,
+    frame: LocalFrame,
+) -> tuple[Array, Array, Array, Array]:
+    """Velocity and position at the start and at the end of every step, (n, 3) each: v, v_end, p, p_end."""
+    assert keyframes.velocities is not None
+    dt = intervals.durations[:, None]
+    about = (1 - u) * keyframes.velocities[which] + u * keyframes.velocities[which + 1]
+    a = np.einsum("nij,nj->ni", R, force) - 2 * np.cross(frame.earth_rate, about) - [0.0, 0.0, frame.gravity]
+    v_end = keyframes.velocities[which] + _sum_since_keyframe(a * dt, intervals.bounds, which)
+    v = v_end - a * dt
+    step = (v + a * dt / 2) * dt
+    p_end = keyframes.positions[which] + _sum_since_keyframe(step, intervals.bounds, which)
+    return v, v_end, p_end - step, p_end
+
+
+def _sum_since_keyframe(steps: Array, bounds: NDArray[np.intp], which: NDArray[np.intp]) -> Array:
+    total = np.cumsum(steps, axis=0)
+    before = np.concatenate([np.zeros((1, 3)), total[bounds[1:-1] - 1]])
+    since: Array = total - before[which]
+    return since
+
+
+def _covariances(
+    keyframes: Trajectory, T: Array, noise: list[ImuNoise], which: NDArray[np.intp], u: Array
+) -> Array:
+    """Pose covariances at every node: the keyframes' own, mixed, and the noise of the bridge between them.
+
+    The error of the path is the mixture of the two ends' errors, so the mixture of their covariances is an
+    upper bound whatever their correlation. A bridge of white noise of density d over a span S adds
+    d² S u (1 - u) to a turn and d² S³ (u (1 - u))³ / 3 to a position.
+    """
+    assert keyframes.covariances is not None
+    turn = np.zeros((len(keyframes), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = keyframes.T_map_imu[:, :3, :3]
+    in_map = turn @ keyframes.covariances @ np.swapaxes(turn, 1, 2)
+    share = u[:, None, None]
+    mixed = (1 - share) * in_map[which] + share * in_map[which + 1]
+    bridge, spans = u * (1 - u), np.diff(keyframes.stamps)
+    rotation = np.array([n.gyroscope_noise_density**2 for n in noise]) * spans
+    position = np.array([n.accelerometer_noise_density**2 for n in noise]) * spans**3 / 3
+    diagonal = np.column_stack(
+        [np.tile(rotation[which] * bridge, (3, 1)).T, np.tile(position[which] * bridge**3, (3, 1)).T]
+    )
+    mixed[:, range(6), range(6)] += diagonal
+    back = np.zeros((len(T), 6, 6))
+    back[:, :3, :3] = back[:, 3:, 3:] = np.swapaxes(T[:, :3, :3], 1, 2)
+    covariances: Array = back @ np.concatenate([mixed, in_map[-1:]]) @ np.swapaxes(back, 1, 2)
+    return covariances

@@ -1,0 +1,96 @@
+"""One function per factor: how each measurement binds the pose X, velocity V and bias B of the keyframes."""
+
+from collections.abc import Iterator
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
+
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.intervals import ImuIntervals
+from factor_graphs.measurements import GnssFixes, ImuNoise
+
+Array = NDArray[np.float64]
+
+# GTSAM's own error of integration, m²/s: far below any IMU's, but it keeps short intervals regular.
+INTEGRATION_VARIANCE = 1e-8
+
+
+def preintegration_params(noise: ImuNoise, frame: LocalFrame) -> gtsam.PreintegrationCombinedParams:
+    """Everything GTSAM must know of the IMU and of the Earth: it presumes identity for what is not set."""
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(frame.gravity)
+    params.setAccelerometerCovariance(noise.accelerometer_noise_density**2 * np.eye(3))
+    params.setGyroscopeCovariance(noise.gyroscope_noise_density**2 * np.eye(3))
+    params.setBiasAccCovariance(noise.accelerometer_bias_walk**2 * np.eye(3))
+    params.setBiasOmegaCovariance(noise.gyroscope_bias_walk**2 * np.eye(3))
+    params.setIntegrationCovariance(INTEGRATION_VARIANCE * np.eye(3))
+    params.setOmegaCoriolis(frame.earth_rate)
+    return params
+
+
+def imu_factors(
+    intervals: ImuIntervals, noise: list[ImuNoise], frame: LocalFrame
+) -> Iterator[gtsam.CombinedImuFactor]:
+    """The preintegrated IMU from each keyframe to the next (Forster et al. 2017), bias walk included."""
+    params = {id(n): preintegration_params(n, frame) for n in noise}
+    steps = zip(intervals.specific_force, intervals.angular_rate, intervals.durations.tolist(), strict=True)
+    for i, count in enumerate(np.diff(intervals.bounds).tolist()):
+        pim = gtsam.PreintegratedCombinedMeasurements(params[id(noise[i])])
+        integrate = pim.integrateMeasurement
+        for _ in range(count):
+            integrate(*next(steps))
+        yield gtsam.CombinedImuFactor(X(i), V(i), X(i + 1), V(i + 1), B(i), B(i + 1), pim)
+
+
+def gnss_factors(
+    fixes: GnssFixes,
+    keyframes: NDArray[np.intp],
+    p_imu_antenna: Array,
+    loss: gtsam.noiseModel.mEstimator.Base | None,
+) -> Iterator[gtsam.GPSFactorArm]:
+    """Every fix holds the antenna of its keyframe's pose."""
+    for keyframe, position, stddevs in zip(keyframes.tolist(), fixes.positions, fixes.stddevs, strict=True):
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(stddevs)
+        if loss is not None:
+            model = gtsam.noiseModel.Robust.Create(loss, model)
+        yield gtsam.GPSFactorArm(X(keyframe), position, p_imu_antenna, model)
+
+
+def prior_factors(
+    pose: Array,
+    velocity: Array,
+    attitude: AttitudePrior,
+    position_stddev: float,
+    speed_stddev: float,
+    noise: ImuNoise,
+) -> Iterator[gtsam.NonlinearFactor]:
+    """What is known of the first keyframe before any fix: finite in every direction, or GTSAM 4.3 fails."""
+    pose_stddevs = np.concatenate([attitude.stddevs, np.full(3, position_stddev)])
+    rotation = gtsam.Rot3(attitude.R_map_imu)
+    yield gtsam.PriorFactorPose3(
+        X(0), gtsam.Pose3(rotation, pose[:3, 3]), gtsam.noiseModel.Diagonal.Sigmas(pose_stddevs)
+    )
+    yield gtsam.PriorFactorVector(V(0), velocity, gtsam.noiseModel.Isotropic.Sigma(3, speed_stddev))
+    bias_stddevs = np.repeat([noise.accelerometer_bias_stddev, noise.gyroscope_bias_stddev], 3)
+    yield gtsam.PriorFactorConstantBias(
+        B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(bias_stddevs)
+    )
+
+
+def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:
+    """Keyframe states (k, 4, 4), (k, 3), (k, 6) as GTSAM values."""
+    values = gtsam.Values()
+    for i, (pose, velocity, bias) in enumerate(zip(T, velocities, biases, strict=True)):
+        values.insert(X(i), gtsam.Pose3(pose))
+        values.insert(V(i), velocity)
+        values.insert(B(i), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+    return values
+
+
+def from_values(values: gtsam.Values, k: int) -> tuple[Array, Array, Array]:
+    """GTSAM values as keyframe states: poses (k, 4, 4), velocities (k, 3), biases (k, 6)."""
+    T = np.array([values.atPose3(X(i)).matrix() for i in range(k)])
+    velocities = np.array([values.atVector(V(i)) for i in range(k)])
+    return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(k)])

@@ -1,0 +1,135 @@
+"""The IMU between keyframes: where the keyframes are, and the steps that lead from one to the next."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.measurements import ImuNoise, ImuSamples
+
+Array = NDArray[np.float64]
+
+# A fix this close to a keyframe is taken at the keyframe; shorter intervals have no usable covariance.
+SAME_STAMP_S = 5e-4
+# Below this rate the samples miss motion between them: they show more noise than the sensor has.
+ALIASED_BELOW_HZ = 50.0
+# Longer steps are subdivided: noise is continuous, and the covariance of a single step would be singular;
+# and the dense trajectory has a knot at every step.
+MAX_STEP_S = 0.01
+# What a road vehicle may do unseen while the IMU is silent: acceleration m/s², rate rad/s.
+UNSEEN_FORCE, UNSEEN_RATE = 2.0, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ImuIntervals:
+    """The IMU cut at keyframes into steps of constant specific force and angular rate (trapezoid).
+
+    `keyframes` (k,) s; steps `bounds[i]:bounds[i + 1]` lead from keyframe i to i + 1; `nodes` (n + 1,) s are
+    the ends of the steps; `specific_force` (n, 3), in the axes that the imu has at the start of the step,
+    and `angular_rate` (n, 3); `blind` (k - 1,): no IMU there.
+    """
+
+    keyframes: Array
+    bounds: NDArray[np.intp]
+    nodes: Array
+    specific_force: Array
+    angular_rate: Array
+    blind: NDArray[np.bool_]
+
+    @property
+    def durations(self) -> Array:
+        """Length of every step, (n,) s."""
+        return np.diff(self.nodes)
+
+    def noise(self, noise: ImuNoise) -> list[ImuNoise]:
+        """The noise of every interval: `noise`, or where the IMU is silent what a vehicle may do unseen."""
+        spans = np.diff(self.keyframes)
+        return [
+            _unseen(noise, span) if blind else noise for span, blind in zip(spans, self.blind, strict=True)
+        ]
+
+    def keyframe_of(self, stamps: Array) -> NDArray[np.intp]:
+        """Index of the keyframe nearest to each stamp."""
+        right = np.clip(np.searchsorted(self.keyframes, stamps), 1, len(self.keyframes) - 1)
+        left_is_nearer = stamps - self.keyframes[right - 1] < self.keyframes[right] - stamps
+        return right - left_is_nearer
+
+
+def split(
+    imu: ImuSamples, fix_stamps: Array, max_interval_s: float = 1.0, max_gap_s: float = 0.1
+) -> ImuIntervals:
+    """Cut the IMU at every fix, at both ends of every IMU gap, and at least every `max_interval_s`.
+
+    `fix_stamps` (m,) s must lie inside the IMU's span. A step of the IMU longer than `max_gap_s`, and than
+    two and a half usual steps, is a gap: an interval of its own, whose noise is that of an unseen vehicle.
+    """
+    steps = np.diff(imu.stamps)
+    gap = np.flatnonzero(steps > max(max_gap_s, 2.5 * float(np.median(steps))))
+    gap_ends = np.column_stack([imu.stamps[gap], imu.stamps[gap + 1]])
+    marks = np.concatenate([imu.stamps[[0, -1]], gap_ends.ravel(), fix_stamps])
+    keyframes = _fill(_distinct(np.sort(marks)), max_interval_s)
+    nodes = _fill(_distinct(np.union1d(imu.stamps, keyframes), keep=keyframes), MAX_STEP_S)
+    both = np.hstack([imu.specific_force, imu.angular_rate])
+    at_nodes = np.column_stack([np.interp(nodes, imu.stamps, column) for column in both.T])
+    rate = (at_nodes[:-1, 3:] + at_nodes[1:, 3:]) / 2
+    # the imu turns during the step; seen from its start, the later force is turned by the angular rate
+    later = Rotation.from_rotvec(rate * np.diff(nodes)[:, None]).apply(at_nodes[1:, :3])
+    force = (at_nodes[:-1, :3] + later) / 2
+    middle = (keyframes[:-1] + keyframes[1:]) / 2
+    blind = np.zeros(len(middle), dtype=bool)
+    for first, last in gap_ends:
+        blind |= (middle > first) & (middle < last)
+    return ImuIntervals(keyframes, np.searchsorted(nodes, keyframes), nodes, force, rate, blind)
+
+
+def noise_as_sampled(imu: ImuSamples, noise: ImuNoise) -> ImuNoise:
+    """The white noise to expect of these samples: the sensor's, or for a slow log what the samples show.
+
+    Under 50 Hz the motion between samples is lost, so the noise is read off the second differences
+    (white noise of stddev s has second differences of stddev s √6); never less than the sensor's own.
+    """
+    step = float(np.median(np.diff(imu.stamps)))
+    if step < 1 / ALIASED_BELOW_HZ or len(imu) < 10:
+        return noise
+    shown = [
+        float(np.sqrt(np.mean(np.diff(samples, n=2, axis=0) ** 2) / 6 * step))
+        for samples in (imu.specific_force, imu.angular_rate)
+    ]
+    return noise.model_copy(
+        update={
+            "accelerometer_noise_density": max(noise.accelerometer_noise_density, shown[0]),
+            "gyroscope_noise_density": max(noise.gyroscope_noise_density, shown[1]),
+        }
+    )
+
+
+def _unseen(noise: ImuNoise, span_s: float) -> ImuNoise:
+    return noise.model_copy(
+        update={
+            "accelerometer_noise_density": UNSEEN_FORCE * np.sqrt(span_s),
+            "gyroscope_noise_density": UNSEEN_RATE * np.sqrt(span_s),
+        }
+    )
+
+
+def _distinct(stamps: Array, keep: Array | None = None) -> Array:
+    """Sorted stamps without those that follow another too closely; the ones in `keep` stay."""
+    if keep is None:
+        close = np.diff(stamps, prepend=-np.inf) < SAME_STAMP_S
+        close[-1] = False  # the last stamp is the end of the log: the one before it goes instead
+        if len(stamps) > 2 and stamps[-1] - stamps[-2] < SAME_STAMP_S:
+            close[-2] = True
+        return stamps[~close]
+    nearest = np.clip(np.searchsorted(keep, stamps), 1, len(keep) - 1)
+    distance = np.minimum(np.abs(stamps - keep[nearest - 1]), np.abs(stamps - keep[nearest]))
+    kept: Array = stamps[(distance == 0) | (distance > SAME_STAMP_S)]
+    return kept
+
+
+def _fill(stamps: Array, max_interval_s: float) -> Array:
+    parts = np.maximum(1, np.ceil(np.diff(stamps) / max_interval_s - 0.05)).astype(int)
+    first = np.repeat(np.cumsum(parts) - parts, parts)
+    share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
+    filled = np.repeat(stamps[:-1], parts) + share * np.repeat(np.diff(stamps), parts)
+    return np.append(filled, stamps[-1])

@@ -1,0 +1,159 @@
+"""The estimation problem: what stays the same from one optimisation to the next, and one optimisation."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from factor_graphs.alignment import AttitudePrior, first_guess
+from factor_graphs.errors import EstimationError, MeasurementError
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.graph import from_values, gnss_factors, imu_factors, prior_factors, to_values
+from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.screening import decorrelate, inside, plausible
+from factor_graphs.settings import SmootherSettings
+
+Array = NDArray[np.float64]
+
+# 99 % of good fixes have a squared whitened residual below the first, 99.9 % below the second.
+GATE, REJECTION = float(chi2.ppf(0.99, 3)), float(chi2.ppf(0.999, 3))
+GOOD_MEAN = float(3 * chi2.cdf(GATE, 5) / chi2.cdf(GATE, 3))
+# Prior of the first keyframe's position m and speed m/s: finite, and no information.
+START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
+
+LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
+    "quadratic": None,
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
+    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(REJECTION**0.5),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Measurements ready for the graph, keyframes, first guess. `used` (m,) says which fixes take part."""
+
+    settings: SmootherSettings
+    frame: LocalFrame
+    p_imu_antenna: Array
+    intervals: ImuIntervals
+    noise: ImuNoise
+    used: NDArray[np.bool_]
+    fixes: GnssFixes
+    at: NDArray[np.intp]
+    attitude: AttitudePrior
+    guess: tuple[Array, Array]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One optimised graph; `squares` (m,) are the squared whitened residuals of the fixes, chi2 of 3 dof."""
+
+    inflation: float
+    motion: gtsam.NonlinearFactorGraph
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    iterations: int
+    squares: Array
+    weights: Array
+    chi2_per_dof: float
+
+
+def pose_problem(
+    imu: ImuSamples,
+    fixes: GnssFixes,
+    frame: LocalFrame,
+    settings: SmootherSettings,
+    p_imu_antenna: Array,
+    attitude: AttitudePrior | None,
+) -> Problem:
+    """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
+    within = inside(fixes, imu)
+    used = within.copy()
+    used[within] = plausible(fixes[within], settings.max_speed_mps)
+    notes = (
+        [f"{np.sum(~within)} of {len(fixes)} fixes outside the IMU's span: not used"]
+        if np.any(~within)
+        else []
+    )
+    if np.any(within & ~used):
+        notes.append(
+            f"{np.sum(within & ~used)} of {len(fixes)} fixes need more than {settings.max_speed_mps:g} m/s: not used"
+        )
+    if used.sum() < 3:
+        raise MeasurementError(
+            f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."
+            f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
+        )
+    kept = decorrelate(fixes[used], settings.fix_correlation_time_s, settings.min_fix_stddev_m)
+    intervals = split(imu, kept.stamps, settings.keyframe_interval_s)
+    if intervals.blind.any():
+        silent = np.diff(intervals.keyframes)[intervals.blind].sum()
+        notes.append(f"the IMU is silent for {silent:.2f} s: bridged as an unseen vehicle")
+    noise = noise_as_sampled(imu, settings.imu_noise)
+    if noise != settings.imu_noise:
+        notes.append("the IMU is logged too slowly for its own noise: more is assumed, as its samples show")
+    guess = first_guess(intervals, kept, p_imu_antenna, attitude)
+    unknown = np.array([*[settings.start_tilt_stddev_rad] * 2, settings.start_heading_stddev_rad])
+    attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown)
+    at = intervals.keyframe_of(kept.stamps)
+    return Problem(
+        settings, frame, p_imu_antenna, intervals, noise, used, kept, at, attitude, guess, tuple(notes)
+    )
+
+
+def motion_graph(problem: Problem, inflation: float) -> gtsam.NonlinearFactorGraph:
+    """Every factor but the fixes: the IMU with `inflation` times its noise, and the prior."""
+    graph = gtsam.NonlinearFactorGraph()
+    noise = problem.intervals.noise(problem.noise.scaled(inflation))
+    for factor in imu_factors(problem.intervals, noise, problem.frame):
+        graph.push_back(factor)
+    T, velocities = problem.guess
+    priors = prior_factors(
+        T[0], velocities[0], problem.attitude, START_POSITION_STDDEV, START_SPEED_STDDEV, problem.noise
+    )
+    for prior in priors:
+        graph.push_back(prior)
+    return graph
+
+
+def optimise(
+    problem: Problem, motion: gtsam.NonlinearFactorGraph, start: gtsam.Values, inflation: float, loss: str
+) -> Fit:
+    """The most probable states (Levenberg-Marquardt); raises EstimationError when it stops at its limit."""
+    graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
+    for factor in gnss_factors(problem.fixes, problem.at, problem.p_imu_antenna, kernel):
+        graph.push_back(factor)
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(problem.settings.max_iterations)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
+    values = optimiser.optimize()
+    if optimiser.iterations() >= problem.settings.max_iterations:
+        raise EstimationError(
+            f"the optimiser stopped at its limit of {problem.settings.max_iterations} iterations, cost "
+            f"{optimiser.error():.4g}; check lever arm and axes of the IMU, or raise max_iterations"
+        )
+    squares = _squares(problem, values)
+    good = squares < GATE
+    chi2_per_dof = (2 * motion.error(values) + squares[good].sum()) / (GOOD_MEAN * max(good.sum(), 1))
+    weights = np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
+    return Fit(
+        inflation, motion, graph, values, optimiser.iterations(), squares, weights, float(chi2_per_dof)
+    )
+
+
+def _squares(problem: Problem, values: gtsam.Values) -> Array:
+    T, _, _ = from_values(values, len(problem.intervals.keyframes))
+    R, p = T[problem.at, :3, :3], T[problem.at, :3, 3]
+    off = problem.fixes.positions - p - R @ problem.p_imu_antenna
+    squares: Array = np.sum((off / problem.fixes.stddevs) ** 2, axis=1)
+    return squares
+
+
+def first_values(problem: Problem) -> gtsam.Values:
+    """The first guess, biases zero, as the optimiser wants it."""
+    T, velocities = problem.guess
+    return to_values(T, velocities, np.zeros((len(T), 6)))

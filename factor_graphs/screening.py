@@ -1,0 +1,52 @@
+"""Which fixes can be used at all, before any estimation, and how much a crowd of them weighs."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import GnssFixes, ImuSamples
+
+Mask = NDArray[np.bool_]
+
+# However slow the vehicle, two good fixes may differ by this much, m.
+ALLOWANCE_M = 50.0
+
+
+def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
+    """The fixes that the IMU can carry to: those inside its span, (m,)."""
+    return np.asarray((fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1]))
+
+
+def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
+    """The fixes that a vehicle can have driven to from the others, (m,).
+
+    The fixes fall into runs between impossible jumps. The longest run is believed, and from it outwards
+    every run that can be reached at `max_speed_mps`.
+    """
+    m = len(fixes)
+    if m == 0:
+        return np.zeros(0, dtype=bool)
+    steps = np.linalg.norm(np.diff(fixes.positions, axis=0), axis=1)
+    jumps = steps > max_speed_mps * np.diff(fixes.stamps) + ALLOWANCE_M
+    runs = np.split(np.arange(m), np.flatnonzero(jumps) + 1)
+    longest = max(range(len(runs)), key=lambda i: len(runs[i]))
+    keep = np.zeros(m, dtype=bool)
+    keep[runs[longest]] = True
+    for outwards, facing in ((runs[longest + 1 :], 0), (runs[:longest][::-1], -1)):
+        edge = runs[longest][-1 - facing]
+        for run in outwards:
+            step = np.linalg.norm(fixes.positions[run[facing]] - fixes.positions[edge])
+            if step <= max_speed_mps * abs(fixes.stamps[run[facing]] - fixes.stamps[edge]) + ALLOWANCE_M:
+                keep[run] = True
+                edge = run[-1 - facing]
+    return keep
+
+
+def decorrelate(fixes: GnssFixes, correlation_time_s: float, min_stddev_m: float) -> GnssFixes:
+    """The same fixes with stddevs such that all within one correlation time together weigh as one.
+
+    An inertial unit that reports its filtered position ten times a second says the same thing ten times.
+    """
+    first = np.searchsorted(fixes.stamps, fixes.stamps - correlation_time_s / 2 + 1e-9)
+    last = np.searchsorted(fixes.stamps, fixes.stamps + correlation_time_s / 2 - 1e-9)
+    crowd = np.maximum(last - first, 1)[:, None]
+    return GnssFixes(fixes.stamps, fixes.positions, np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))

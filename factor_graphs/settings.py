@@ -1,0 +1,26 @@
+"""How the trajectory is estimated: every choice that a user may make, with its default and its reason."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from factor_graphs.measurements import ImuNoise
+
+
+class SmootherSettings(BaseModel):
+    """How the trajectory is estimated; the defaults need no tuning for a road vehicle."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    imu_noise: ImuNoise = Field(ImuNoise(), description="What the IMU's data sheet promises.")
+    inflate_imu_noise: bool = Field(
+        True, description="Multiply the IMU noise until the residuals fit their standard deviations."
+    )
+    robust: bool = Field(True, description="Give fixes that do not fit less weight, or none.")
+    keyframe_interval_s: float = Field(1.0, gt=0, description="Longest time between two keyframes.")
+    fix_correlation_time_s: float = Field(
+        1.0, ge=0, description="Fixes closer than this are not independent: together they weigh as one."
+    )
+    min_fix_stddev_m: float = Field(0.02, gt=0, description="No fix is trusted more than this.")
+    max_speed_mps: float = Field(70.0, gt=0, description="A fix that would need more speed is dropped.")
+    start_tilt_stddev_rad: float = Field(0.2, gt=0, description="Unknown roll and pitch of the first guess.")
+    start_heading_stddev_rad: float = Field(0.7, gt=0, description="Unknown heading of the first guess.")
+    max_iterations: int = Field(50, gt=0, description="The optimiser fails when it needs more.")

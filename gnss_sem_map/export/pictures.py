@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.atomic import replacing
-from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR
-from gnss_sem_map.export.raster import NOTHING, TopView, top_view
+from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, colours, visible
+from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
+from gnss_sem_map.export.render import FACE_LIGHT, Camera, draw_cubes, hollows
 from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.voxel_map import SemanticMap
 
@@ -26,6 +29,18 @@ ENTRY_PX = (200, 36)
 """Width and height of one class in the legend."""
 DPI = 150
 
+PERSPECTIVE_PX = (1920, 1080)
+SUPERSAMPLING = 2
+FIELD_OF_VIEW_DEG = 62.0
+BEHIND_M, ABOVE_M, AHEAD_M = 14.0, 11.0, 30.0
+"""From the vehicle to the eye, and to the point that it looks at."""
+BEAD_M = 0.12
+TRACK_COLOUR = (255, 214, 10)
+SKY = np.array([[13, 17, 28], [38, 48, 66]], np.float32)
+"""RGB at the upper and the lower edge."""
+HOLLOWS = ((2, 6.0, 0.1), (8, 2.5, 0.15), (24, 1.5, 0.25), (64, 1.0, 0.35))
+"""Pixels to the neighbour, strength, and the largest step in log depth that counts: edges, then wide shadows."""
+
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
 
@@ -38,22 +53,26 @@ def write_topview(
     """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the track.
 
     North is up; the highest voxel wins; walls darken what stands beside them. Small maps get several pixels per
-    voxel, large ones several voxels per pixel. Raises DataError for an empty map or when the file cannot be written.
+    voxel, large ones several voxels per pixel. Raises DataError for an empty map or when the file cannot be
+    written.
     """
     view = top_view(semantic_map, LONGEST_SIDE_PX)
     label_set = semantic_map.voxels.label_set
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
-    entries = _legend_entries(view, label_set)
+    entries = _legend_entries(view.labels, label_set)
     if trajectory is not None:
         entries.append(("track, from the dot", (0, 0, 0)))
-    strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // _legend_columns(max(image.shape[1], NARROWEST_PX)))
+    columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
+    strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // columns)
     figure, axes = _frame(view, image, zoom, strip_px)
-    _draw_legend(figure, axes, entries, strip_px)
+    strip = _strip(figure, strip_px)
+    _draw_entries(strip, entries, columns, "black")
+    _draw_scale_and_north(strip, view.cell_m / zoom)
     if trajectory is not None:
         _draw_track(axes, trajectory)
     if title is not None:
-        axes.set_title(title, fontsize=11, loc="left")
+        axes.set_title(title, fontsize=11, loc="left", parse_math=False)
     with replacing(path) as file:
         figure.savefig(file, format="png", dpi=DPI)
 
@@ -71,28 +90,14 @@ def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
 
 
-def _legend_entries(view: TopView, label_set: LabelSet) -> list[tuple[str, Colour]]:
-    """Name and colour of what the picture shows."""
-    present = [i for i in range(len(label_set.names)) if (view.labels == i).any()]
-    entries: list[tuple[str, Colour]] = [(label_set.names[i], label_set.colours[i]) for i in present]
-    if (view.labels == UNLABELLED).any():
-        entries.append(("unlabelled", UNLABELLED_COLOUR))
-    return entries
-
-
-def hollows(depth: NDArray[np.floating[Any]], reach: int, most: float) -> NDArray[np.float32]:
-    """How much nearer to the eye the four neighbours at `reach` pixels are, on average: what eye-dome lighting darkens.
-
-    `depth` (h, w), NaN where nothing is; each difference counts from 0 to `most`. Boucheny, "Visualisation
-    scientifique de grands volumes de données" (2009), simplified to one ring of four.
-    """
-    padded = np.pad(np.asarray(depth, np.float32), reach, mode="edge")
-    height, width = depth.shape
-    total = np.zeros(depth.shape, np.float32)
-    for down, right in ((0, reach), (2 * reach, reach), (reach, 0), (reach, 2 * reach)):
-        nearer = depth - padded[down : down + height, right : right + width]
-        total += np.clip(np.nan_to_num(nearer, nan=0.0), 0, most)
-    return np.asarray(total / 4, np.float32)
+def _legend_entries(labels: NDArray[np.int8], label_set: LabelSet) -> list[tuple[str, Colour]]:
+    """Name and colour of the classes among these labels."""
+    entries: list[tuple[str, Colour]] = [
+        (name, colour)
+        for i, (name, colour) in enumerate(zip(label_set.names, label_set.colours, strict=True))
+        if (labels == i).any()
+    ]
+    return entries + [("unlabelled", UNLABELLED_COLOUR)] * bool((labels == UNLABELLED).any())
 
 
 def _frame(view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int) -> tuple[Figure, Any]:
@@ -126,41 +131,150 @@ def _draw_track(axes: Any, trajectory: Trajectory) -> None:
     axes.plot(east[:1], north[:1], "o", color="black", markersize=5, markeredgecolor="white")
 
 
-def _draw_legend(figure: Figure, axes: Any, entries: list[tuple[str, Colour]], strip_px: int) -> None:
-    """The strip below the map, in pixels from its upper left corner: classes, scale bar, north arrow."""
-    from matplotlib.patches import Rectangle
-
+def _strip(figure: Figure, strip_px: int) -> Any:
+    """Axes over the lowest pixels of a figure, in pixels from their upper left corner."""
     width, height = figure.get_size_inches() * DPI
     strip = figure.add_axes((0, 0, 1, strip_px / height), xlim=(0, width), ylim=(strip_px, 0), frameon=False)
     strip.set(xticks=[], yticks=[])
-    columns = _legend_columns(width - 2 * MARGIN_PX)
+    return strip
+
+
+def _draw_entries(strip: Any, entries: list[tuple[str, Colour]], columns: int, text: str) -> None:
+    from matplotlib.patches import Rectangle
+
     for i, (name, colour) in enumerate(entries):
         x, y = MARGIN_PX + ENTRY_PX[0] * (i % columns), 22 + ENTRY_PX[1] * (i // columns)
         strip.add_patch(
             Rectangle((x, y), 22, 22, facecolor=np.divide(colour, 255), edgecolor="#606060", lw=0.5)
         )
-        strip.text(x + 32, y + 11, name[:20], va="center", fontsize=8.5)
-    metres_per_px = np.ptp(axes.get_xlim()) / (width - 2 * MARGIN_PX)
+        strip.text(x + 32, y + 11, name[:20], va="center", fontsize=8.5, color=text, parse_math=False)
+
+
+def _draw_scale_and_north(strip: Any, metres_per_px: float) -> None:
     bar_m = _round_length(SCALE_BAR_PX * metres_per_px)
-    right = width - MARGIN_PX - 60
+    right = strip.get_xlim()[1] - MARGIN_PX - 60
     left = right - bar_m / metres_per_px
+    text = f"{bar_m:g} m" if bar_m < 1000 else f"{bar_m / 1000:g} km"
     strip.plot([left, left, right, right], [34, 44, 44, 34], color="black", linewidth=1.4)
-    strip.text(
-        (left + right) / 2,
-        30,
-        f"{bar_m:g} m" if bar_m < 1000 else f"{bar_m / 1000:g} km",
-        ha="center",
-        fontsize=8.5,
-    )
-    strip.annotate("N", xy=(right + 45, 14), xytext=(right + 45, 58), ha="center", va="center", fontsize=9,
-                   arrowprops={"arrowstyle": "-|>", "color": "black", "linewidth": 1.4})  # fmt: skip
-
-
-def _legend_columns(width_px: float) -> int:
-    return max(1, int((width_px - SCALE_BAR_PX - 100) // ENTRY_PX[0]))
+    strip.text((left + right) / 2, 30, text, ha="center", fontsize=8.5)
+    strip.annotate(
+        "N", xy=(right + 45, 14), xytext=(right + 45, 58), ha="center", va="center", fontsize=9,
+        arrowprops={"arrowstyle": "-|>", "color": "black", "linewidth": 1.4},
+    )  # fmt: skip
 
 
 def _round_length(longest_m: float) -> float:
     """The longest of 1, 2, 5, 10, 20, 50... metres that is not longer than this."""
     power = 10.0 ** np.floor(np.log10(longest_m))
     return float(max(step * power for step in (1, 2, 5) if step * power <= longest_m))
+
+
+def write_perspective(
+    semantic_map: SemanticMap,
+    path: Path | str,
+    trajectory: Trajectory | None = None,
+    at_s: float | None = None,
+    camera: Camera | None = None,
+) -> None:
+    """Draw the map as PNG, as a camera sees it that flies behind and above the vehicle, with legend and track.
+
+    The vehicle is where it was at the stamp `at_s`, by default where most of the map lies ahead; without a
+    trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
+    map or when the file cannot be written, and MeasurementError when `at_s` lies outside the trajectory.
+    """
+    chosen = visible(semantic_map)
+    if not chosen.any():
+        raise DataError(NO_VOXELS)
+    centres, labels = semantic_map.voxels.centres[chosen], semantic_map.labels[chosen]
+    if camera is None:
+        camera = _from_the_south(centres) if trajectory is None else _behind(trajectory, centres, at_s)
+    track = np.empty((0, 3)) if trajectory is None else _beads(trajectory)
+    half_m = np.repeat([semantic_map.voxels.voxel_size_m / 2, BEAD_M / 2], [len(centres), len(track)])
+    rgb = np.vstack([colours(semantic_map)[chosen], np.tile(TRACK_COLOUR, (len(track), 1))])
+    image = _lit(np.vstack([centres, track]), half_m, rgb, camera)
+    entries = _legend_entries(labels, semantic_map.voxels.label_set)
+    if trajectory is not None:
+        entries.append(("track", TRACK_COLOUR))
+    figure = _with_legend(image, entries)
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=DPI)
+
+
+def _behind(trajectory: Trajectory, centres: NDArray[np.float64], at_s: float | None) -> Camera:
+    """Behind and above the vehicle, looking along its way."""
+    if at_s is None:
+        at_s = _busiest(trajectory, centres)
+    T_map_imu = trajectory.at([at_s])[0]
+    vehicle, forward = T_map_imu[:3, 3], T_map_imu[:3, 0] * (1, 1, 0)
+    forward /= np.linalg.norm(forward)
+    return _camera(vehicle - BEHIND_M * forward + np.array([0, 0, ABOVE_M]), vehicle + AHEAD_M * forward)
+
+
+def _busiest(trajectory: Trajectory, centres: NDArray[np.float64]) -> float:
+    """The stamp, out of a few, with the most voxels in the 60 m ahead."""
+    stamps = np.linspace(trajectory.start, trajectory.end, 25)
+    some = centres[:: 1 + len(centres) // 100_000, :2]
+    ahead = []
+    for T_map_imu in trajectory.at(stamps):
+        offset = (some - T_map_imu[:2, 3]) @ T_map_imu[:2, :2]
+        ahead.append(np.count_nonzero((offset[:, 0] > 0) & (offset[:, 0] < 60) & (abs(offset[:, 1]) < 20)))
+    return float(stamps[int(np.argmax(ahead))])
+
+
+def _from_the_south(centres: NDArray[np.float64]) -> Camera:
+    middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
+    distance = max(20.0, 0.8 * float(np.ptp(centres[:, :2], axis=0).max()))
+    return _camera(middle + distance * np.array([0, -1, 0.6]), middle)
+
+
+def _camera(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Camera:
+    width, height = PERSPECTIVE_PX
+    return Camera(eye, target, width, height, FIELD_OF_VIEW_DEG)
+
+
+def _beads(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Points (n, 3) m along the track, so near to one another that they make a line."""
+    p = trajectory.positions
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1)))
+    steps = np.arange(0.0, along[-1], BEAD_M / 2)
+    return np.column_stack([np.interp(steps, along, axis) for axis in p.T])
+
+
+def _lit(
+    centres: NDArray[np.float64], half_m: NDArray[np.float64], rgb: NDArray[np.uint8], camera: Camera
+) -> NDArray[np.uint8]:
+    """(h, w, 3) RGB: the cubes, lit from above, darkened in their hollows, fading into the sky with distance."""
+    import cv2
+
+    wide, high = camera.width_px, camera.height_px
+    distance = np.float32(np.linalg.norm(camera.target - camera.eye))
+    near = np.linalg.norm(centres - camera.eye, axis=1) < 10 * distance
+    rgb = np.vstack([rgb[near], [[0, 0, 0]]]).astype(np.float32)  # the sky is cube -1, the last
+    camera = replace(camera, width_px=SUPERSAMPLING * wide, height_px=SUPERSAMPLING * high)
+    picture = draw_cubes(centres[near], half_m[near], camera)
+    log_depth = np.log(picture.depth)
+    light = FACE_LIGHT[picture.face]
+    for reach, strength, most in HOLLOWS:
+        light *= np.exp(-strength * hollows(log_depth, reach, most))
+    sky = np.linspace(SKY[0], SKY[1], len(light), dtype=np.float32)[:, None]
+    haze = 1 - np.exp(np.minimum(distance - picture.depth, 0) / (4 * distance))[..., None]
+    image = haze * sky + (1 - haze) * light[..., None] * rgb[picture.cube]
+    small = cv2.resize(np.clip(image, 0, 255), (wide, high), interpolation=cv2.INTER_AREA)
+    return np.asarray(np.rint(small), np.uint8)
+
+
+def _with_legend(image: NDArray[np.uint8], entries: list[tuple[str, Colour]]) -> Figure:
+    """The image above a dark strip with the classes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    height, width = image.shape[:2]
+    columns = max(1, (width - 2 * MARGIN_PX) // ENTRY_PX[0])
+    strip_px = 28 + ENTRY_PX[1] * -(-len(entries) // columns)
+    figure = Figure(figsize=(width / DPI, (height + strip_px) / DPI), dpi=DPI, facecolor=SKY[0] / 255)
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes((0, strip_px / (height + strip_px), 1, height / (height + strip_px)))
+    axes.imshow(image, interpolation="nearest", aspect="auto")
+    axes.axis("off")
+    _draw_entries(_strip(figure, strip_px), entries, columns, "white")
+    return figure

@@ -97,13 +97,14 @@ def _plain(name: str) -> str:
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
 
 
-def write_laz(semantic_map: SemanticMap, frame: LocalFrame, path: Path | str) -> None:
+def write_laz(semantic_map: SemanticMap, frame: LocalFrame | None, path: Path | str) -> None:
     """Write every voxel as LAZ (LAS 1.4, point format 7) in the UTM zone of the map's origin.
 
-    Heights are above the WGS 84 ellipsoid. `classification` holds the class set's ASPRS codes, 0 where no
-    camera looked and 1 where looking gave no class; removed voxels keep their class and are flagged
-    `withheld`. Extra bytes: `sem_label` (SemanticKITTI raw id), `confidence`, `hits`, `state`. Raises
-    DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system as OGC WKT 1).
+    Heights are above the WGS 84 ellipsoid; a map without a `frame` stays in its own metres, without a CRS.
+    `classification` holds the class set's ASPRS codes, 0 where no camera looked and 1 where looking gave no class;
+    removed voxels keep their class and are flagged `withheld`. Extra bytes: `sem_label` (SemanticKITTI raw id),
+    `confidence`, `hits`, `state`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15
+    (coordinate system as OGC WKT 1).
     """
     import laspy
 
@@ -117,7 +118,7 @@ def write_laz(semantic_map: SemanticMap, frame: LocalFrame, path: Path | str) ->
             writer.write_points(_las_points(semantic_map, frame, header, slice(start, end)))
 
 
-def _las_header(label_set: LabelSet, frame: LocalFrame) -> laspy.LasHeader:
+def _las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader:
     import laspy
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
     from pyproj import CRS
@@ -125,11 +126,12 @@ def _las_header(label_set: LabelSet, frame: LocalFrame) -> laspy.LasHeader:
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"
     header.scales = np.full(3, LAZ_SCALE_M)
-    header.offsets = np.floor(to_utm(frame, np.zeros((1, 3)))[0])
+    header.offsets = np.floor(_placed(np.zeros((1, 3)), frame)[0])
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in EXTRA_BYTES])
-    # LAS 1.4 asks for WKT 1; laspy's own add_crs writes WKT 2, which older readers refuse
-    header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(frame.utm_epsg).to_wkt("WKT1_GDAL")))
     header.global_encoding.wkt = True
+    if frame is not None:
+        # LAS 1.4 asks for WKT 1; laspy's own add_crs writes WKT 2, which older readers refuse
+        header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(frame.utm_epsg).to_wkt("WKT1_GDAL")))
     lookup = ClassificationLookupVlr()
     for code, name in zip(label_set.asprs_codes.tolist(), label_set.names, strict=True):
         lookup[code] = _plain(name)[:15]
@@ -137,8 +139,13 @@ def _las_header(label_set: LabelSet, frame: LocalFrame) -> laspy.LasHeader:
     return header
 
 
+def _placed(p_map: NDArray[np.float64], frame: LocalFrame | None) -> NDArray[np.float64]:
+    """Map points in the coordinates of the file: UTM, or as they are when the map is not georeferenced."""
+    return p_map if frame is None else to_utm(frame, p_map)
+
+
 def _las_points(
-    semantic_map: SemanticMap, frame: LocalFrame, header: laspy.LasHeader, part: slice
+    semantic_map: SemanticMap, frame: LocalFrame | None, header: laspy.LasHeader, part: slice
 ) -> laspy.ScaleAwarePointRecord:
     import laspy
 
@@ -146,7 +153,7 @@ def _las_points(
     labels, states = semantic_map.labels[part], semantic_map.states[part]
     points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
     centres = (unpack(voxels.keys[part]).astype(np.float64) + 0.5) * voxels.voxel_size_m
-    points.x, points.y, points.z = to_utm(frame, centres).T
+    points.x, points.y, points.z = _placed(centres, frame).T
     points.red, points.green, points.blue = 257 * colours(semantic_map)[part].T.astype(np.uint16)  # to 16 bit
     points.return_number[:] = 1
     points.number_of_returns[:] = 1

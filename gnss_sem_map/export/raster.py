@@ -19,6 +19,7 @@ from gnss_sem_map.voxel_map import SemanticMap
 
 NOTHING = -2
 """Label of a cell without any voxel."""
+NO_VOXELS = "the map has no voxels to draw; run.json lists what was skipped"
 GEOTIFF_UNLABELLED, GEOTIFF_NODATA = 254, 255
 GEOTIFF_LONGEST_SIDE = 10_000
 BLOCK = 256
@@ -47,7 +48,7 @@ def top_view(semantic_map: SemanticMap, longest_side: int) -> TopView:
     """
     chosen = visible(semantic_map)
     if not chosen.any():
-        raise DataError("the map has no voxels to draw; check run.json for skipped scans")
+        raise DataError(NO_VOXELS)
     x, y, z = semantic_map.voxels.indices[chosen].T
     per_cell = max(1, -(-(1 + max(np.ptp(x), np.ptp(y))) // longest_side))
     columns, rows = x // per_cell, -(y // per_cell)

@@ -8,7 +8,8 @@ import pytest
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.pictures import hollows, write_topview
+from gnss_sem_map.export.pictures import write_perspective, write_topview
+from gnss_sem_map.export.render import Camera
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack
 
@@ -94,10 +95,38 @@ def test_an_empty_map_is_refused_in_one_line(street: SemanticMap, tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
-def test_hollows_are_deep_beside_a_step_and_nowhere_else() -> None:
-    depth = np.full((5, 8), 10.0)
-    depth[:, 4:] = 4.0
-    found = hollows(depth, reach=1, most=3.0)
-    expected = np.zeros((5, 8))
-    expected[:, 3] = 3.0 / 4
-    np.testing.assert_allclose(found, expected)
+def chased(size: tuple[int, int]) -> Camera:
+    """Behind a car that drives east on the strip."""
+    return Camera(np.array([-12.0, 2.0, 9.0]), np.array([30.0, 2.0, 0.0]), *size, 62.0)
+
+
+def test_driving_east_the_hedge_in_the_north_is_on_the_left(tmp_path: Path) -> None:
+    write_perspective(strip(60), tmp_path / "perspective.png", camera=chased((480, 270)))
+    image = read(tmp_path / "perspective.png")[:270]
+    road, hedge = (np.argwhere(near(image, name)) for name in ("road", "vegetation"))
+    assert len(road) > 1000
+    assert len(hedge) > 100
+    lower = 200  # a row across both
+    assert hedge[hedge[:, 0] == lower][:, 1].max() < road[road[:, 0] == lower][:, 1].min()
+    assert not near(image[:30], "road").any()  # the sky
+
+
+def test_the_default_camera_flies_behind_the_vehicle_and_sees_its_track(
+    street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    write_perspective(street, tmp_path / "perspective.png", track)
+    image = read(tmp_path / "perspective.png")
+    assert image.shape[1] == 1920
+    yellow = np.argwhere((image[:1080] > (200, 160, 0)).all(axis=2) & (image[:1080, :, 2] < 60))
+    assert len(yellow) > 500
+    assert abs(np.median(yellow[:, 1]) - 960) < 200
+    assert near(image[:1080], "building")[:, :960].sum() > 10 * near(image[:1080], "building")[:, 960:].sum()
+
+
+def test_without_a_trajectory_the_whole_map_is_in_the_picture(street: SemanticMap, tmp_path: Path) -> None:
+    write_perspective(street, tmp_path / "perspective.png")
+    image = read(tmp_path / "perspective.png")[:1080]
+    drawn = np.argwhere(near(image, "road") | near(image, "sidewalk"))
+    assert len(drawn) > 10_000
+    assert (drawn.min(axis=0) > 0).all()
+    assert (drawn.max(axis=0) < (1079, 1919)).all()

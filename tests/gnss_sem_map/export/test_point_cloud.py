@@ -105,6 +105,15 @@ def test_the_laz_lies_in_the_zone_and_hemisphere_of_the_origin(
     np.testing.assert_allclose(las.xyz, expected, atol=0.002)
 
 
+def test_a_map_without_georeference_keeps_its_metres_and_claims_no_crs(
+    street: SemanticMap, tmp_path: Path
+) -> None:
+    write_laz(street, None, tmp_path / "map.laz")
+    las = laspy.read(tmp_path / "map.laz")
+    assert las.header.parse_crs() is None
+    np.testing.assert_allclose(las.xyz, street.voxels.centres, atol=0.001)
+
+
 def utm_by_geodesic(p_map: np.ndarray, frame: LocalFrame, epsg: int) -> np.ndarray:
     """Independent of cart and topocentric steps: along the geodesic from the origin, then PROJ's tmerc.
 

@@ -1,0 +1,163 @@
+"""A simulated colour camera: sun, shadows, textures, haze, and a sensor with noise and automatic exposure."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gnss_sem_map.simulation.compiled import kernel
+from gnss_sem_map.simulation.ground import FAR, Floats, to_town
+from gnss_sem_map.simulation.hits import surface_at
+from gnss_sem_map.simulation.noise import gaussian, value_noise
+from gnss_sem_map.simulation.raycast import GROUND, KERB, cast_ray
+from gnss_sem_map.simulation.surfaces import TRAIN_IDS
+from gnss_sem_map.simulation.textures import ground_colour, thing_colour
+from gnss_sem_map.simulation.world import World
+
+_REACH_M = 260.0
+_SUN = (1.75, 1.62, 1.42)
+_SKY = (0.50, 0.58, 0.72)
+_DISPLAY = np.round(255.0 * np.linspace(0.0, 1.0, 4096) ** (1.0 / 2.2)).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; the defaults are KITTI's rectified colour camera (focal length and centre in pixels)."""
+
+    width: int = 1242
+    height: int = 375
+    focal_px: float = 721.5377
+    centre_u_px: float = 609.5593
+    centre_v_px: float = 172.854
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedImage:
+    """One image: `rgb` (h, w, 3) uint8, `train_ids` (h, w) Cityscapes classes with 255 void, `depth` (h, w) metres
+    along the optical axis (0 in the sky), `instances` (h, w) as in the scans' labels (0: none)."""
+
+    rgb: npt.NDArray[np.uint8]
+    train_ids: npt.NDArray[np.uint8]
+    depth: npt.NDArray[np.float32]
+    instances: npt.NDArray[np.uint16]
+
+
+@kernel
+def _sky(dx, dy, dz, sx, sy, sz):
+    """Blue that pales towards the horizon, a few clouds, and the glow around the sun."""
+    up = max(dz, 0.02)
+    pale = 1.0 / (1.0 + 6.0 * up)
+    r, g, b = 0.28 + 0.62 * pale, 0.45 + 0.47 * pale, 0.80 + 0.14 * pale
+    x, y = dx / (up + 0.12), dy / (up + 0.12)
+    cloud = 0.6 * value_noise(91, x * 1.3, y * 1.3) + 0.4 * value_noise(92, x * 3.7, y * 3.7)
+    cover = min(1.0, max(0.0, 4.0 * (cloud - 0.52)))
+    r, g, b = r + (1.05 - r) * cover, g + (1.05 - g) * cover, b + (1.07 - b) * cover
+    glow = max(0.0, dx * sx + dy * sy + dz * sz) ** 24
+    return r + 0.7 * glow, g + 0.65 * glow, b + 0.5 * glow
+
+
+@kernel
+def _light(scene, x, y, z, nx, ny, nz, on_ground, sun):
+    """Light that arrives at a point: from the sky, bounced from the ground, and from the sun unless it is hidden."""
+    sky = 0.5 + 0.5 * nz
+    bounce = 0.16 * (1.0 - sky)
+    r, g, b = _SKY[0] * sky + bounce * 1.1, _SKY[1] * sky + bounce, _SKY[2] * sky + bounce * 0.9
+    x, y, z = x + 0.02 * nx, y + 0.02 * ny, z + 0.02 * nz
+    if on_ground and cast_ray(scene, 1.3, True, 0.5, x, y, z, 0.0, 0.0, 1.0)[0] < FAR:
+        r, g, b = 0.35 * r, 0.35 * g, 0.35 * b  # under a car
+    facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
+    if facing > 0.0 and cast_ray(scene, 70.0, True, 0.5, x, y, z, sun[0], sun[1], sun[2])[0] >= FAR:
+        r, g, b = r + facing * _SUN[0], g + facing * _SUN[1], b + facing * _SUN[2]
+    return r, g, b
+
+
+@kernel
+def _expose(scene, T, lens, sun, linear, kinds, depth, things):
+    """Trace one ray per pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it."""
+    focal, cu, cv = lens
+    ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
+    for v in range(linear.shape[0]):
+        for u in range(linear.shape[1]):
+            x, y = (u - cu) / focal, (v - cv) / focal
+            norm = 1.0 / np.sqrt(x * x + y * y + 1.0)
+            dx = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * norm
+            dy = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * norm
+            dz = (T[2, 0] * x + T[2, 1] * y + T[2, 2]) * norm
+            t, thing, shape = cast_ray(scene, _REACH_M, False, 0.5, ox, oy, oz, dx, dy, dz)
+            if t >= FAR:
+                r, g, b = _sky(dx, dy, dz, sun[0], sun[1], sun[2])
+                linear[v, u, 0], linear[v, u, 1], linear[v, u, 2] = r, g, b
+                continue
+            surface, kind, n, p, clump = surface_at(scene, thing, shape, 0.5, ox, oy, oz, dx, dy, dz, t)
+            near = 1.0 / (1.0 + (t / 18.0) ** 2)
+            mirror, on_ground = 0.0, thing == GROUND or thing == KERB
+            if on_ground:
+                a, c = to_town(scene.ground, p[0], p[1])
+                r, g, b = ground_colour(surface, a, c, near)
+            else:
+                c, s = scene.things[thing, 4], scene.things[thing, 5]
+                local_x, local_y = c * n[0] + s * n[1], c * n[1] - s * n[0]
+                r, g, b, mirror = thing_colour(
+                    scene.shapes, shape, thing, scene.colours[thing, 0], scene.colours[thing, 1],
+                    scene.colours[thing, 2], p[0], p[1], p[2], local_x, local_y, n[2], clump, near,
+                )  # fmt: skip
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            lr, lg, lb = _light(scene, x, y, z, n[0], n[1], n[2], on_ground and kind > 0, sun)
+            r, g, b = r * lr, g * lg, b * lb
+            if mirror > 0.0:
+                facing = dx * n[0] + dy * n[1] + dz * n[2]
+                mx, my, mz = dx - 2.0 * facing * n[0], dy - 2.0 * facing * n[1], dz - 2.0 * facing * n[2]
+                share = mirror + (1.0 - mirror) * 0.7 * (1.0 - min(1.0, abs(facing))) ** 5
+                sr, sg, sb = _sky(mx, my, mz, sun[0], sun[1], sun[2]) if mz > 0.08 else (0.16, 0.15, 0.14)
+                r, g, b = r + share * (sr - r), g + share * (sg - g), b + share * (sb - b)
+            haze = 1.0 - np.exp(-t / 700.0)
+            linear[v, u, 0] = r + haze * (0.78 - r)
+            linear[v, u, 1] = g + haze * (0.83 - g)
+            linear[v, u, 2] = b + haze * (0.90 - b)
+            kinds[v, u], depth[v, u], things[v, u] = kind, t * norm, thing
+
+
+@kernel
+def _develop(linear, gain, key, display, rgb):
+    """From light to bytes: vignetting, shot and read noise, the display curve."""
+    height, width, _ = linear.shape
+    for v in range(height):
+        for u in range(width):
+            x, y = (u - 0.5 * width) / width, (v - 0.5 * height) / width
+            scale = gain * (1.0 - 0.45 * (x * x + y * y))
+            for c in range(3):
+                light = max(0.0, linear[v, u, c] * scale)
+                light += gaussian(key, v, u, c) * (0.0025 + 0.012 * np.sqrt(light))
+                rgb[v, u, c] = display[int(min(4095.0, max(0.0, light * 4095.0)))]
+
+
+def sun_direction(seed: int) -> Floats:
+    """Unit vector towards the sun of a seed, in the map's axes."""
+    rng = np.random.default_rng([seed, 2])
+    azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38.0, 58.0))
+    return np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+
+
+def render_image(
+    world: World, T_map_camera: Floats, stamp: float, *, camera: Camera | None = None, seed: int = 0, frame: int = 0
+) -> SimulatedImage:
+    """What the camera at `T_map_camera` (4, 4; x right, y down, z forward) sees at a moment (s).
+
+    The same arguments give the same bytes, in any order of frames and with any number of threads.
+    """
+    camera = camera or Camera()
+    size = (camera.height, camera.width)
+    linear, kinds = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
+    depth, things = np.zeros(size, np.float32), np.full(size, GROUND, np.int32)
+    lens = (camera.focal_px, camera.centre_u_px, camera.centre_v_px)
+    sun = tuple(float(s) for s in sun_direction(seed))
+    _expose(world.scene(stamp, stamp), T_map_camera, lens, sun, linear, kinds, depth, things)
+    linear = cv2.GaussianBlur(linear, (3, 3), 0.55)
+    # the meter looks at the lower half and follows slowly changing light and its own hunting
+    light = float(linear[size[0] // 3 :: 4, ::4].mean())
+    gain = 0.33 * (0.42 / max(light, 0.05)) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))
+    rgb = np.zeros((*size, 3), np.uint8)
+    _develop(linear, gain, np.int64(seed) * 1_000_003 + frame + 500_009, _DISPLAY, rgb)
+    instances = np.where(things >= 0, world.instances[things], 0).astype(np.uint16)
+    return SimulatedImage(rgb, TRAIN_IDS[kinds], depth, instances)

@@ -1,0 +1,132 @@
+"""A simulated Velodyne HDL-64E: one sweep, every column at its own time.
+
+Conventions of KITTI's raw scans: the sweep begins behind the car (azimuth 180 degrees) and runs clockwise; a point of
+azimuth a is of the time start + (0.5 - a / 2 pi) (end - start), a in (-pi, pi]; the file holds ring after ring from the
+top, azimuth increasing from 0 in each; coordinates are what the sensor measured, not compensated for its own motion,
+in whole millimetres.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from gnss_sem_map.simulation.compiled import kernel
+from gnss_sem_map.simulation.ground import FAR, Floats
+from gnss_sem_map.simulation.hits import surface_at
+from gnss_sem_map.simulation.noise import gaussian, uniform
+from gnss_sem_map.simulation.raycast import GROUND, cast_ray
+from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
+from gnss_sem_map.simulation.textures import window_at
+from gnss_sem_map.simulation.world import World
+
+_CABIN, _FACADE = int(Surface.CABIN), int(Surface.FACADE)
+
+
+def _hdl_64e() -> Floats:
+    return np.radians(np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.87, -24.9, 32)]))
+
+
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """A spinning LiDAR; the defaults are the HDL-64E's."""
+
+    elevations: Floats = field(default_factory=_hdl_64e)
+    columns: int = 2083
+    range_m: float = 120.0
+    blind_m: float = 2.3
+    range_stddev_m: float = 0.02
+    dropout: float = 0.015
+
+    @property
+    def azimuths(self) -> Floats:
+        """Azimuth of every column, rad in (-pi, pi], in file order (none lies on the seam)."""
+        a = (np.arange(self.columns) + 0.25) * (2 * np.pi / self.columns)
+        return np.where(a > np.pi, a - 2 * np.pi, a)
+
+    @property
+    def fractions(self) -> Floats:
+        """When every column is measured, as a part of the sweep."""
+        return 0.5 - self.azimuths / (2 * np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedScan:
+    """One sweep: `points` (n, 4) float32 x y z reflectance in the LiDAR's axes, `labels` (n,) uint32 SemanticKITTI
+    ids with the instance in the high half, `fractions` (n,) of the sweep at which each was measured."""
+
+    points: npt.NDArray[np.float32]
+    labels: npt.NDArray[np.uint32]
+    fractions: Floats
+
+
+@kernel
+def _sweep(scene, T, directions, fractions, reflectances, lidar, key, ranges, intensities, kinds, things):
+    """Cast all rays of a sweep: rings by columns. `lidar`: reach, blind range, range noise, dropout."""
+    reach, blind, noise, dropout = lidar
+    for ring in range(directions.shape[0]):
+        for column in range(directions.shape[1]):
+            x, y, z = directions[ring, column, 0], directions[ring, column, 1], directions[ring, column, 2]
+            dx = T[column, 0, 0] * x + T[column, 0, 1] * y + T[column, 0, 2] * z
+            dy = T[column, 1, 0] * x + T[column, 1, 1] * y + T[column, 1, 2] * z
+            dz = T[column, 2, 0] * x + T[column, 2, 1] * y + T[column, 2, 2] * z
+            ox, oy, oz, f = T[column, 0, 3], T[column, 1, 3], T[column, 2, 3], fractions[column]
+            t, thing, shape = cast_ray(scene, reach, False, f, ox, oy, oz, dx, dy, dz)
+            if t >= FAR or t < blind or uniform(key, ring, column, 1) < dropout:
+                continue
+            surface, kind, n, p, _ = surface_at(scene, thing, shape, f, ox, oy, oz, dx, dy, dz, t)
+            slant = abs(n[0] * dx + n[1] * dy + n[2] * dz)
+            chance = uniform(key, ring, column, 2)
+            # glass mirrors the beam away, and little comes back from dark ground at a grazing angle
+            if surface == _CABIN and chance < 0.75:
+                continue
+            if surface == _FACADE and chance < 0.5 and window_at(p[0], p[2])[0] >= 0.0:
+                continue
+            echo = reflectances[surface] * (0.25 + 0.75 * np.sqrt(slant))
+            if chance > 4000.0 * echo * (0.02 + slant) / (t * t):
+                continue
+            ranges[ring, column] = t + noise * gaussian(key, ring, column, 3)
+            intensities[ring, column] = min(0.99, max(0.0, echo + 0.05 * gaussian(key, ring, column, 4)))
+            kinds[ring, column], things[ring, column] = kind, thing
+
+
+def render_scan(
+    world: World,
+    T_imu_lidar: Floats,
+    start: float,
+    end: float,
+    *,
+    lidar: Lidar | None = None,
+    seed: int = 0,
+    frame: int = 0,
+) -> SimulatedScan:
+    """What the LiDAR measures in a sweep from `start` to `end` (s) while the vehicle drives.
+
+    The same arguments give the same bytes, in any order of frames and with any number of threads.
+    """
+    lidar = lidar or Lidar()
+    scene, fractions = world.scene(start, end), lidar.fractions
+    T = world.ego.poses(start + fractions * (end - start)) @ T_imu_lidar
+    a, e = lidar.azimuths[None, :], lidar.elevations[:, None]
+    directions = np.stack(np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1)
+    shape = directions.shape[:2]
+    ranges, intensities = np.zeros(shape), np.zeros(shape)
+    kinds, things = np.zeros(shape, np.uint8), np.full(shape, GROUND, np.int32)
+    numbers = (lidar.range_m, lidar.blind_m, lidar.range_stddev_m, lidar.dropout)
+    key = np.int64(seed) * 1_000_003 + frame
+    _sweep(scene, T, directions, fractions, REFLECTANCES, numbers, key, ranges, intensities, kinds, things)
+    hit = ranges > 0
+    xyz = np.round(ranges[hit][:, None] * directions[hit], 3)
+    points = np.column_stack([xyz, np.round(intensities[hit], 2)]).astype(np.float32)
+    labels = hit_labels(world, kinds[hit], things[hit])
+    return SimulatedScan(points, labels, np.broadcast_to(fractions, shape)[hit])
+
+
+def hit_labels(
+    world: World, kinds: npt.NDArray[np.uint8], things: npt.NDArray[np.int32]
+) -> npt.NDArray[np.uint32]:
+    """SemanticKITTI labels of hits: the kind, moving or not, and the instance in the high 16 bits."""
+    moving = things >= len(world.town.things)
+    instances = np.where(things >= 0, world.instances[things], 0).astype(np.uint32)
+    labels: npt.NDArray[np.uint32] = RAW_IDS[moving.astype(np.int64), kinds] | (instances << np.uint32(16))
+    return labels

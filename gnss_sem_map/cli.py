@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
 import typer
 
 if TYPE_CHECKING:
+    from gnss_sem_map.account import Progress
     from gnss_sem_map.config import Settings
-    from gnss_sem_map.pipeline import Progress
     from gnss_sem_map.sensor_log import SensorLog
 
 app = typer.Typer(

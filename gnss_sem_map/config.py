@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from factor_graphs.smoothing import SmootherSettings
+from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
 from gnss_sem_map.refinement import RefinementSettings

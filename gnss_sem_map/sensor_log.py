@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
@@ -143,6 +144,8 @@ class SensorLog:
     gnss: GnssFixes | None = None
     imu_noise: ImuNoise | None = None
     """None: the estimator's default."""
+    initial_attitude: AttitudePrior | None = None
+    """What the navigation unit knows of the attitude at the first IMU stamp; None: found from the motion."""
     given: Trajectory | None = None
     """Poses that came with the drive; where they are there, nothing is smoothed."""
     reference: Trajectory | None = None

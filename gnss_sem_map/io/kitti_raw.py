@@ -15,6 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.trajectory import Trajectory
@@ -26,6 +27,8 @@ Array = NDArray[np.float64]
 T = TypeVar("T", Scan, Image)
 
 CAMERA_TIME_OFFSET_S = -0.0085
+ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.02])
+"""How far the unit's first roll, pitch and yaw are believed; a looser yaw lets a short track turn the whole map."""
 OXTS_COLUMNS = 30
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
@@ -45,6 +48,7 @@ def read(drive: Path) -> SensorLog:
     gnss = GnssFixes(
         stamps, frame.to_map(*oxts[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
     )
+    reference = Trajectory(stamps, _reference_poses(gnss.positions, oxts))
     imu_stamps, imu_rows, imu_skips = _imu_rows(drive, epoch_ns, stamps, oxts)
     scans, scan_skips = _scans(drive, epoch_ns)
     images, image_skips = _images(drive, epoch_ns, calibration.image_size)
@@ -57,7 +61,8 @@ def read(drive: Path) -> SensorLog:
         frame=frame,
         imu=ImuSamples(imu_stamps, imu_rows[:, SPECIFIC_FORCE], imu_rows[:, ANGULAR_RATE]),
         gnss=gnss,
-        reference=Trajectory(stamps, _reference_poses(gnss.positions, oxts)),
+        initial_attitude=AttitudePrior(reference.T_map_imu[0, :3, :3], ATTITUDE_STDDEVS_RAD),
+        reference=reference,
         skips=(*skips, *imu_skips, *scan_skips, *image_skips),
     )
 

@@ -1,0 +1,174 @@
+"""The run folder: one drive's results as a value, written beside and renamed into place."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map import tiles
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.pictures import write_topview
+from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.mapping import label_points
+from gnss_sem_map.pipeline import Result
+from gnss_sem_map.refinement import RefinementReport
+from gnss_sem_map.sensor_log import SensorLog
+
+PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
+MANY_SKIPS = 200
+"""run.json lists this many skips; it always says how many there were."""
+
+
+@contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A folder to write into; it becomes `out` when the block ends well and vanishes when it does not.
+
+    An earlier run at `out` is replaced; raises DataError when something else lies there, or the disk is full.
+    """
+    check_replaceable(out)
+    beside = out.with_name(f".{out.name}.part")
+    shutil.rmtree(beside, ignore_errors=True)
+    try:
+        beside.mkdir(parents=True)
+        yield beside
+        if out.exists():
+            shutil.rmtree(out)
+        beside.rename(out)
+    except OSError as error:
+        raise DataError(
+            f"{out}: cannot write the results ({error.strerror}); free the disk or choose another -o"
+        ) from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def check_replaceable(out: Path) -> None:
+    """Raise DataError when `out` is something that no run wrote."""
+    if out.exists() and not (out / "run.json").is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f"{out}: exists and is no run folder; choose another -o or remove it")
+
+
+def write_run(
+    out: Path, drive: Path, log: SensorLog, result: Result, settings: Settings, write_labels: bool
+) -> dict[str, Any]:
+    """Write everything that a run made (design: the run folder); returns the content of run.json."""
+    with new_folder(out) as folder:
+        with result.account.stage("export"):
+            write_trajectory(folder, log, result)
+            tiles.write(result.raw, folder / "map", log.frame)
+            tiles.write(result.refined, folder / "refined", log.frame)
+            write_ply(result.refined, folder / "map.ply", log.frame)
+            write_laz(result.refined, log.frame, folder / "map.laz")
+            write_topview(
+                result.refined, folder / "topview.png", trajectory=result.trajectory, title=log.name
+            )
+            if write_labels:
+                write_point_labels(
+                    folder, label_points(log, result.trajectory, result.refined, settings), result
+                )
+        (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
+        about = about_run(drive, log, result.account) | {"map": _about_map(result)}
+        _write_json(folder / "run.json", about)
+        _write_json(folder / "metrics.json", {})
+    return about
+
+
+def write_trajectory(folder: Path, log: SensorLog, result: Result) -> None:
+    """The trajectory in every form that others read, over the span of the drive's measurements."""
+    result.trajectory.save(folder / "trajectory.parquet")
+    write_tum(result.trajectory, folder / "trajectory.tum")
+    write_kitti(result.trajectory, folder / "trajectory_kitti.txt")
+    if log.frame is not None:
+        write_geojson(result.trajectory, log.frame, folder / "trajectory.geojson")
+
+
+def write_point_labels(
+    folder: Path, labelled: Iterable[tuple[Any, NDArray[np.int8], NDArray[np.bool_]]], result: Result
+) -> None:
+    """SemanticKITTI raw ids per original point in labels/, and 1 for removed vehicles in removed/."""
+    for name in ("labels", "removed"):
+        (folder / name).mkdir()
+    label_set: LabelSet = result.raw.voxels.label_set
+    ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # -1, unlabelled, is the last
+    for scan, labels, removed in labelled:
+        ids[labels].tofile(folder / "labels" / f"{scan.name}.label")
+        removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
+
+
+def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
+    """What went in, what was left out and why, and what it cost."""
+    skips = sorted({(s.what, s.where, s.reason) for s in account.skips})
+    return {
+        "versions": {name: _version(name) for name in PACKAGES},
+        "drive": drive.name,
+        "name": log.name,
+        "epoch_ns": log.epoch_ns,
+        "local_frame": None if log.frame is None else asdict(log.frame),
+        "counts": dict(sorted(account.counts.items())),
+        "warnings": account.warnings,
+        "skips": {
+            "count": len(skips),
+            "listed": [
+                dict(zip(("what", "where", "reason"), skip, strict=True)) for skip in skips[:MANY_SKIPS]
+            ],
+        },
+        "seconds": {name: round(value, 3) for name, value in account.seconds.items()},
+        "peak_memory_mb": {name: round(value) for name, value in account.peak_memory_mb.items()},
+    }
+
+
+def _about_map(result: Result) -> dict[str, Any]:
+    names = result.raw.voxels.label_set.names
+    return {
+        "voxels": len(result.raw),
+        "points": int(result.raw.voxels.hits.sum()),
+        "labelled": {
+            stage: {name: int(np.count_nonzero(m.labels == i)) for i, name in enumerate(names)}
+            for stage, m in (("raw", result.raw), ("refined", result.refined))
+        },
+        "refinement": _about_refinement(result.refinement),
+    }
+
+
+def _about_refinement(report: RefinementReport) -> dict[str, Any]:
+    return {
+        "steps": [
+            {
+                "name": step.name,
+                "voxels_changed": step.changed,
+                "changes": {f"{before} to {after}": n for (before, after), n in sorted(step.changes.items())},
+                "skipped": step.skipped,
+            }
+            for step in report.steps
+        ],
+        "objects": [asdict(thing) for thing in report.objects],
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, default=_plain) + "\n", "utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Numpy values as JSON numbers and lists, to the millimetre."""
+    return np.asarray(value).round(3).tolist()

@@ -1,0 +1,72 @@
+"""One set of settings, in a file or on the command line; nothing unknown passes."""
+
+from pathlib import Path
+
+import pytest
+
+from gnss_sem_map import config
+from gnss_sem_map.errors import ConfigError
+
+
+def test_what_is_printed_reads_back_as_the_same_settings(tmp_path: Path) -> None:
+    settings = config.load(overrides=["mapping.voxel_size_m=0.3", "labelling.probability_floor=0.1"])
+    file = tmp_path / "config.yaml"
+    file.write_text(settings.to_yaml())
+    assert config.load(file) == settings
+    assert settings.mapping.voxel_size_m == 0.3
+
+
+def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text("mapping: {voxel_size_m: 0.5, farthest_m: 60}\n")
+    settings = config.load(file, ["mapping.voxel_size_m=0.25"])
+    assert (settings.mapping.voxel_size_m, settings.mapping.farthest_m) == (0.25, 60)
+
+
+def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("")
+    assert config.load(tmp_path / "config.yaml") == config.load()
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("mapping.voxel_sise_m=0.2", "unknown setting 'mapping.voxel_sise_m'; did you mean 'voxel_size_m'"),
+        ("maping.voxel_size_m=0.2", "unknown setting 'maping'; did you mean 'mapping'"),
+        ("mapping.voxel_size_m=0", "mapping.voxel_size_m: .*greater than 0.01"),
+        ("mapping.voxel_size_m=-1", "mapping.voxel_size_m"),
+        ("mapping.voxel_size_m=wide", "mapping.voxel_size_m: .*number"),
+        ("mapping.voxel_size_m.x=1", "mapping.voxel_size_m: .*number"),
+        ("mapping", "expected section.name=value"),
+        ("classes.x=1", "classes: .*string"),
+    ],
+)
+def test_what_is_not_understood_is_refused_in_one_line(override: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says) as error:
+        config.load(overrides=[override])
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_no_settings_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    for content, says in (("- a\n", "expected sections"), ("a: [\n", "not YAML")):
+        file.write_text(content)
+        with pytest.raises(ConfigError, match=says):
+            config.load(file)
+    with pytest.raises(ConfigError, match="cannot read"):
+        config.load(tmp_path / "absent.yaml")
+
+
+def test_every_setting_says_what_it_is() -> None:
+    from pydantic import BaseModel
+
+    def undescribed(model: type[BaseModel], place: str) -> list[str]:
+        found = []
+        for name, field in model.model_fields.items():
+            if not field.description:
+                found.append(f"{place}.{name}")
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+                found += undescribed(field.annotation, f"{place}.{name}")
+        return found
+
+    assert undescribed(config.Settings, "settings") == []

@@ -5,6 +5,8 @@ Cheap to import: torch, transformers and onnxruntime are imported by the segment
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import parse_qsl
@@ -39,6 +41,7 @@ class MissingLabels(DataError):
 
 SCHEMES = {
     "labels": "labels:FOLDER[?ids=train_id|label_id&taxonomy=cityscapes]",
+    "refinenet": "refinenet:CHECKPOINT[?classes=..&scale=1&shrink=2]",
 }
 """How a segmenter is asked for, by the word before the colon."""
 
@@ -58,6 +61,11 @@ def open_segmenter(
 
             _only(options, spec, "ids", "taxonomy")
             return CachedLabels(Path(place), label_set, expected_size, **options)
+        case "refinenet":
+            _only(options, spec, "classes", "scale", "shrink")
+            with _needs("segmentation", spec):
+                from gnss_sem_map.segmentation.checkpoints import open_refinenet
+            return open_refinenet(Path(place), label_set, device, **options)
     raise ConfigError(
         f"segmenter {spec!r}: unknown kind {scheme!r}; expected one of {list(SCHEMES.values())}"
     )
@@ -74,6 +82,16 @@ def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
             f"segmenter {spec!r}: found no options after '?', expected name=value joined by '&'"
         )
     return scheme, place, options
+
+
+@contextmanager
+def _needs(extra: str, spec: str) -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"segmenter {spec!r}: {error.name} is not installed; pip install 'gnss-sem-map[{extra}]'"
+        ) from None
 
 
 def _only(options: dict[str, str], spec: str, *allowed: str) -> None:

@@ -1,0 +1,192 @@
+"""RefineNet weights on disk: only tensors are read, never code, and they must fit the network to the last one."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
+from gnss_sem_map.segmentation.classes import VOID, named_classes
+from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, from_logits
+from gnss_sem_map.segmentation.pixels import scale_and_shrink
+from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
+
+METADATA = "gnss_sem_map"
+"""The entry of a safetensors file that holds what we know beyond the tensors, as JSON."""
+
+WRAPPERS = ("state_dict", "model", "network", "segmenter")
+"""Names under which training programs keep the tensors in a checkpoint."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """The tensors of a file, and what it says about them."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    class_names: tuple[str, ...] | None = None
+    scale: float = 1.0
+    """Of the images that the network was trained on."""
+
+
+def open_refinenet(
+    path: Path, label_set: LabelSet, device: str = "auto", classes: str | None = None,
+    scale: str | None = None, shrink: str | None = None,
+) -> NetworkSegmenter:  # fmt: skip
+    """RefineNet or Light-Weight RefineNet from a checkpoint, whose tensors say which of them it is.
+
+    Class names come from `classes` (see `named_classes`), from the file, or from their number. Raises DataError for a
+    file that is not such a checkpoint, ConfigError for class names that do not fit.
+    """
+    checkpoint = read_checkpoint(path)
+    network = network_like(checkpoint)
+    load_strictly(network, checkpoint)
+    if classes is None and checkpoint.class_names is not None:
+        classes = ",".join(checkpoint.class_names)
+    names = named_classes(classes, class_count(checkpoint), label_set, str(path))
+    where = find_device(device)
+    network.to(where).eval()
+    as_scale, as_shrink = scale_and_shrink(scale, shrink, str(path), checkpoint.scale)
+    kept = [name for name in names if name != VOID]
+    return NetworkSegmenter(from_logits(network, names), kept, where, MEAN, STD, as_scale, as_shrink)
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """The tensors of a safetensors file, or of a torch file read with `weights_only=True`; raises DataError."""
+    if not path.is_file():
+        raise DataError(f"checkpoint {path}: no such file")
+    if path.suffix == ".safetensors":
+        return _read_safetensors(path)
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        OSError,
+        ValueError,
+        KeyError,
+        AttributeError,
+    ) as error:
+        raise DataError(
+            f"checkpoint {path}: damaged, or holds code ({type(error).__name__}); expected only tensors: save the"
+            " state_dict alone, best as safetensors"
+        ) from None
+    return Checkpoint(path, _only_tensors(content, path))
+
+
+def network_like(checkpoint: Checkpoint) -> nn.Module:
+    """A new network of the architecture that the names and shapes of the tensors show; raises DataError for another."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in checkpoint.tensors.items()}
+    count = class_count(checkpoint)
+    if "conv1.weight" in shapes and "p_ims1d2_outl1_dimred.weight" in shapes:
+        blocks = tuple(sum(name.startswith(f"layer{i}.") and name.endswith("conv1.weight") for name in shapes)
+                       for i in (1, 2, 3, 4))  # fmt: skip
+        backbone = next((name for name, known in RESNET_BLOCKS.items() if known == blocks), None)
+        if backbone is None:
+            raise DataError(
+                f"checkpoint {checkpoint.path}: found {blocks} ResNet blocks, expected {RESNET_BLOCKS}"
+            )
+        light_weight = shapes["p_ims1d2_outl1_dimred.weight"][-1] == 1
+        return (LightWeightRefineNet if light_weight else RefineNet)(count, backbone)
+    if "layer1.0.weight" in shapes and "conv8.weight" in shapes:
+        return LightWeightRefineNet(
+            count, "mobilenet_v2", width=shapes["conv8.weight"][0],
+            depth_head="depth.weight" in shapes, single_task="pre_segm.weight" not in shapes,
+        )  # fmt: skip
+    raise _other_architecture(checkpoint)
+
+
+def class_count(checkpoint: Checkpoint) -> int:
+    """The number of classes that the last layer tells apart; raises DataError where there is no such layer."""
+    for name in ("clf_conv.bias", "segm.bias"):
+        if name in checkpoint.tensors:
+            return checkpoint.tensors[name].numel()
+    raise _other_architecture(checkpoint)
+
+
+def load_strictly(network: nn.Module, checkpoint: Checkpoint) -> None:
+    """Put the tensors into the network; raises DataError unless names and shapes agree and all values are finite.
+
+    Only batch counters may be missing: they were not yet saved when the first checkpoints were published.
+    """
+    expected, found = network.state_dict(), checkpoint.tensors
+    missing = sorted(
+        name for name in expected.keys() - found.keys() if not name.endswith("num_batches_tracked")
+    )
+    extra = sorted(found.keys() - expected.keys())
+    other = sorted(
+        name for name in expected.keys() & found.keys() if expected[name].shape != found[name].shape
+    )
+    for what, names in (("missing", missing), ("unknown", extra), ("of another shape", other)):
+        if names:
+            raise DataError(
+                f"checkpoint {checkpoint.path}: {len(names)} of {len(expected)} tensors {what}, such as {names[:3]};"
+                " expected those of this RefineNet and no others"
+            )
+    damaged = [name for name, tensor in found.items() if not torch.isfinite(tensor).all()]
+    if damaged:
+        raise DataError(
+            f"checkpoint {checkpoint.path}: values that are not finite in {damaged[:3]}; get the file again"
+        )
+    network.load_state_dict(found, strict=False)
+
+
+def write_network(
+    path: Path, network: nn.Module, class_names: tuple[str, ...], scale: float, half: bool = True
+) -> None:
+    """Save a network with its class names and image scale as safetensors, in half precision unless told otherwise."""
+    tensors = {
+        name: (tensor.half() if half and tensor.is_floating_point() else tensor).cpu().contiguous()
+        for name, tensor in network.state_dict().items()
+    }
+    about = {METADATA: json.dumps({"class_names": class_names, "scale": scale})}
+    beside = path.with_name(path.name + ".part")
+    save_file(tensors, beside, about)
+    beside.replace(path)
+
+
+def _read_safetensors(path: Path) -> Checkpoint:
+    try:
+        with safe_open(path, "pt") as file:
+            about = json.loads((file.metadata() or {}).get(METADATA, "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        names = about.get("class_names")
+        return Checkpoint(
+            path, tensors, tuple(map(str, names)) if names else None, float(about.get("scale", 1.0))
+        )
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"checkpoint {path}: no safetensors file ({error}); get it again") from None
+
+
+def _only_tensors(content: Any, path: Path) -> dict[str, Tensor]:
+    while isinstance(content, dict) and (
+        inner := next((k for k in WRAPPERS if isinstance(content.get(k), dict)), None)
+    ):
+        content = content[inner]
+    if (
+        not isinstance(content, dict)
+        or not content
+        or not all(isinstance(t, Tensor) for t in content.values())
+    ):
+        raise DataError(
+            f"checkpoint {path}: found {type(content).__name__}, expected a state_dict of named tensors"
+        )
+    return {str(name).removeprefix("module."): tensor for name, tensor in content.items()}
+
+
+def _other_architecture(checkpoint: Checkpoint) -> DataError:
+    return DataError(
+        f"checkpoint {checkpoint.path}: found tensors such as {sorted(checkpoint.tensors)[:3]}, expected those of"
+        " RefineNet, full or light-weight, on a ResNet or MobileNet-v2; other networks come through hf:, onnx: or python:"
+    )

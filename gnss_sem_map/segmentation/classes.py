@@ -1,0 +1,40 @@
+"""What the channels of a network are called: from the user's own words, or from how many there are."""
+
+from __future__ import annotations
+
+from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.labels import LabelSet, taxonomy
+
+VOID = "void"
+"""A channel of this name is dropped before the softmax: it was never trained to mean anything."""
+
+BY_COUNT = {6: "kitti6", 11: "camvid", 19: "cityscapes"}
+"""Published street networks with that many classes have these, in the order of their ids."""
+
+
+def named_classes(description: str | None, count: int, label_set: LabelSet, where: str) -> tuple[str, ...]:
+    """The names of `count` channels, known to the class set, from a list of class and taxonomy names joined by commas.
+
+    A taxonomy stands for its classes in the order of its first kind of ids. Without a description the count decides
+    (BY_COUNT). Raises ConfigError for another number of names, or a name that the class set does not know.
+    """
+    if description is None:
+        if count not in BY_COUNT:
+            raise ConfigError(
+                f"{where}: found {count} classes without names; say them with ?classes=road,sidewalk,..."
+            )
+        description = BY_COUNT[count]
+    names = tuple(name for item in description.split(",") for name in _expand(item.strip(), label_set))
+    if len(names) != count or len(set(names)) != count:
+        raise ConfigError(
+            f"{where}: found {count} classes for {len(set(names))} different names {list(names)}; expected one each"
+        )
+    label_set.table_from([name for name in names if name != VOID])
+    return names
+
+
+def _expand(item: str, label_set: LabelSet) -> list[str]:
+    if item not in label_set.sources:
+        return [item]
+    ids = next(iter(taxonomy(item).ids.values()))
+    return sorted(ids, key=lambda name: ids[name])

@@ -1,0 +1,91 @@
+"""A torch network as a segmenter: pixels in, probabilities out, on the processor or on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.segmentation.classes import VOID
+from gnss_sem_map.segmentation.pixels import checked_pixels, scaled
+from gnss_sem_map.sensor_log import Image
+
+Probabilities = Callable[[Tensor, tuple[int, int]], Tensor]
+"""Normalised images (b, 3, h, w) and the wanted (height, width) -> class probabilities (b, c, height, width)."""
+
+
+class NetworkSegmenter:
+    """Runs a network at `scale` times the image's size, and answers at the image's size divided by `shrink`.
+
+    What the integer division cuts off at the right and lower border (less than `shrink` pixels) the network does not
+    see. Raises DataError for an image that is not (h, w, 3) uint8, or probabilities that are not finite.
+    """
+
+    def __init__(
+        self,
+        probabilities: Probabilities,
+        class_names: Sequence[str],
+        device: torch.device,
+        mean: Sequence[float],
+        std: Sequence[float],
+        scale: float = 1.0,
+        shrink: int = 2,
+    ) -> None:
+        self.class_names = tuple(class_names)
+        self._probabilities, self._device = probabilities, device
+        self._mean = torch.tensor(mean, device=device).reshape(3, 1, 1)
+        self._std = torch.tensor(std, device=device).reshape(3, 1, 1)
+        self._scale, self._shrink = scale, shrink
+
+    def __call__(self, image: Image) -> NDArray[np.float32]:
+        """Class probabilities (h, w, c) of one image."""
+        return self.segment_many([image])[0]
+
+    def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
+        """Class probabilities of several images of one size in one go, as if each had been alone."""
+        pixels = [checked_pixels(image) for image in images]
+        if len({p.shape for p in pixels}) > 1:
+            return [seen for image in images for seen in self.segment_many([image])]
+        height, width = (side // self._shrink for side in pixels[0].shape[:2])
+        inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
+        with torch.inference_mode():
+            batch = torch.from_numpy(inputs).to(self._device).permute(0, 3, 1, 2).float() / 255
+            seen = self._probabilities((batch - self._mean) / self._std, (height, width))
+            result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()
+        if not np.isfinite(result).all():
+            numbers = [image.number for image in images]
+            raise DataError(
+                f"images {numbers}: the network's probabilities are not finite; are its weights damaged?"
+            )
+        return [np.ascontiguousarray(one) for one in result]
+
+
+def from_logits(network: Callable[[Tensor], Tensor], class_names: Sequence[str]) -> Probabilities:
+    """Probabilities of a network that gives logits at some stride: enlarge, drop void channels, softmax."""
+    kept = [i for i, name in enumerate(class_names) if name != VOID]
+
+    def probabilities(images: Tensor, size: tuple[int, int]) -> Tensor:
+        logits = interpolate(network(images)[:, kept], size=size, mode="bilinear", align_corners=False)
+        return logits.softmax(1)
+
+    return probabilities
+
+
+def find_device(name: str) -> torch.device:
+    """The device of that name; `auto` is a GPU where there is one. Raises ConfigError for one that is not there."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"device {name!r}: {reason}; expected auto, cpu, cuda or another torch device"
+        ) from None
+    return device

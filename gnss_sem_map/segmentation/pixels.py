@@ -1,0 +1,53 @@
+"""Camera pixels on their way into a network."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.sensor_log import Image
+
+
+def checked_pixels(image: Image) -> NDArray[np.uint8]:
+    """The RGB pixels (h, w, 3) of an image; raises DataError when they are grey, of 16 bits, or none."""
+    pixels = image.read()
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.size == 0:
+        raise DataError(
+            f"image {image.number}: found {pixels.dtype} {pixels.shape}, expected RGB pixels (h, w, 3) of uint8;"
+            " convert grey or 16-bit images first"
+        )
+    return pixels
+
+
+def scaled(pixels: NDArray[np.uint8], shrink: int, scale: float) -> NDArray[np.uint8]:
+    """The pixels cut to sides that `shrink` divides, then resized to `scale` times that, rounded up: (h, w, 3)."""
+    import cv2
+
+    height, width = (side - side % shrink for side in pixels.shape[:2])
+    if min(height, width) == 0:
+        raise DataError(
+            f"found an image of {pixels.shape[1]} x {pixels.shape[0]} pixels, expected at least {shrink}"
+        )
+    cut = pixels[:height, :width]
+    if scale == 1.0:
+        return np.ascontiguousarray(cut)
+    size = (int(np.ceil(width * scale)), int(np.ceil(height * scale)))
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(cut, size, interpolation=method), np.uint8)
+
+
+def scale_and_shrink(
+    scale: str | None, shrink: str | None, where: str, usual_scale: float = 1.0
+) -> tuple[float, int]:
+    """The options of the same names as numbers; raises ConfigError unless 0.1 <= scale <= 4 and 1 <= shrink <= 16."""
+    try:
+        as_scale = usual_scale if scale is None else float(scale)
+        as_shrink = 2 if shrink is None else int(shrink)
+        if not (0.1 <= as_scale <= 4 and 1 <= as_shrink <= 16):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(
+            f"{where}: found scale {scale}, shrink {shrink}; expected 0.1 to 4, and a whole number from 1 to 16"
+        ) from None
+    return as_scale, as_shrink

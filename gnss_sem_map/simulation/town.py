@@ -110,10 +110,13 @@ class _Builder:
 
 
 def build_town(seed: int, crossings: int = 3) -> Town:
-    """The town of a seed, with a route over this many crossings; the route begins near the map's origin."""
+    """The town of a seed, with a route over this many crossings.
+
+    The map's origin lies on the first street, 56 m before the first crossing, where the drive begins.
+    """
     rng = np.random.default_rng([seed, 1])
     streets = lay_streets(rng)
-    route = random_route(streets, crossings, rng)
+    route = random_route(streets, crossings, np.random.default_rng([seed, 3]))
     bare = _ground(streets, route, rng)
     builder = _Builder(rng, [*models.cars(), models.lamp_post(), models.traffic_light(), models.sign()], [])
     builder.models += [models.bollard(), models.person(), models.cyclist()]
@@ -139,7 +142,7 @@ def _ground(streets: Streets, route: list[Node], rng: np.random.Generator) -> Gr
     angle = rng.uniform(-np.pi, np.pi)
     heading = (float(np.cos(angle)), float(np.sin(angle)))
     a, b = streets.position(route[0]), streets.position(route[1])
-    u, v = b + 45.0 * (a - b) / np.linalg.norm(a - b)
+    u, v = b + 56.0 * (a - b) / np.linalg.norm(a - b)
     origin = float(heading[1] * v - heading[0] * u), float(-heading[1] * u - heading[0] * v)
     a1, a2 = (float(a) for a in rng.uniform(-0.012, 0.012, 2))
     q1, q2, q3 = (float(q) for q in rng.uniform(-1.2e-4, 1.2e-4, 3))

@@ -1,0 +1,204 @@
+"""From a seed to a drive on disk: KITTI raw files and the exact truth beside them."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
+from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
+from gnss_sem_map.simulation.oxts import DATAFORMAT, oxts_rows, row_text, sweep_rows
+from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_imu, camera_in_lidar, write_calibration
+from gnss_sem_map.simulation.town import build_town
+from gnss_sem_map.simulation.traffic import EARLY_S, LATE_S, drive_through
+from gnss_sem_map.simulation.truth import (
+    seen_alone,
+    write_trajectory,
+    write_vehicles,
+    seen_boxes,
+)
+from gnss_sem_map.simulation.tracklets import write_tracklets
+from gnss_sem_map.simulation.world import World
+
+DATE = "2026_04_18"
+IMAGE_AFTER_SCAN_S = 0.0105
+EXPOSURE_AFTER_SCAN_S = 0.0020  # 8.5 ms before the image's stamp, as measured on KITTI
+_MORNING_NS = 1_776_504_600_000_000_000  # 2026-04-18 09:30:00 UTC, stamp zero of the simulation
+_PLACE = LocalFrame(lat_deg=49.0131, lon_deg=8.4044, alt_m=115.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A drive before it is written: the world, when the sensors measure, and what the navigation unit says.
+
+    Stamps are seconds since the first row of the drive's oxts; the map is the LocalFrame of that row's position.
+    """
+
+    seed: int
+    world: World
+    lidar: Lidar
+    camera: Camera
+    sweeps: Floats
+    """(frames, 2) s, start and end of every sweep."""
+    oxts_stamps: Floats
+    """(n,) s, 100 Hz."""
+    oxts: Floats
+    """(n, 30)"""
+    sync: npt.NDArray[np.int64]
+    """(frames,) the row of `oxts` that belongs to every sweep."""
+
+    @property
+    def stamps(self) -> Floats:
+        """The stamp of every scan: the middle of its sweep, (frames,) s."""
+        return np.asarray(self.sweeps.mean(axis=1))
+
+    @property
+    def zero_s(self) -> float:
+        """Simulated time of stamp zero of the log: the first row of the drive's oxts."""
+        return float(self.oxts_stamps[self.sync[0]])
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The map's frame: the position that the first row of the drive's oxts reports."""
+        return LocalFrame(*(float(v) for v in self.oxts[self.sync[0], :3]))
+
+    def to_map(self, points: Floats) -> Floats:
+        """From the simulation's own axes (origin at `_PLACE`) to the map that readers of the drive will find."""
+        return self.frame.to_map(*_PLACE.to_geodetic(points))
+
+    def scan(self, frame: int) -> SimulatedScan:
+        """The sweep of a frame."""
+        start, end = self.sweeps[frame]
+        return render_scan(self.world, T_IMU_LIDAR, start, end, lidar=self.lidar, seed=self.seed, frame=frame)
+
+    def image(self, frame: int) -> SimulatedImage:
+        """The image of a frame, at its moment of exposure."""
+        moment = self.stamps[frame] + EXPOSURE_AFTER_SCAN_S
+        T_map_camera = self.world.ego.poses([moment])[0] @ camera_in_imu(self.camera)
+        return render_image(self.world, T_map_camera, moment, camera=self.camera, seed=self.seed, frame=frame)
+
+
+def prepare(seconds: float, seed: int, lidar: Lidar | None = None, camera: Camera | None = None) -> Simulation:
+    """Build the town, let everybody drive, and let the navigation unit measure; renders nothing yet."""
+    frames = round(10.0 * seconds)
+    if frames < 3:
+        raise DataError(f"a drive of {seconds} s has {frames} scans, expected at least 3; ask for 0.3 s or more")
+    town = build_town(seed, crossings=4 + int(seconds / 7.0))
+    town, ego, movers = drive_through(town, seconds, seed)
+    rng = np.random.default_rng([seed, 5])
+    edges = 0.05 + 0.1 * np.arange(frames + 1) + np.concatenate([[0.0], rng.uniform(-4e-4, 4e-4, frames)])
+    sweeps = np.column_stack([edges[:-1], edges[1:]])
+    ticks = np.arange(-EARLY_S + 0.05, seconds + LATE_S - 0.3, 0.01)
+    oxts_stamps = ticks + rng.uniform(-2e-4, 2e-4, len(ticks))
+    rows = oxts_rows(ego, oxts_stamps, _PLACE, rng)
+    sync = sweep_rows(oxts_stamps, sweeps.mean(axis=1), rng)
+    world = World(town, ego, movers)
+    return Simulation(seed, world, lidar or Lidar(), camera or Camera(), sweeps, oxts_stamps, rows, sync)
+
+
+def simulate(
+    folder: Path,
+    seconds: float = 30.0,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    lidar: Lidar | None = None,
+    camera: Camera | None = None,
+    workers: int | None = None,
+) -> Path:
+    """Write the drive of a seed in KITTI raw format, with its truth, under `folder`; returns the drive's folder.
+
+    `progress(done, frames)` is called after every frame; `workers` threads render (None: one per core). The bytes
+    do not depend on the threads. Raises DataError when the drive is already there or is too short.
+    """
+    drive = Path(folder) / DATE / f"{DATE}_drive_{seed:04d}_sync"
+    for path in (drive, _twin(drive)):
+        if path.exists():
+            raise DataError(f"{path}: is already there; remove it or simulate into another folder")
+    simulation = prepare(seconds, seed, lidar, camera)
+    partial = drive.with_name(f".{drive.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    _write_still(simulation, partial, drive)
+    frames = len(simulation.sweeps)
+    seen: list[npt.NDArray[np.uint16]] = []
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        for done, instances in enumerate(pool.map(lambda k: _write_frame(simulation, k, partial), range(frames)), 1):
+            seen.append(instances)
+            if progress is not None:
+                progress(done, frames)
+    write_tracklets(partial / "tracklet_labels.xml", seen_boxes(simulation.world, simulation.sweeps, seen))
+    partial.rename(drive)
+    return drive
+
+
+def _twin(drive: Path) -> Path:
+    return drive.with_name(drive.name.replace("_sync", "_extract"))
+
+
+def _write_still(simulation: Simulation, partial: Path, drive: Path) -> None:
+    """Calibration, oxts, stamps, and the truth that needs no rendering."""
+    for name in ("velodyne_points/data", "image_02/data", "truth/labels", "truth/train_ids", "truth/single_frame"):
+        (partial / name).mkdir(parents=True)
+    write_calibration(drive.parent, simulation.camera)
+    _write_oxts(partial, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
+    _write_oxts(_twin(drive), simulation.oxts_stamps, simulation.oxts)
+    stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}
+    for name, values in stamps.items():
+        _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", values)
+    _write_stamps(partial / "image_02" / "timestamps.txt", simulation.stamps + IMAGE_AFTER_SCAN_S)
+    truth, frame = partial / "truth", simulation.frame
+    about = {
+        "epoch_ns": _MORNING_NS + round(simulation.zero_s * 1e9),
+        "lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m, "seed": simulation.seed,
+    }  # fmt: skip
+    (truth / "world.json").write_text(json.dumps(about, indent=2) + "\n")
+    to_map, zero = simulation.to_map, simulation.zero_s
+    write_trajectory(truth / "trajectory.tum", simulation.world.ego, simulation.oxts_stamps, zero, to_map)
+    write_trajectory(truth / "trajectory_lidar.tum", simulation.world.ego, simulation.stamps, zero, to_map)
+    write_vehicles(truth / "vehicles.csv", simulation.world, simulation.stamps, zero, to_map)
+
+
+def _write_oxts(drive: Path, stamps: Floats, rows: Floats) -> None:
+    (drive / "oxts" / "data").mkdir(parents=True)
+    (drive / "oxts" / "dataformat.txt").write_text(DATAFORMAT)
+    _write_stamps(drive / "oxts" / "timestamps.txt", stamps)
+    for k, row in enumerate(rows):
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(row_text(row))
+
+
+def _write_stamps(path: Path, stamps: Floats) -> None:
+    """One line `date time` with nanoseconds for each stamp."""
+    times = (_MORNING_NS + np.round(stamps * 1e9).astype(np.int64)).astype("datetime64[ns]")
+    path.write_text("".join(str(time).replace("T", " ") + "\n" for time in times))
+
+
+def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.uint16]:
+    """Render and write one scan and one image with their truth; returns the instances that the image shows."""
+    name, scan, image = f"{k:010d}", simulation.scan(k), simulation.image(k)
+    (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
+    (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
+    _write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
+    _write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids)
+    start, end = simulation.sweeps[k]
+    T = simulation.world.ego.poses([*(start + scan.fractions * (end - start)), simulation.stamps[k] + EXPOSURE_AFTER_SCAN_S])
+    alone = seen_alone(scan, image, T[:-1], T[-1], T_IMU_LIDAR, camera_in_lidar(simulation.camera), simulation.camera)
+    (drive / "truth" / "single_frame" / f"{name}.label").write_bytes(alone.astype("<u4").tobytes())
+    numbers, counts = np.unique(image.instances, return_counts=True)
+    return numbers[(numbers > 0) & (counts >= 60)]
+
+
+def _write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise DataError(f"{path}: the image could not be encoded")
+    path.write_bytes(data.tobytes())

@@ -1,0 +1,282 @@
+"""Who moves: the recording vehicle on its route, and the others, none of whom runs into anybody."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factor_graphs.simulation import Motion, follow
+from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.streets import LANE_M, STOP_LINE_M, Node, lane_path
+from gnss_sem_map.simulation.town import CAR_COLOURS, CYCLIST, PERSON, Colour, Thing, Town
+from gnss_sem_map.simulation.world import Mover
+
+IMU_HEIGHT_M = 0.93
+EARLY_S, LATE_S = 0.6, 1.0  # how long before and after the drive everybody's motion is known
+_GREEN_S = 10.5  # when the light at the first crossing turns green
+_START_M = 56.0  # how far before the first crossing the drive begins
+_GAIN, _BRAKE, _SIDEWAYS = 1.5, 1.8, 2.0  # m/s2
+_CLOTHES: list[Colour] = [(0.5, 0.08, 0.08), (0.1, 0.2, 0.45), (0.75, 0.72, 0.66), (0.12, 0.3, 0.16), (0.7, 0.5, 0.1)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """A way on the ground of the map: points (k, 3) and their distance along it (k,)."""
+
+    points: Floats
+    way: Floats
+
+    def beyond(self, start: float) -> Floats:
+        """The points from `start` metres on."""
+        at = np.concatenate([[start], self.way[self.way > start + 0.3]])
+        return np.column_stack([np.interp(at, self.way, c) for c in self.points.T])
+
+    def nearest(self, point: Floats) -> float:
+        """How far along the way it comes nearest to a point."""
+        return float(self.way[np.argmin(((self.points[:, :2] - point[:2]) ** 2).sum(1))])
+
+
+def _path(town: Town, uv: Floats) -> _Path:
+    points = town.to_map(uv)
+    return _Path(points, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]))
+
+
+def _profile(
+    path: _Path, start: float, speed: float, limit: float, stops: Sequence[tuple[float, float]], seconds: float
+) -> tuple[Floats, Floats]:
+    """Stamps and speeds of somebody who keeps a limit, slows in curves, and waits at stops (way, until stamp)."""
+    way = np.arange(start, path.way[-1] - 0.5, 0.25)
+    xy = np.column_stack([np.interp(way, path.way, c) for c in path.points[:, :2].T])
+    course = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
+    bend = np.convolve(np.abs(np.gradient(course, way)), np.ones(9) / 9, mode="same")
+    v = np.minimum(limit, np.sqrt(_SIDEWAYS / np.maximum(bend, 1e-4)))
+    halts = {int(np.argmin(np.abs(way - at))): until for at, until in stops if at > start + 1.0}
+    v[[*halts, len(v) - 1]] = 0.0
+    v[0] = min(v[0], speed)
+    for k in range(1, len(v)):
+        v[k] = min(v[k], np.sqrt(v[k - 1] ** 2 + 0.5 * _GAIN))
+    for k in range(len(v) - 2, -1, -1):
+        v[k] = min(v[k], np.sqrt(v[k + 1] ** 2 + 0.5 * _BRAKE))
+    stamps, speeds, now = [-EARLY_S], [float(v[0])], -EARLY_S
+    for k in range(1, len(v)):
+        now += 0.5 / max(v[k - 1] + v[k], 1e-3)
+        stamps.append(now)
+        speeds.append(float(v[k]))
+        if k in halts:
+            now = max(now + 0.8, halts[k])
+            stamps.append(now)
+            speeds.append(0.0)
+        if now > seconds + LATE_S:
+            break
+    if now <= seconds + LATE_S:
+        stamps.append(seconds + LATE_S + 1.0)
+        speeds.append(0.0)
+    return np.array(stamps), np.array(speeds)
+
+
+def _drive(
+    path: _Path,
+    seconds: float,
+    *,
+    start: float,
+    speed: float,
+    limit: float,
+    stops: Sequence[tuple[float, float]] = (),
+    lift: float = 0.0,
+    suspension_deg: float = 0.0,
+) -> Motion:
+    stamps, speeds = _profile(path, start, speed, limit, stops, seconds)
+    return follow(path.beyond(start) + np.array([0.0, 0.0, lift]), stamps, speeds, suspension_deg)
+
+
+class _Crowd:
+    """Those who are on the road already; a newcomer who would touch one of them is turned away."""
+
+    def __init__(self, town: Town, ego: Motion, seconds: float) -> None:
+        self.town, self.stamps = town, np.arange(-EARLY_S, seconds + 0.5, 0.2)
+        self.discs = [self._discs(ego.poses(self.stamps), 2.3)]
+        self.movers: list[Mover] = []
+
+    @staticmethod
+    def _discs(T: Floats, length: float) -> Floats:
+        """Circles that cover somebody at every stamp: (stamps, 3, 2) centres; all have a radius of about 1 m."""
+        ahead = np.array([-0.5, 0.0, 0.5]) * length
+        return np.asarray(T[:, None, :2, 3] + ahead[:, None] * T[:, None, :2, 0])
+
+    def admit(self, name: str, model: int, colour: Colour, motion: Motion) -> bool:
+        """Take somebody in who keeps clear of all others."""
+        bounds = self.town.models[model].bounds
+        mine, radius = self._discs(motion.poses(self.stamps), 0.75 * (bounds[3] - bounds[0])), 0.5 * bounds[4] + 0.15
+        for other in self.discs:
+            gap = np.linalg.norm(mine[:, :, None] - other[:, None, :], axis=-1).min()
+            if gap < radius + 1.05:
+                return False
+        self.discs.append(mine)
+        self.movers.append(Mover(name, model, colour, motion))
+        return True
+
+
+def drive_through(town: Town, seconds: float, seed: int) -> tuple[Town, Motion, list[Mover]]:
+    """The town (without the car that leaves its bay), the recording vehicle's exact motion, and all other movers.
+
+    They are: one who drives ahead, one behind, some who wait at the light of the first crossing and some who pass it,
+    oncoming and stop-and-go traffic, a car that creeps out of a bay, cyclists and people on foot.
+    """
+    rng = np.random.default_rng([seed, 4])
+    before = (2 * town.route[0][0] - town.route[1][0], 2 * town.route[0][1] - town.route[1][1])
+    own = _path(town, lane_path(town.streets, [before, *town.route]))
+    first = own.nearest(town.to_map(town.streets.position(town.route[1])[None])[0])
+    approach = _length(town, town.route[0], town.route[1])
+    length = _length(town, before, town.route[0]) + approach
+    start = length - _START_M
+    line = length - town.streets.crossing_edge(town.route[0], town.route[1]) - STOP_LINE_M
+    if not start < line < first + 20.0:
+        raise ValueError(f"route {town.route[:2]}: the stop line at {line:.1f} m is not behind the start {start:.1f} m")
+    cruise = {"speed": 7.0, "limit": 8.5}
+    ego = _drive(
+        own, seconds, start=start, stops=_stops(line - 10.2), lift=IMU_HEIGHT_M, suspension_deg=0.25, **cruise
+    )
+    crowd = _Crowd(town, ego, seconds)
+    ahead = _drive(own, seconds, start=start + 14.0, stops=_stops(line - 2.6, -1.0), speed=7.0, limit=9.5)
+    crowd.admit("leader", 4, CAR_COLOURS[0], ahead)
+    behind = _drive(own, seconds, start=start - 13.0, stops=_stops(line - 18.0, 1.3), speed=7.0, limit=8.0)
+    crowd.admit("follower", 1, CAR_COLOURS[5], behind)
+    _meet_at_the_light(town, crowd, seconds, rng)
+    town = _creep(town, crowd, ego, seconds)
+    _oncoming(town, crowd, seconds, rng)
+    _on_foot(town, crowd, seconds, rng)
+    return town, ego, crowd.movers
+
+
+def _stops(at: float, later: float = 0.0) -> list[tuple[float, float]]:
+    return [(at, _GREEN_S + later)]
+
+
+def _length(town: Town, a: Node, b: Node) -> float:
+    return float(np.linalg.norm(town.streets.position(b) - town.streets.position(a)))
+
+
+def _meet_at_the_light(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
+    """Somebody waits opposite until it is green, and others cross before."""
+    before, here = town.route[0], town.route[1]
+    step = (here[0] - before[0], here[1] - before[1])
+    across = (-step[1], step[0])
+    opposite = [(here[0] + 2 * step[0], here[1] + 2 * step[1])]
+    opposite += [(here[0] + step[0], here[1] + step[1]), here, before]
+    path = _path(town, lane_path(town.streets, _within(town, opposite)))
+    line = _length(town, opposite[0], opposite[1]) * (len(_within(town, opposite)) == 4)
+    line += _length(town, opposite[1], here) - town.streets.crossing_edge(opposite[1], here) - STOP_LINE_M - 2.6
+    for late in (0.7, 4.0, 7.0, 10.0):
+        stop = [(line, _GREEN_S + late)]
+        motion = _drive(path, seconds, start=line - 16.0, speed=4.0, limit=8.5, stops=stop)
+        if crowd.admit("waits opposite", 0, CAR_COLOURS[2], motion):
+            break
+    for side in (1, -1):
+        nodes = [(here[0] + k * side * across[0], here[1] + k * side * across[1]) for k in (-2, -1, 0, 1, 2)]
+        path = _path(town, lane_path(town.streets, _within(town, nodes)))
+        middle = path.nearest(town.to_map(town.streets.position(here)[None])[0])
+        for back in (24.0, 36.0, 52.0, 66.0):
+            if middle - back < 0:
+                continue
+            motion = _drive(path, seconds, start=middle - back, speed=7.5, limit=8.5)
+            crowd.admit("crosses", int(rng.integers(0, 6)), _colour(rng), motion)
+
+
+def _within(town: Town, nodes: list[Node]) -> list[Node]:
+    return [node for node in nodes if town.streets.holds(node)]
+
+
+def _colour(rng: np.random.Generator) -> Colour:
+    return CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
+
+
+def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
+    """Traffic against the drive on every street of the route, some of it stop and go, and a cyclist."""
+    for number, (a, b) in enumerate(zip(town.route[1:-1], town.route[2:], strict=True)):
+        step = (b[0] - a[0], b[1] - a[1])
+        nodes = _within(town, [(b[0] + k * step[0], b[1] + k * step[1]) for k in (2, 1, 0, -1, -2)])
+        path = _path(town, lane_path(town.streets, nodes))
+        reach, bicycle = path.way[-1], np.diff(town.streets.position(nodes[-1]) - town.streets.position(nodes[0]))
+        for k in range(8):
+            start = float(rng.uniform(0.05, 0.7) * reach)
+            halt = (start + float(rng.uniform(15, 40)), float(rng.uniform(6, 14)))
+            stops = [halt, (halt[0] + 9.0, halt[1] + 5.0)] if k % 3 == 0 else []
+            speed = float(rng.uniform(5.5, 8.5))
+            motion = _drive(path, seconds, start=start, speed=speed, limit=speed + 1.0, stops=stops)
+            crowd.admit("stop and go" if stops else "oncoming", int(rng.choice([0, 1, 2, 3, 4, 5])), _colour(rng), motion)
+        if number == 0 and bicycle.size:
+            kerb = town.streets.half_width(a, b) - 2.6
+            side = _path(town, _shifted(lane_path(town.streets, nodes), kerb - LANE_M))
+            for share in (0.35, 0.45, 0.25, 0.55):
+                motion = _drive(side, seconds, start=share * side.way[-1], speed=4.0, limit=4.2)
+                if crowd.admit("cyclist", CYCLIST, _CLOTHES[1], motion):
+                    break
+
+
+def _shifted(uv: Floats, right: float) -> Floats:
+    """A straight way moved to its right."""
+    course = (uv[-1] - uv[0]) / np.linalg.norm(uv[-1] - uv[0])
+    return np.asarray(uv + right * np.array([course[1], -course[0]]))
+
+
+def _creep(town: Town, crowd: _Crowd, ego: Motion, seconds: float) -> Town:
+    """One car rolls out of its bay for a metre and a half as the drive passes: a trail hardly longer than the car."""
+    track = ego.poses(np.arange(0.0, seconds, 0.5))[:, :3, 3]
+    best: tuple[float, int, float] | None = None
+    for k, thing in enumerate(town.things):
+        if not thing.is_vehicle or thing.model > 3 or not _stands_across(town, thing):
+            continue
+        gaps = np.linalg.norm(track[:, :2] - town.place(thing)[:2], axis=1)
+        if best is None or gaps.min() < best[0]:
+            best = (float(gaps.min()), k, 0.5 * float(gaps.argmin()))
+    if best is None or best[0] > 40.0:
+        return town
+    _, k, passing = best
+    thing = town.things[k]
+    ahead = np.array([np.cos(thing.heading), np.sin(thing.heading)])
+    path = _path(town, np.array([thing.u, thing.v]) + np.arange(0.0, 5.0, 0.5)[:, None] * ahead)
+    begin = max(passing - 5.0, 1.0)
+    stamps = np.array([-EARLY_S - 0.1, begin, begin + 0.8, begin + 4.0, begin + 4.8, seconds + 30.0])
+    speeds = np.array([0.0, 0.0, 0.38, 0.38, 0.0, 0.0])
+    if not crowd.admit("creeps", thing.model, thing.colour, follow(path.points, stamps, speeds)):
+        return town
+    rest = [other for j, other in enumerate(town.things) if j != k]
+    return Town(town.streets, town.route, town.ground, town.models, rest)
+
+
+def _stands_across(town: Town, thing: Thing) -> bool:
+    """Whether a car stands in a bay with its front to the street."""
+    ahead = np.array([np.cos(thing.heading), np.sin(thing.heading)])
+    depth, front = (_depth(town, np.array([thing.u, thing.v]) + reach * ahead) for reach in (0.0, 5.0))
+    return depth > 5.0 and front < depth - 4.0
+
+
+def _depth(town: Town, uv: Floats) -> float:
+    """How far behind the kerb of the nearest street a point is."""
+    u, v = town.streets, uv
+    return float(min((np.abs(v[0] - u.u) - u.half_u).min(), (np.abs(v[1] - u.v) - u.half_v).min()))
+
+
+def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
+    """People on both sidewalks of the route, and one on the zebra while the drive waits."""
+    for a, b in zip(town.route[:-1], town.route[1:], strict=True):
+        pa, pb = town.streets.position(a), town.streets.position(b)
+        course = (pb - pa) / np.linalg.norm(pb - pa)
+        right = np.array([course[1], -course[0]])
+        for k in range(6):
+            out = town.streets.half_width(a, b) + float(rng.uniform(2.2, 2.8))
+            way = float(rng.uniform(14.0, np.linalg.norm(pb - pa) - 16.0))
+            here = pa + course * way + (right if k % 2 else -right) * out
+            towards = course if rng.random() < 0.5 else -course
+            line = here + np.arange(0.0, 60.0, 1.5)[:, None] * towards
+            speed = float(rng.uniform(1.0, 1.5))
+            motion = _drive(_path(town, line), seconds, start=0.0, speed=speed, limit=speed)
+            crowd.admit("walks", PERSON, _CLOTHES[k % 5], motion)
+    a, b = town.route[0], town.route[1]
+    pa, pb = town.streets.position(a), town.streets.position(b)
+    course = (pb - pa) / np.linalg.norm(pb - pa)
+    right = np.array([course[1], -course[0]])
+    zebra = pb - course * (town.streets.crossing_edge(a, b) + 5.7)
+    half = town.streets.half_width(a, b) + 1.6
+    line = zebra + right * half - np.arange(0.0, 2 * half + 12.0, 1.5)[:, None] * right
+    crowd.admit("crosses on foot", PERSON, _CLOTHES[0], _drive(_path(town, line), seconds, start=0.0, speed=1.4, limit=1.4))

@@ -1,0 +1,144 @@
+"""What really was: trajectory, poses of all vehicles, and what a single image tells of a scan."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.simulation import Motion
+from gnss_sem_map.simulation.camera import Camera, SimulatedImage
+from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.lidar import SimulatedScan
+from gnss_sem_map.simulation.models import Model
+from gnss_sem_map.simulation.rig import T_LIDAR_IMU
+from gnss_sem_map.simulation.tracklets import Box, Tracklet
+from gnss_sem_map.simulation.world import World
+
+_RANGE_M = 120.0
+# Cityscapes trainId -> the five classes of the map as SemanticKITTI ids; everything else stays unlabelled
+_SCORED = np.zeros(256, np.uint32)
+_SCORED[[0, 1, 2, 8]] = 40, 48, 50, 70
+_SCORED[13:18] = 10
+_TRACKLET_KINDS = {"van": "Van", "truck": "Truck", "person": "Pedestrian", "cyclist": "Cyclist"}
+
+
+def write_trajectory(
+    path: Path, motion: Motion, stamps: Floats, zero_s: float, to_map: Callable[[Floats], Floats]
+) -> None:
+    """T_map_imu in TUM format, stamps in seconds since the log's epoch."""
+    T = motion.poses(stamps)
+    rows = np.column_stack([stamps - zero_s, to_map(T[:, :3, 3]), Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+    np.savetxt(path, rows, fmt="%.9f")
+
+
+def vehicle_poses(world: World, stamp: float) -> tuple[npt.NDArray[np.int32], Floats]:
+    """Instance numbers (k,) of everybody with one, and x, y, z, yaw (k, 4) of the middle of their bottoms."""
+    rows = world.scene(stamp, stamp).things
+    who = np.flatnonzero(world.instances > 0)
+    return world.instances[who], rows[who, :4]
+
+
+def write_vehicles(
+    path: Path, world: World, stamps: Floats, zero_s: float, to_map: Callable[[Floats], Floats]
+) -> None:
+    """Who stood or drove where at every scan's stamp: everybody within the LiDAR's range, moving or not."""
+    details = {number: (name, model, moving) for number, name, model, moving in _everybody(world)}
+    lines = ["stamp_s,instance,name,moving,x_m,y_m,z_m,yaw_rad,length_m,width_m,height_m\n"]
+    for stamp in stamps:
+        here = world.ego.poses([stamp])[0, :2, 3]
+        numbers, poses = vehicle_poses(world, float(stamp))
+        near = np.hypot(*(poses[:, :2] - here).T) < _RANGE_M
+        for number, place, yaw in zip(numbers[near], to_map(poses[near, :3]), poses[near, 3], strict=True):
+            name, model, moving = details[int(number)]
+            x, y, z = place
+            yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
+            length, width, height = _size(model)
+            lines.append(
+                f"{stamp - zero_s:.6f},{number},{name},{int(moving)},{x:.4f},{y:.4f},{z:.4f},{yaw:.6f},"
+                f"{length:.3f},{width:.3f},{height:.3f}\n"
+            )
+    path.write_text("".join(lines))
+
+
+def _everybody(world: World) -> list[tuple[int, str, Model, bool]]:
+    """Instance number, model's name, model, and whether it moves during the drive."""
+    town = world.town
+    parked = [(int(n), town.models[t.model]) for n, t in zip(world.instances, town.things, strict=False) if n > 0]
+    moving = zip(world.instances[len(town.things) :], (town.models[m.model] for m in world.movers), strict=True)
+    return [(n, m.name, m, False) for n, m in parked] + [(int(n), m.name, m, True) for n, m in moving]
+
+
+def _size(model: Model) -> tuple[float, float, float]:
+    b = model.bounds
+    return float(b[3] - b[0]), float(b[4] - b[1]), float(b[5])
+
+
+def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]]) -> list[Tracklet]:
+    """A tracklet for everybody who is seen, from the first frame to the last one that shows it."""
+    details = {number: (name, model) for number, name, model, _ in _everybody(world)}
+    span: dict[int, tuple[int, int]] = {}
+    for frame, numbers in enumerate(seen):
+        for number in numbers.tolist():
+            span[number] = (span.get(number, (frame, frame))[0], frame)
+    boxes: dict[int, list[Box]] = {number: [] for number in span}
+    for frame, stamp in enumerate(sweeps.mean(axis=1)):
+        numbers, poses = vehicle_poses(world, float(stamp))
+        T = T_LIDAR_IMU @ np.linalg.inv(world.ego.poses([stamp])[0])
+        p = poses[:, :3] @ T[:3, :3].T + T[:3, 3]
+        turn = np.arctan2(T[1, 0], T[0, 0])
+        for number, (x, y, z), yaw in zip(numbers.tolist(), p.tolist(), poses[:, 3].tolist(), strict=True):
+            if number in span and span[number][0] <= frame <= span[number][1]:
+                heading = (yaw + turn + np.pi) % (2 * np.pi) - np.pi
+                boxes[number].append(Box(frame, x, y, z, float(heading)))
+    tracklets = []
+    for number in sorted(span):
+        name, model = details[number]
+        length, width, height = _size(model)
+        tracklets.append(Tracklet(_TRACKLET_KINDS.get(name, "Car"), height, width, length, tuple(boxes[number])))
+    return tracklets
+
+
+def seen_alone(
+    scan: SimulatedScan,
+    image: SimulatedImage,
+    T_map_imu: Floats,
+    T_map_imu_exposure: Floats,
+    T_imu_lidar: Floats,
+    T_camera_lidar: Floats,
+    camera: Camera,
+) -> npt.NDArray[np.uint32]:
+    """What the true class image says of every point of its scan: 40 48 10 50 70, and 0 where it shows another thing.
+
+    `T_map_imu` (n, 4, 4) at the points' own stamps, and at the exposure. A point counts as seen when the image's true
+    depth there is its own.
+    """
+    u, v, z = project(scan, T_map_imu, T_map_imu_exposure, T_imu_lidar, T_camera_lidar, camera)
+    inside = (z > 0.5) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    labels = np.zeros(len(scan.points), np.uint32)
+    rows, columns = v[inside], u[inside]
+    depth = image.depth[rows, columns]
+    visible = (depth > 0) & (np.abs(z[inside] - depth) < 0.15 + 0.03 * z[inside])
+    labels[inside] = np.where(visible, _SCORED[image.train_ids[rows, columns]], 0)
+    return labels
+
+
+def project(
+    scan: SimulatedScan,
+    T_map_imu: Floats,
+    T_map_imu_exposure: Floats,
+    T_imu_lidar: Floats,
+    T_camera_lidar: Floats,
+    camera: Camera,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Floats]:
+    """Pixels u, v and depth z at the moment of exposure of points that were measured each at its own stamp."""
+    p = scan.points[:, :3].astype(np.float64)
+    T_map_lidar = T_map_imu @ T_imu_lidar
+    p_map = np.einsum("nij,nj->ni", T_map_lidar[:, :3, :3], p) + T_map_lidar[:, :3, 3]
+    T = T_camera_lidar @ np.linalg.inv(T_map_imu_exposure @ T_imu_lidar)
+    x, y, z = (p_map @ T[:3, :3].T + T[:3, 3]).T
+    ahead = np.maximum(z, 1e-6)
+    u = np.round(camera.focal_px * x / ahead + camera.centre_u_px)
+    v = np.round(camera.focal_px * y / ahead + camera.centre_v_px)
+    return np.clip(u, -1e6, 1e6).astype(np.int64), np.clip(v, -1e6, 1e6).astype(np.int64), z

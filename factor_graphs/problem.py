@@ -1,5 +1,6 @@
 """The estimation problem: what stays the same from one optimisation to the next, and one optimisation."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -53,6 +54,7 @@ class Fit:
     """One optimised graph; `squares` (m,) are the squared whitened residuals of the fixes, chi2 of 3 dof."""
 
     inflation: float
+    loss: str
     motion: gtsam.NonlinearFactorGraph
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
@@ -121,12 +123,19 @@ def motion_graph(problem: Problem, inflation: float) -> gtsam.NonlinearFactorGra
 
 
 def optimise(
-    problem: Problem, motion: gtsam.NonlinearFactorGraph, start: gtsam.Values, inflation: float, loss: str
+    problem: Problem,
+    motion: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    inflation: float,
+    loss: str,
+    constraints: Iterable[gtsam.NonlinearFactor] = (),
 ) -> Fit:
     """The most probable states (Levenberg-Marquardt); raises EstimationError when it stops at its limit."""
     graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
     for factor in gnss_factors(problem.fixes, problem.at, problem.p_imu_antenna, kernel):
         graph.push_back(factor)
+    for constraint in constraints:
+        graph.push_back(constraint)
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(problem.settings.max_iterations)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
@@ -141,7 +150,7 @@ def optimise(
     chi2_per_dof = (2 * motion.error(values) + squares[good].sum()) / (GOOD_MEAN * max(good.sum(), 1))
     weights = np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
     return Fit(
-        inflation, motion, graph, values, optimiser.iterations(), squares, weights, float(chi2_per_dof)
+        inflation, loss, motion, graph, values, optimiser.iterations(), squares, weights, float(chi2_per_dof)
     )
 
 

@@ -21,6 +21,24 @@ class SmootherSettings(BaseModel):
     )
     min_fix_stddev_m: float = Field(0.02, gt=0, description="No fix is trusted more than this.")
     max_speed_mps: float = Field(70.0, gt=0, description="A fix that would need more speed is dropped.")
+    estimate_time_offset: bool | None = Field(
+        None,
+        description="Find how much later than its stamp a fix is. Empty: only where the data leave no doubt.",
+    )
+    estimate_lever_arm: bool = Field(
+        False, description="Find where the antenna is, starting from where it is said."
+    )
+    standing_stddev_mps: float | None = Field(
+        0.03, gt=0, description="Velocity of a vehicle seen to stand (zero-velocity update). Empty: not used."
+    )
+    lateral_stddev_mps: float | None = Field(
+        None,
+        gt=0,
+        description="Sideways velocity of a vehicle whose IMU looks straight ahead. Empty: not used.",
+    )
+    vertical_stddev_mps: float | None = Field(
+        None, gt=0, description="Vertical velocity in the IMU's own axes, likewise. Empty: not used."
+    )
     start_tilt_stddev_rad: float = Field(0.2, gt=0, description="Unknown roll and pitch of the first guess.")
     start_heading_stddev_rad: float = Field(0.7, gt=0, description="Unknown heading of the first guess.")
     max_iterations: int = Field(50, gt=0, description="The optimiser fails when it needs more.")

@@ -1,8 +1,4 @@
-"""The batch smoother: IMU and GNSS in, the most probable trajectory out, with covariance.
-
-The order is fixed. First the IMU noise is inflated until the residuals are as large as they should be,
-then fixes that still do not fit are rejected: on a graph that is too stiff, good fixes would be.
-"""
+"""The batch smoother: IMU and GNSS in, the most probable trajectory out, with covariance."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,20 +9,19 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.calibration import Calibration
 from factor_graphs.dense import densify
+from factor_graphs.errors import MeasurementError
+from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.problem import REJECTION, Fit, Problem, first_values, motion_graph, optimise, pose_problem
+from factor_graphs.problem import REJECTION, Fit, Problem, pose_problem
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-# Residuals fit their standard deviations when chi2 per degree of freedom is in this range.
-FITTING_CHI2 = (0.8, 1.3)
-# Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
-INFLATED_CHI2, MAX_INFLATION, WORTHWHILE = 1.1, 100.0, 0.98
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
 UNKNOWN_HEADING = 0.35
 
@@ -40,7 +35,7 @@ class Solution:
     For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
     outside the IMU's span; `rejected`: does not fit or could not be used. `chi2_per_dof` is about 1 when the
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
-    `notes` says in words what was repaired and what is in doubt.
+    `calibration` the time offset and lever arm used; `notes` says in words what was repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -53,6 +48,7 @@ class Solution:
     chi2_per_dof: float
     inflation: float
     imu_noise: ImuNoise
+    calibration: Calibration
     iterations: int
     notes: tuple[str, ...] = ()
 
@@ -72,31 +68,21 @@ def smooth(
     EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
-    problem = pose_problem(
-        imu, fixes, frame, settings, np.asarray(p_imu_antenna, np.float64), initial_attitude
-    )
-    fit = _fit_noise(problem)
-    if settings.robust and fit.chi2_per_dof <= FITTING_CHI2[1]:
-        fit = optimise(problem, fit.motion, fit.values, fit.inflation, "truncated")
-    return _solution(problem, fit, fixes)
+    given = np.asarray(p_imu_antenna, dtype=np.float64)
+    if given.shape != (3,) or not np.isfinite(given).all():
+        raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
+
+    def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
+        shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
+        problem = pose_problem(imu, shifted, frame, settings, calibration.p_imu_antenna, initial_attitude)
+        return problem, fit_noise(problem)
+
+    problem, fit, calibration = calibrate(fit_to, settings, given)
+    fit = constrain(problem, reject(problem, fit))
+    return _solution(problem, fit, fixes, calibration)
 
 
-def _fit_noise(problem: Problem) -> Fit:
-    """Inflate the IMU noise, starting from the sensor's own, until chi2 per degree of freedom fits."""
-    loss = "huber" if problem.settings.robust else "quadratic"
-    fit = optimise(problem, motion_graph(problem, 1.0), first_values(problem), 1.0, loss)
-    if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
-        return fit
-    while fit.chi2_per_dof > INFLATED_CHI2 and fit.inflation < MAX_INFLATION:
-        inflation = fit.inflation * float(np.clip(fit.chi2_per_dof, 1.25, 4.0))
-        looser = optimise(problem, motion_graph(problem, inflation), fit.values, inflation, loss)
-        if looser.chi2_per_dof > WORTHWHILE * fit.chi2_per_dof:
-            break
-        fit = looser
-    return fit
-
-
-def _solution(problem: Problem, fit: Fit, fixes: GnssFixes) -> Solution:
+def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     covariances = _state_covariances(fit, len(T))
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, covariances[:, :6, :6])
@@ -110,13 +96,14 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes) -> Solution:
         biases=biases,
         state_covariances=covariances,
         fix_weights=weights,
-        fix_residuals=_residuals(trajectory, fixes, problem.p_imu_antenna),
+        fix_residuals=_residuals(trajectory, fixes, calibration),
         rejected=rejected,
         chi2_per_dof=fit.chi2_per_dof,
         inflation=fit.inflation,
         imu_noise=noise,
+        calibration=calibration,
         iterations=fit.iterations,
-        notes=(*problem.notes, *_doubts(fit, keyframes, rejected)),
+        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
     )
 
 
@@ -126,23 +113,29 @@ def _state_covariances(fit: Fit, k: int) -> Array:
     return np.array(blocks)
 
 
-def _residuals(trajectory: Trajectory, fixes: GnssFixes, p_imu_antenna: Array) -> Array:
-    inside = (fixes.stamps >= trajectory.start) & (fixes.stamps <= trajectory.end)
-    T = trajectory.at(fixes.stamps[inside])
+def _residuals(trajectory: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:
+    stamps = fixes.stamps + calibration.time_offset_s
+    inside = (stamps >= trajectory.start) & (stamps <= trajectory.end)
+    T = trajectory.at(stamps[inside])
     off = np.full((len(fixes), 3), np.nan)
-    off[inside] = fixes.positions[inside] - T[:, :3, 3] - T[:, :3, :3] @ p_imu_antenna
+    off[inside] = fixes.positions[inside] - T[:, :3, 3] - T[:, :3, :3] @ calibration.p_imu_antenna
     return off
 
 
-def _doubts(fit: Fit, keyframes: Trajectory, rejected: NDArray[np.bool_]) -> Iterator[str]:
+def _doubts(
+    fit: Fit, keyframes: Trajectory, rejected: NDArray[np.bool_], calibration: Calibration
+) -> Iterator[str]:
     """What the user should know before believing the trajectory, in words."""
     low, high = FITTING_CHI2
+    chi2 = f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1"
     if fit.inflation > 1:
         yield f"the IMU fits with {fit.inflation:.1f} times the noise that was expected"
     if fit.chi2_per_dof > high:
-        yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something fits worse than its stddev"
+        yield f"{chi2}: something does not fit"
     if fit.chi2_per_dof < low:
-        yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: fixes scatter less than their stddevs"
+        yield f"{chi2}: the fixes are better than they say"
+    if calibration.time_offset_s:
+        yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
     if rejected.any():
         yield f"{rejected.sum()} of {len(rejected)} fixes rejected"
     heading = heading_stddevs(keyframes)

@@ -1,0 +1,99 @@
+"""The fixed order of a good fit: noise, calibration, rejection, constraints, each on what the one before left."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.calibration import Calibration, correct
+from factor_graphs.constraints import body_velocity_factors, standing, zero_velocity_factors
+from factor_graphs.graph import from_values
+from factor_graphs.problem import Fit, Problem, first_values, motion_graph, optimise
+from factor_graphs.settings import SmootherSettings
+
+Array = NDArray[np.float64]
+
+# Residuals fit their standard deviations when chi2 per degree of freedom is in this range.
+FITTING_CHI2 = (0.8, 1.3)
+# Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
+INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
+# A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
+NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
+# After the second linearisation the constraints are exact to three digits.
+CONSTRAINT_ROUNDS = 2
+
+
+def fit_noise(problem: Problem) -> Fit:
+    """Inflate the IMU noise, starting from the sensor's own, until chi2 per degree of freedom fits.
+
+    The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only.
+    """
+    loss = "huber" if problem.settings.robust else "quadratic"
+    fit = optimise(problem, motion_graph(problem, 1.0), first_values(problem), 1.0, loss)
+    if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
+        return fit
+    stiff, loosest = fit, MAX_INFLATION
+    for _ in range(INFLATION_ROUNDS):
+        step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
+        inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
+        fit = optimise(problem, motion_graph(problem, inflation), fit.values, inflation, loss)
+        if FITTING_CHI2[0] <= fit.chi2_per_dof <= INFLATED_CHI2:
+            return fit
+        if fit.chi2_per_dof < FITTING_CHI2[0]:
+            loosest = inflation
+        elif fit.chi2_per_dof < WORTHWHILE * stiff.chi2_per_dof:
+            stiff = fit
+        else:
+            return stiff
+    return fit
+
+
+def calibrate(
+    fit_to: Callable[[Calibration], tuple[Problem, Fit]], settings: SmootherSettings, given: Array
+) -> tuple[Problem, Fit, Calibration]:
+    """Fit, correct time offset and lever arm, and fit again, until the correction is lost in its own noise.
+
+    `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from.
+    """
+    with_time, with_lever = settings.estimate_time_offset, settings.estimate_lever_arm
+    calibration = Calibration(0.0, given)
+    problem, fit = fit_to(calibration)
+    if with_time is False and not with_lever:
+        return problem, fit, calibration
+    least = BEYOND_DOUBT if with_time is None and not with_lever else NEGLIGIBLE
+    for _ in range(CALIBRATION_ROUNDS):
+        better, moved = correct(problem, fit, calibration, given, with_time is not False, with_lever)
+        if moved < least:
+            place = calibration.p_imu_antenna
+            return problem, fit, replace(better, time_offset_s=calibration.time_offset_s, p_imu_antenna=place)
+        calibration, least = better, NEGLIGIBLE
+        problem, fit = fit_to(calibration)
+    return problem, fit, calibration
+
+
+def reject(problem: Problem, fit: Fit) -> Fit:
+    """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
+    if not problem.settings.robust or fit.chi2_per_dof > FITTING_CHI2[1]:
+        return fit
+    return optimise(problem, fit.motion, fit.values, fit.inflation, "truncated")
+
+
+def constrain(problem: Problem, fit: Fit) -> Fit:
+    """Add what a road vehicle cannot do, linearised at the solution, and again at the one that follows."""
+    settings = problem.settings
+    axes = {1: settings.lateral_stddev_mps, 2: settings.vertical_stddev_mps}
+    for _ in range(CONSTRAINT_ROUNDS):
+        T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
+        factors: list[gtsam.NonlinearFactor] = []
+        if settings.standing_stddev_mps is not None:
+            stands = standing(problem.intervals, velocities)
+            factors += zero_velocity_factors(stands, settings.standing_stddev_mps)
+        for axis, stddev in axes.items():
+            if stddev is not None:
+                factors += body_velocity_factors(T, velocities, axis, stddev)
+        if not factors:
+            break
+        fit = optimise(problem, fit.motion, fit.values, fit.inflation, fit.loss, factors)
+    return fit

@@ -154,7 +154,7 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
             }
             for step in report.steps
         ],
-        "objects": [asdict(thing) for thing in report.objects],
+        "objects": [asdict(thing) | {"centre": thing.centre.round(3).tolist()} for thing in report.objects],
     }
 
 
@@ -166,9 +166,4 @@ def _version(package: str) -> str | None:
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=1, default=_plain) + "\n", "utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """Numpy values as JSON numbers and lists, to the millimetre."""
-    return np.asarray(value).round(3).tolist()
+    path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")

@@ -1,0 +1,234 @@
+"""The command line end to end, as a user types it, checked with other people's readers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import street
+from evo.tools import file_interface
+from plyfile import PlyData
+from street import Street
+
+from gnss_sem_map.labels import label_set
+
+URBAN = label_set()
+RAW_IDS = np.array([40, 48, 10, 50, 70, 0])
+
+
+def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def run(drive: Path, labels: Path, out: Path, *more: str) -> dict:
+    done = gnss_sem_map(
+        "run", drive, "--segmenter", f"labels:{labels}", "-o", out, "--write-labels", "--json", *more
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def raw_run(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "out"
+    run(small_drive.drive, small_drive.labels, out)
+    return out
+
+
+def agreement(out: Path, driven: Street, digits: int) -> float:
+    """Share of the labelled points whose class is the true one."""
+    right = labelled = 0
+    for number in driven.frames:
+        ids = np.fromfile(out / f"labels/{number:0{digits}d}.label", "<u4")
+        truth = RAW_IDS[driven.scan_classes[number]]
+        assert ids.shape == truth.shape
+        right += int((ids == truth)[ids > 0].sum())
+        labelled += int((ids > 0).sum())
+    assert labelled > 20_000
+    return right / labelled
+
+
+def test_a_raw_drive_becomes_a_map_with_the_right_labels(raw_run: Path, small_drive: Street) -> None:
+    assert agreement(raw_run, small_drive, 10) > 0.97
+    about = json.loads((raw_run / "run.json").read_text())
+    assert about["counts"]["scans"] == len(small_drive.frames)
+    assert about["counts"]["points"] == sum(map(len, small_drive.scan_classes.values()))
+    assert about["skips"]["count"] == 0
+    assert about["epoch_ns"] == int(street.EPOCH.astype(np.int64)) - 20_000_000
+    removed = np.fromfile(raw_run / "removed/0000000003.label", "<u4")
+    assert set(removed) <= {0, 1}
+    assert len(removed) == len(small_drive.scan_classes[3])
+
+
+def test_the_map_lies_where_the_drive_was(raw_run: Path, small_drive: Street) -> None:
+    """The walls of the street stand 16 m apart, in UTM as in the PLY."""
+    from pyproj import Transformer
+
+    las = laspy.read(raw_run / "map.laz")
+    crs = las.header.parse_crs()
+    assert crs is not None
+    assert crs.to_epsg() == 32632
+    building = np.asarray(las["sem_label"]) == 50
+    xyz = np.column_stack([las.x, las.y, las.z])[building]
+    start = np.array(
+        Transformer.from_crs(4326, 32632, always_xy=True).transform(
+            street.FRAME.lon_deg, street.FRAME.lat_deg
+        )
+    )
+    assert np.linalg.norm(xyz[:, :2].mean(axis=0) - start) < 30
+    ply = PlyData.read(raw_run / "map.ply")["vertex"]
+    wall = ply["label"] == URBAN.index("building")
+    north = np.asarray(ply["y"], float)[wall]
+    sides = np.median(north[north > 0]), np.median(north[north < 0])
+    assert sides[0] - sides[1] == pytest.approx(2 * street.WALL_M, abs=0.2)
+
+
+def test_the_trajectory_is_the_motion_that_was_driven(raw_run: Path, small_drive: Street) -> None:
+    tum = file_interface.read_tum_trajectory_file(str(raw_run / "trajectory.tum"))
+    inside = (tum.timestamps > 0.0) & (tum.timestamps < 1.1)
+    exact = small_drive.motion.poses(tum.timestamps[inside] - 0.02)[:, :3, 3]
+    origin = small_drive.motion.poses(np.array([-0.02]))[0, :3, 3]
+    error = tum.positions_xyz[inside] - (exact - origin)
+    assert np.abs(error).max() < 0.1
+    kitti = file_interface.read_kitti_poses_file(str(raw_run / "trajectory_kitti.txt"))
+    np.testing.assert_allclose(kitti.positions_xyz, tum.positions_xyz, atol=1e-5)
+    geojson = json.loads((raw_run / "trajectory.geojson").read_text())
+    assert "coordinates" in json.dumps(geojson)
+
+
+def test_an_odometry_sequence_becomes_a_map(small_drive: Street, tmp_path: Path) -> None:
+    sequence = street.write_odometry(tmp_path, small_drive)
+    labels = tmp_path / "probabilities"
+    labels.mkdir()
+    for number in small_drive.frames:
+        shutil.copy(small_drive.labels / f"{number:010d}.npz", labels / f"{number:06d}.npz")
+    about = run(sequence, labels, tmp_path / "out")
+    assert about["local_frame"] is None
+    assert agreement(tmp_path / "out", small_drive, 6) > 0.97
+    assert laspy.read(tmp_path / "out/map.laz").header.parse_crs() is None
+
+
+def test_a_table_log_becomes_a_map(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    run(drive, small_drive.labels, tmp_path / "out")
+    assert agreement(tmp_path / "out", small_drive, 1) > 0.97
+
+
+def test_two_runs_give_the_same_map_and_a_subset_of_frames_a_smaller_one(
+    raw_run: Path, small_drive: Street, tmp_path: Path
+) -> None:
+    run(small_drive.drive, small_drive.labels, tmp_path / "again")
+    for name in ("map.ply", "map.laz", "trajectory.tum", "map/map.json", "config.yaml", "topview.png"):
+        assert (raw_run / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+    about = run(small_drive.drive, small_drive.labels, tmp_path / "part", "--frames", "3:7")
+    assert about["counts"]["scans"] == 4
+    assert sorted(p.name for p in (tmp_path / "part/labels").iterdir()) == [
+        f"{n:010d}.label" for n in range(3, 7)
+    ]
+
+
+def test_a_drive_without_images_gives_a_map_without_labels_and_a_warning(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    drive = tmp_path / "2011_09_26" / small_drive.drive.name
+    shutil.copytree(small_drive.drive.parent, tmp_path / "2011_09_26")
+    shutil.rmtree(drive / "image_02")
+    done = gnss_sem_map("run", drive, "--segmenter", f"labels:{small_drive.labels}", "-o", tmp_path / "out")
+    assert done.returncode == 0
+    assert "has no images: the map shows geometry only" in done.stderr
+    las = laspy.read(tmp_path / "out/map.laz")
+    assert len(las.points) > 1000
+    assert not np.asarray(las["sem_label"]).any()
+
+
+def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    shutil.copytree(small_drive.drive.parent, tmp_path / "2011_09_26")
+    shutil.copytree(small_drive.labels, tmp_path / "labels")
+    data = tmp_path / "2011_09_26" / small_drive.drive.name / "velodyne_points/data"
+    (data / "0000000003.bin").write_bytes((data / "0000000003.bin").read_bytes()[:1001])
+    bad = np.fromfile(data / "0000000004.bin", "<f4").reshape(-1, 4)
+    bad[:5] = np.nan
+    bad[5:8] = 0.0
+    bad[8] = 1e9
+    bad.tofile(data / "0000000004.bin")
+    (data / "0000000005.bin").unlink()
+    np.zeros((50, 4), "<f4").tofile(data / "0000000006.bin")
+    (tmp_path / "labels/0000000008.npz").unlink()
+    about = run(data.parents[1], tmp_path / "labels", tmp_path / "out")
+    assert about["counts"]["scans"] == 10
+    assert about["counts"]["points left out"] == 9 + 50
+    reasons = " ".join(skip["reason"] for skip in about["skips"]["listed"])
+    assert about["skips"]["count"] == 3
+    for says in ("truncated scan", "1 files missing", "no labels of frame 8"):
+        assert says in reasons + " ".join(skip["where"] for skip in about["skips"]["listed"])
+    for number in (4, 7):
+        ids = np.fromfile(tmp_path / f"out/labels/{number:010d}.label", "<u4")
+        truth = RAW_IDS[small_drive.scan_classes[number]]
+        assert (ids == truth)[ids > 0].mean() > 0.97, "nothing may shift"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("run", "nowhere", "-o", "out"), 1, "nowhere: no such folder; expected a drive"),
+        (("run",), 2, "Missing argument"),
+        (("run", "DRIVE", "-o", "out", "--set", "mapping.voxl=1"), 1, "unknown setting 'mapping.voxl'"),
+        (("run", "DRIVE", "-o", "out", "--frames", "3"), 2, "expected A:B"),
+        (("run", "DRIVE", "-o", "out", "--format", "ros"), 2, "expected one of"),
+        (("run", "DRIVE", "-o", "out", "--segmenter", "magic"), 1, "unknown kind 'magic'"),
+        (("run", "DRIVE", "-o", "out", "--segmenter", "labels:nowhere"), 1, "nowhere"),
+        (("run", "DRIVE", "-o", "out", "--frames", "100:200"), 1, "none of 0 scans can be used"),
+        (("run", "DRIVE", "-o", "DRIVE"), 1, "exists and is no run folder"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_answered_in_one_line(
+    arguments: tuple[str, ...], code: int, says: str, small_drive: Street, tmp_path: Path
+) -> None:
+    places = {"DRIVE": small_drive.drive, "out": tmp_path / "out"}
+    done = gnss_sem_map(*(places.get(a, a) for a in arguments))
+    assert done.returncode == code
+    assert says in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+    if code == 1:
+        assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_settings_that_are_printed_are_those_of_the_run(raw_run: Path) -> None:
+    assert gnss_sem_map("config").stdout == (raw_run / "config.yaml").read_text()
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys; from gnss_sem_map.cli import app; print([m for m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for heavy in ("gtsam", "sklearn", "torch", "matplotlib", "numba", "scipy", "numpy", "pykitti", "cv2"):
+        assert f"'{heavy}'" not in done.stdout, heavy
+
+
+@pytest.mark.parametrize(
+    ("drive", "labels"),
+    [
+        ("kitti_raw/2011_09_26/2011_09_26_drive_0005_sync", "kitti_raw_0005"),
+        ("semantic_kitti/sequences/08", "semantic_kitti/08"),
+    ],
+)
+def test_a_real_drive_becomes_a_map(real_data: Path, drive: str, labels: str, tmp_path: Path) -> None:
+    about = run(real_data / drive, real_data / f"labels/{labels}/probabilities", tmp_path / "out")
+    scans = len(list((real_data / drive).glob("velodyne*/**/*.bin")))
+    assert about["counts"]["scans"] == scans
+    assert len(list((tmp_path / "out/labels").iterdir())) == scans
+    assert about["counts"]["points labelled"] > 0.12 * about["counts"]["points"]
+    assert not [skip for skip in about["skips"]["listed"] if "files missing" not in skip["reason"]]

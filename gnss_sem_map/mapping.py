@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -84,25 +85,46 @@ def map_points(
     return points_in_map(points[valid], scan.stamp, trajectory, log.calibration.T_imu_lidar), valid
 
 
+@dataclass(frozen=True, eq=False)
+class PointLabels:
+    """What a map says of every original point of one scan."""
+
+    labels: NDArray[np.int8]
+    """(n,) class index, -1 where nothing is known."""
+    confidence: NDArray[np.float32]
+    """(n,) probability of that class, 0 where nothing is known."""
+    removed: NDArray[np.bool_]
+    """(n,) part of a moving vehicle."""
+
+
 def label_points(
-    log: SensorLog, trajectory: Trajectory, semantic_map: SemanticMap, settings: Settings
-) -> Iterator[tuple[Scan, NDArray[np.int8], NDArray[np.bool_]]]:
-    """For every usable scan, the label of each original point (-1 unknown), and whether it was removed."""
+    log: SensorLog, trajectory: Trajectory, maps: Sequence[SemanticMap], settings: Settings
+) -> Iterator[tuple[Scan, list[PointLabels]]]:
+    """For every usable scan, what each of the maps says of its original points."""
     for scan in log.scans:
         try:
             points = scan.read()
             p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
             continue  # counted when the map was built
-        places = semantic_map.voxels.places(keys_of(p_map, settings.mapping.voxel_size_m))
-        known = valid.copy()
-        known[valid] = places >= 0
-        places = places[places >= 0]
-        point_labels = np.full(len(valid), labels.UNLABELLED, np.int8)
-        point_labels[known] = semantic_map.labels[places]
-        removed = np.zeros(len(valid), np.bool_)
-        removed[known] = semantic_map.states[places] == State.REMOVED
-        yield scan, point_labels, removed
+        keys = keys_of(p_map, settings.mapping.voxel_size_m)
+        yield scan, [_look_up(semantic_map, keys, valid) for semantic_map in maps]
+
+
+def _look_up(semantic_map: SemanticMap, keys: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:
+    places = semantic_map.voxels.places(keys)
+    known = valid.copy()
+    known[valid] = places >= 0
+    places = places[places >= 0]
+    found = PointLabels(
+        labels=np.full(len(valid), labels.UNLABELLED, np.int8),
+        confidence=np.zeros(len(valid), np.float32),
+        removed=np.zeros(len(valid), np.bool_),
+    )
+    found.labels[known] = semantic_map.labels[places]
+    found.confidence[known] = semantic_map.confidence[places]
+    found.removed[known] = semantic_map.states[places] == State.REMOVED
+    return found
 
 
 class _Look:

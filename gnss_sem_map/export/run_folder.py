@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gnss_sem_map import tiles
 from gnss_sem_map.account import Account
@@ -21,7 +20,6 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
-from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.mapping import label_points
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement import RefinementReport
@@ -76,9 +74,7 @@ def write_run(
                 result.refined, folder / "topview.png", trajectory=result.trajectory, title=log.name
             )
             if write_labels:
-                write_point_labels(
-                    folder, label_points(log, result.trajectory, result.refined, settings), result
-                )
+                write_point_labels(folder, log, result, settings)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, result.account) | {"map": _about_map(result)}
         _write_json(folder / "run.json", about)
@@ -95,17 +91,22 @@ def write_trajectory(folder: Path, log: SensorLog, result: Result) -> None:
         write_geojson(result.trajectory, log.frame, folder / "trajectory.geojson")
 
 
-def write_point_labels(
-    folder: Path, labelled: Iterable[tuple[Any, NDArray[np.int8], NDArray[np.bool_]]], result: Result
-) -> None:
-    """SemanticKITTI raw ids per original point in labels/, and 1 for removed vehicles in removed/."""
-    for name in ("labels", "removed"):
+def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: Settings) -> None:
+    """Per original point: the class before (labels_raw/) and after refinement (labels/), how sure, and what was removed.
+
+    `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
+    """
+    for name in ("labels", "labels_raw", "confidence", "removed"):
         (folder / name).mkdir()
-    label_set: LabelSet = result.raw.voxels.label_set
-    ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # -1, unlabelled, is the last
-    for scan, labels, removed in labelled:
-        ids[labels].tofile(folder / "labels" / f"{scan.name}.label")
-        removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
+    ids = np.append(result.raw.voxels.label_set.semantic_kitti_ids, 0).astype(
+        "<u4"
+    )  # -1, unlabelled, is the last
+    maps = (result.raw, result.refined)
+    for scan, (raw, refined) in label_points(log, result.trajectory, maps, settings):
+        ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
+        ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
+        refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{scan.name}.bin")
+        refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
 
 
 def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:

@@ -42,6 +42,9 @@ class MissingLabels(DataError):
 SCHEMES = {
     "labels": "labels:FOLDER[?ids=train_id|label_id&taxonomy=cityscapes]",
     "refinenet": "refinenet:CHECKPOINT[?classes=..&scale=1&shrink=2]",
+    "hf": "hf:MODEL_OR_FOLDER[?classes=..&scale=1&shrink=2]",
+    "onnx": "onnx:FILE[?classes=..&mean=..&std=..&order=rgb|bgr&pixel_max=1|255&scale=1&shrink=2]",
+    "python": "python:package.module:callable[?classes=..]",
 }
 """How a segmenter is asked for, by the word before the colon."""
 
@@ -66,6 +69,21 @@ def open_segmenter(
             with _needs("segmentation", spec):
                 from gnss_sem_map.segmentation.checkpoints import open_refinenet
             return open_refinenet(Path(place), label_set, device, **options)
+        case "hf":
+            _only(options, spec, "classes", "scale", "shrink")
+            with _needs("hf", spec):
+                from gnss_sem_map.segmentation.huggingface import open_huggingface
+            return open_huggingface(place, label_set, device, **options)
+        case "onnx":
+            _only(options, spec, "classes", "mean", "std", "order", "pixel_max", "scale", "shrink")
+            with _needs("onnx", spec):
+                from gnss_sem_map.segmentation.onnx_file import OnnxSegmenter
+            return OnnxSegmenter(Path(place), label_set, device, **options)
+        case "python":
+            from gnss_sem_map.segmentation.python_callable import PythonSegmenter
+
+            _only(options, spec, "classes")
+            return PythonSegmenter(place, label_set, **options)
     raise ConfigError(
         f"segmenter {spec!r}: unknown kind {scheme!r}; expected one of {list(SCHEMES.values())}"
     )

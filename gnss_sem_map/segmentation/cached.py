@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
 from gnss_sem_map.segmentation import MissingLabels
+from gnss_sem_map.segmentation.probabilities import check_size, checked_probabilities
 from gnss_sem_map.sensor_log import Image
 
 HARD_LABEL_PROBABILITY = 0.9
 """What a label image's class gets; the rest is spread evenly over the other classes, for no network is always right."""
-
-LARGEST_SHRINK = 16
-"""Labels may be this many times smaller than the image."""
 
 
 class CachedLabels:
@@ -79,7 +77,7 @@ class CachedLabels:
 
     def _read_ids(self, path: Path) -> NDArray[np.uint8]:
         ids = read_class_ids(path)
-        _check_size(ids.shape, self._size, path)
+        check_size(ids.shape, self._size, str(path))
         used = np.flatnonzero(np.bincount(ids.ravel(), minlength=256))
         unknown = used[self._unknown[used]]
         if unknown.size:
@@ -106,10 +104,9 @@ def read_probabilities(
         ) from None
     if names.ndim != 1 or names.dtype.kind != "U":
         raise DataError(f"{path}: found class_names of {names.dtype} {names.shape}, expected a list of names")
-    if probabilities.ndim != 3 or probabilities.shape[2] != len(names):
-        raise DataError(f"{path}: found probabilities {probabilities.shape}, expected (h, w, {len(names)})")
-    _check_size(probabilities.shape, expected_size, path)
-    return _check_values(probabilities, path), tuple(map(str, names))
+    checked = checked_probabilities(probabilities, len(names), str(path))
+    check_size(checked.shape, expected_size, str(path))
+    return checked, tuple(map(str, names))
 
 
 def read_class_ids(path: Path) -> NDArray[np.uint8]:
@@ -174,35 +171,3 @@ def _evidence_of_ids(label_set: LabelSet, name: str, ids: str) -> tuple[NDArray[
     evidence = np.zeros((256, count), np.uint8)
     evidence[classes >= 0] = np.rint(255 * softened[classes[classes >= 0]])
     return classes < UNLABELLED, evidence
-
-
-def _check_size(shape: tuple[int, ...], expected: tuple[int, int] | None, path: Path) -> None:
-    if expected is None:
-        return
-    width, height = expected
-    if not any(shape[:2] == (height // k, width // k) for k in range(1, LARGEST_SHRINK + 1)):
-        raise DataError(
-            f"{path}: found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; expected that, or it"
-            f" divided by 2 to {LARGEST_SHRINK} and rounded down"
-        )
-
-
-def _check_values(probabilities: NDArray[Any], path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
-    one, count = 1.0, probabilities.shape[2]
-    if probabilities.dtype == np.uint8:
-        one, slack = 255.0, float(count)
-    elif probabilities.dtype.kind == "f":
-        probabilities, slack = probabilities.astype(np.float32), 0.02
-        if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):
-            raise DataError(f"{path}: found probabilities that are negative or not finite, expected 0..1")
-    else:
-        raise DataError(
-            f"{path}: found probabilities of {probabilities.dtype}, expected uint8 round(255 p) or floating 0..1"
-        )
-    # Every 64th pixel tells logits, percentages and 0/1 masks from probabilities, at no cost.
-    largest = float(probabilities[::8, ::8].sum(2, dtype=np.float64).max(initial=0.0))
-    if largest > one + slack or 0 < largest < one / 2:
-        raise DataError(
-            f"{path}: probabilities of a pixel sum to {largest:.4g}, expected {one:g}; normalise them"
-        )
-    return probabilities

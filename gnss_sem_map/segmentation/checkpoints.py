@@ -51,9 +51,7 @@ def open_refinenet(
     checkpoint = read_checkpoint(path)
     network = network_like(checkpoint)
     load_strictly(network, checkpoint)
-    if classes is None and checkpoint.class_names is not None:
-        classes = ",".join(checkpoint.class_names)
-    names = named_classes(classes, class_count(checkpoint), label_set, str(path))
+    names = named_classes(classes, class_count(checkpoint), label_set, str(path), checkpoint.class_names)
     where = find_device(device)
     network.to(where).eval()
     as_scale, as_shrink = scale_and_shrink(scale, shrink, str(path), checkpoint.scale)
@@ -186,7 +184,8 @@ def _only_tensors(content: Any, path: Path) -> dict[str, Tensor]:
 
 
 def _other_architecture(checkpoint: Checkpoint) -> DataError:
+    found = sorted(checkpoint.tensors)[:3]
     return DataError(
-        f"checkpoint {checkpoint.path}: found tensors such as {sorted(checkpoint.tensors)[:3]}, expected those of"
-        " RefineNet, full or light-weight, on a ResNet or MobileNet-v2; other networks come through hf:, onnx: or python:"
+        f"checkpoint {checkpoint.path}: found tensors such as {found}, expected those of RefineNet, full or"
+        " light-weight, on a ResNet or MobileNet-v2; other networks come through hf:, onnx: or python:"
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labels import LabelSet, taxonomy
 
@@ -12,19 +14,25 @@ BY_COUNT = {6: "kitti6", 11: "camvid", 19: "cityscapes"}
 """Published street networks with that many classes have these, in the order of their ids."""
 
 
-def named_classes(description: str | None, count: int, label_set: LabelSet, where: str) -> tuple[str, ...]:
+def named_classes(
+    description: str | None, count: int, label_set: LabelSet, where: str, own: Sequence[str] | None = None
+) -> tuple[str, ...]:
     """The names of `count` channels, known to the class set, from a list of class and taxonomy names joined by commas.
 
-    A taxonomy stands for its classes in the order of its first kind of ids. Without a description the count decides
-    (BY_COUNT). Raises ConfigError for another number of names, or a name that the class set does not know.
+    A taxonomy stands for its classes in the order of its first kind of ids. Without a description they have their
+    `own` names, and without those the count decides (BY_COUNT). Raises ConfigError for another number of names, or a
+    name that the class set does not know.
     """
-    if description is None:
-        if count not in BY_COUNT:
-            raise ConfigError(
-                f"{where}: found {count} classes without names; say them with ?classes=road,sidewalk,..."
-            )
-        description = BY_COUNT[count]
-    names = tuple(name for item in description.split(",") for name in _expand(item.strip(), label_set))
+    if description is not None:
+        names = tuple(name for item in description.split(",") for name in _expand(item.strip(), label_set))
+    elif own is not None:
+        names = tuple(own)
+    elif count in BY_COUNT:
+        names = tuple(_expand(BY_COUNT[count], label_set))
+    else:
+        raise ConfigError(
+            f"{where}: found {count} classes without names; say them with ?classes=road,sidewalk,..."
+        )
     if len(names) != count or len(set(names)) != count:
         raise ConfigError(
             f"{where}: found {count} classes for {len(set(names))} different names {list(names)}; expected one each"

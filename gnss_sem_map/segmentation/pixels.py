@@ -20,8 +20,13 @@ def checked_pixels(image: Image) -> NDArray[np.uint8]:
     return pixels
 
 
-def scaled(pixels: NDArray[np.uint8], shrink: int, scale: float) -> NDArray[np.uint8]:
-    """The pixels cut to sides that `shrink` divides, then resized to `scale` times that, rounded up: (h, w, 3)."""
+def scaled(
+    pixels: NDArray[np.uint8], shrink: int, scale: float, fixed_size: tuple[int, int] | None = None
+) -> NDArray[np.uint8]:
+    """The pixels cut to sides that `shrink` divides, then resized to `scale` times that, rounded up, or `fixed_size`.
+
+    Takes and gives (h, w, 3); `fixed_size` is (height, width). Raises DataError for an image smaller than `shrink`.
+    """
     import cv2
 
     height, width = (side - side % shrink for side in pixels.shape[:2])
@@ -29,12 +34,12 @@ def scaled(pixels: NDArray[np.uint8], shrink: int, scale: float) -> NDArray[np.u
         raise DataError(
             f"found an image of {pixels.shape[1]} x {pixels.shape[0]} pixels, expected at least {shrink}"
         )
-    cut = pixels[:height, :width]
-    if scale == 1.0:
-        return np.ascontiguousarray(cut)
-    size = (int(np.ceil(width * scale)), int(np.ceil(height * scale)))
-    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(cut, size, interpolation=method), np.uint8)
+    cut = np.ascontiguousarray(pixels[:height, :width])
+    wanted = fixed_size or (int(np.ceil(height * scale)), int(np.ceil(width * scale)))
+    if wanted == (height, width):
+        return cut
+    method = cv2.INTER_AREA if wanted[0] < height else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(cut, wanted[::-1], interpolation=method), np.uint8)
 
 
 def scale_and_shrink(

@@ -1,0 +1,179 @@
+"""Networks of the transformers library as segmenters: those that give logits, and those that give masks.
+
+A mask network answers with queries: what each of them is, and where. Its post-processing gives the best class of every
+pixel only; we need all of them (Cheng et al., "MaskFormer", NeurIPS 2021, section 3.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+from transformers import (
+    MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
+    MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING,
+    AutoConfig,
+    AutoModelForSemanticSegmentation,
+    AutoModelForUniversalSegmentation,
+    AutoTokenizer,
+)
+from transformers.image_processing_base import ImageProcessingMixin
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.segmentation.classes import VOID, named_classes
+from gnss_sem_map.segmentation.networks import NetworkSegmenter, Probabilities, find_device, from_logits
+from gnss_sem_map.segmentation.pixels import scale_and_shrink
+from gnss_sem_map.segmentation.refinenet import MEAN, STD
+
+STRIDE = 32
+"""Of the coarsest features; images are stretched to whole multiples of it."""
+
+TASK = "the task is semantic"
+"""What OneFormer is told."""
+
+
+def open_huggingface(
+    model: str, label_set: LabelSet, device: str = "auto", classes: str | None = None,
+    scale: str | None = None, shrink: str | None = None,
+) -> NetworkSegmenter:  # fmt: skip
+    """A network of transformers from a folder, or from what `hf download MODEL` left on this machine.
+
+    Mean and standard deviation are those of its image processor (ImageNet's where it has none); its resizing is not
+    used, for it would squeeze a wide street. Class names are its own unless `classes` says otherwise. Raises DataError
+    for a model that is not there or of another kind, ConfigError for class names that the class set does not know.
+    """
+    where = find_device(device)
+    as_scale, as_shrink = scale_and_shrink(scale, shrink, f"hf:{model}")
+    config, network = _load(model)
+    network.to(where).eval()
+    own = [config.id2label[i] for i in range(config.num_labels)]
+    names = named_classes(classes, config.num_labels, label_set, f"hf:{model}", own)
+    run = _stretched(
+        _logits(network, names) if _gives_logits(config) else _masks(network, config, names, model, where)
+    )
+    mean, std = _normalisation(model)
+    kept = [name for name in names if name != VOID]
+    return NetworkSegmenter(run, kept, where, mean, std, as_scale, as_shrink)
+
+
+def _load(model: str) -> tuple[Any, Any]:
+    try:
+        config = AutoConfig.from_pretrained(model, local_files_only=True)
+        kind: Any
+        if type(config) in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING:
+            kind = AutoModelForUniversalSegmentation
+        elif type(config) in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING:
+            kind = AutoModelForSemanticSegmentation
+        else:
+            raise DataError(
+                f"hf:{model}: a {config.model_type} is no segmentation network; expected one, such as segformer"
+            )
+        network, report = kind.from_pretrained(model, local_files_only=True, output_loading_info=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        if isinstance(error, DataError):
+            raise
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(
+            f"hf:{model}: cannot be read ({reason}); get it once with `hf download {model}`"
+        ) from None
+    unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
+    if unset:
+        raise DataError(
+            f"hf:{model}: the file lacks {len(unset)} tensors of the network, such as {unset[:3]}"
+        )
+    return config, network
+
+
+def _gives_logits(config: Any) -> bool:
+    return type(config) not in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING
+
+
+def _logits(network: Any, names: tuple[str, ...]) -> Probabilities:
+    return from_logits(lambda images: network(pixel_values=images).logits, names)
+
+
+def _masks(
+    network: Any, config: Any, names: tuple[str, ...], model: str, device: torch.device
+) -> Probabilities:
+    kept = [i for i, name in enumerate(names) if name != VOID]
+    extra = (
+        {"task_inputs": _task_tokens(model, config).to(device)} if config.model_type == "oneformer" else {}
+    )
+
+    def masses(images: Tensor, size: tuple[int, int]) -> Tensor:
+        task = {name: value.expand(len(images), -1) for name, value in extra.items()}
+        answer = network(pixel_values=images, **task)
+        classes = answer.class_queries_logits.softmax(2)[
+            :, :, kept
+        ]  # the last one, "no object", is not among them
+        masks = interpolate(
+            answer.masks_queries_logits, size=size, mode="bilinear", align_corners=False
+        ).sigmoid()
+        return torch.einsum("bqc,bqhw->bchw", classes, masks)
+
+    see = _in_windows(masses, config.image_size) if config.model_type.startswith("eomt") else masses
+
+    def probabilities(images: Tensor, size: tuple[int, int]) -> Tensor:
+        mass = see(images, size)
+        return mass / mass.sum(1, keepdim=True).clamp_min(1e-6)
+
+    return probabilities
+
+
+def _in_windows(masses: Probabilities, side: int) -> Probabilities:
+    """For a network of a fixed, square input: the shorter side is scaled to it, the longer is seen in windows."""
+
+    def windowed(images: Tensor, size: tuple[int, int]) -> Tensor:
+        height, width = images.shape[2:]
+        ratio = side / min(height, width)
+        whole = interpolate(images, size=(max(side, round(height * ratio)), max(side, round(width * ratio))),
+                            mode="bilinear", align_corners=False)  # fmt: skip
+        total, count = torch.zeros(1), torch.zeros(1)
+        for top in _starts(whole.shape[2], side):
+            for left in _starts(whole.shape[3], side):
+                seen = masses(whole[:, :, top : top + side, left : left + side], (side, side))
+                if total.ndim == 1:
+                    total = seen.new_zeros(len(images), seen.shape[1], *whole.shape[2:])
+                    count = seen.new_zeros(whole.shape[2:])
+                total[:, :, top : top + side, left : left + side] += seen
+                count[top : top + side, left : left + side] += 1
+        return interpolate(total / count, size=size, mode="bilinear", align_corners=False)
+
+    return windowed
+
+
+def _starts(length: int, side: int) -> list[int]:
+    """Where windows of `side` begin that cover `length`, evenly spread."""
+    windows = -(-length // side)
+    return [0] if windows == 1 else [round(i * (length - side) / (windows - 1)) for i in range(windows)]
+
+
+def _stretched(probabilities: Probabilities) -> Probabilities:
+    def run(images: Tensor, size: tuple[int, int]) -> Tensor:
+        whole = [max(STRIDE, STRIDE * round(side / STRIDE)) for side in images.shape[2:]]
+        return probabilities(interpolate(images, size=whole, mode="bilinear", align_corners=False), size)
+
+    return run
+
+
+def _task_tokens(model: str, config: Any) -> Tensor:
+    tokenizer: Callable[..., Any] = AutoTokenizer.from_pretrained(model, local_files_only=True)
+    tokens = tokenizer(
+        [TASK], padding="max_length", max_length=config.task_seq_len, truncation=True, return_tensors="pt"
+    )
+    masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
+    return masked
+
+
+def _normalisation(model: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    try:
+        about, _ = ImageProcessingMixin.get_image_processor_dict(model, local_files_only=True)
+    except OSError:
+        return MEAN, STD
+    if not about.get("do_normalize", True):
+        return (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    return tuple(about.get("image_mean", MEAN)), tuple(about.get("image_std", STD))

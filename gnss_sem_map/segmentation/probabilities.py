@@ -1,0 +1,62 @@
+"""What class probabilities must be, whoever made them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+
+LARGEST_SHRINK = 16
+"""Probabilities may be this many times smaller than the image."""
+
+
+def check_size(shape: tuple[int, ...], image_size: tuple[int, int] | None, where: str) -> None:
+    """Raise DataError unless (h, w, ...) is the image's (width, height), or that divided and rounded down."""
+    if image_size is None:
+        return
+    width, height = image_size
+    if not any(shape[:2] == (height // k, width // k) for k in range(1, LARGEST_SHRINK + 1)):
+        raise DataError(
+            f"{where}: found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; expected that, or it"
+            f" divided by 2 to {LARGEST_SHRINK} and rounded down"
+        )
+
+
+def checked_probabilities(
+    probabilities: NDArray[Any], count: int, where: str
+) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """The array (h, w, count) as uint8 or float32; raises DataError unless every pixel's sum is one, or nothing."""
+    if probabilities.ndim != 3 or probabilities.shape[2] != count or 0 in probabilities.shape:
+        raise DataError(f"{where}: found probabilities {probabilities.shape}, expected (h, w, {count})")
+    one, slack = 1.0, 0.02
+    if probabilities.dtype == np.uint8:
+        one, slack = 255.0, float(count)
+    elif probabilities.dtype.kind == "f":
+        probabilities = probabilities.astype(np.float32)
+        if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):
+            raise DataError(f"{where}: found probabilities that are negative or not finite, expected 0..1")
+    else:
+        raise DataError(
+            f"{where}: found probabilities of {probabilities.dtype}, expected uint8 round(255 p) or floating 0..1"
+        )
+    # Every 64th pixel tells logits, percentages and 0/1 masks from probabilities, at no cost.
+    largest = float(probabilities[::8, ::8].sum(2, dtype=np.float64).max(initial=0.0))
+    if largest > one + slack or 0 < largest < one / 2:
+        raise DataError(
+            f"{where}: probabilities of a pixel sum to {largest:.4g}, expected {one:g}; normalise them"
+        )
+    return probabilities
+
+
+def resized_softmax(logits: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Class logits (c, h, w), enlarged bilinearly to (height, width), as probabilities (height, width, c)."""
+    import cv2
+
+    enlarged = cv2.resize(
+        np.ascontiguousarray(logits.transpose(1, 2, 0)), size[::-1], interpolation=cv2.INTER_LINEAR
+    ).reshape(*size, len(logits))
+    exponentials = np.exp(enlarged - enlarged.max(2, keepdims=True))
+    return np.asarray(exponentials / exponentials.sum(2, keepdims=True), np.float32)

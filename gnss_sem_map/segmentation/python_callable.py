@@ -1,0 +1,59 @@
+"""Any Python callable as a segmenter: RGB pixels (h, w, 3) uint8 in, class probabilities (h', w', c) out."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.segmentation.classes import named_classes
+from gnss_sem_map.segmentation.pixels import checked_pixels
+from gnss_sem_map.segmentation.probabilities import check_size, checked_probabilities
+from gnss_sem_map.sensor_log import Image
+
+
+class PythonSegmenter:
+    """Calls `module:callable`, with class names from its attribute `class_names` or from `classes`.
+
+    Raises ConfigError when there is no such callable or nothing says its class names; DataError, at the call, when
+    what it gives is not probabilities of one image.
+    """
+
+    def __init__(self, place: str, label_set: LabelSet, classes: str | None = None) -> None:
+        self._where = f"python:{place}"
+        self._function = _import(place)
+        own: Sequence[str] | None = getattr(self._function, "class_names", None)
+        if classes is None and own is None:
+            raise ConfigError(
+                f"{self._where} has no class_names; give it that attribute, or say ?classes=road,..."
+            )
+        count = len(own) if own is not None else 1 + str(classes).count(",")
+        self.class_names = named_classes(classes, count, label_set, self._where, own)
+
+    def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
+        """Class probabilities (h, w, c) of one image."""
+        pixels = checked_pixels(image)
+        where = f"{self._where} on image {image.number}"
+        seen = checked_probabilities(np.asarray(self._function(pixels)), len(self.class_names), where)
+        check_size(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
+        return seen
+
+
+def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
+    module, colon, name = place.partition(":")
+    if not (module and colon and name):
+        raise ConfigError(f"python:{place}: expected python:package.module:callable")
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
+    except AttributeError:
+        raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
+    if not callable(function):
+        raise ConfigError(f"python:{place}: found {type(function).__name__}, expected a callable")
+    return function  # type: ignore[no-any-return]

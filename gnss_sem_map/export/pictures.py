@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.atomic import replacing
-from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, colours, visible
+from gnss_sem_map.export.point_cloud import visible
 from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
 from gnss_sem_map.export.render import FACE_LIGHT, Camera, draw_cubes, hollows
 from gnss_sem_map.labels import UNLABELLED, LabelSet
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,21 +25,25 @@ LONGEST_SIDE_PX = 1800
 NARROWEST_PX, LOWEST_PX = 900, 300
 """The map's window is at least this large, so that the legend has room."""
 MARGIN_PX, TITLE_PX, SCALE_BAR_PX = 30, 60, 320
-ENTRY_PX = (200, 36)
+ENTRY_PX = (215, 36)
 """Width and height of one class in the legend."""
 DPI = 150
 
 PERSPECTIVE_PX = (1920, 1080)
 SUPERSAMPLING = 2
 FIELD_OF_VIEW_DEG = 62.0
-BEHIND_M, ABOVE_M, AHEAD_M = 14.0, 11.0, 30.0
-"""From the vehicle to the eye, and to the point that it looks at."""
+BEHIND_M, ABOVE_M = 13.0, 10.0
+"""From the vehicle to the eye."""
+AHEAD_M, BELOW_M = 24.0, 2.0
+"""From the vehicle to the point that the eye looks at: on the road ahead."""
 BEAD_M = 0.12
 TRACK_COLOUR = (255, 214, 10)
 SKY = np.array([[13, 17, 28], [38, 48, 66]], np.float32)
 """RGB at the upper and the lower edge."""
 HOLLOWS = ((2, 6.0, 0.1), (8, 2.5, 0.15), (24, 1.5, 0.25), (64, 1.0, 0.35))
 """Pixels to the neighbour, strength, and the largest step in log depth that counts: edges, then wide shadows."""
+
+UNLABELLED_BY_DAY, UNLABELLED_BY_NIGHT = (214, 217, 222), (72, 80, 97)
 
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
@@ -60,7 +64,7 @@ def write_topview(
     label_set = semantic_map.voxels.label_set
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
-    entries = _legend_entries(view.labels, label_set)
+    entries = _legend_entries(view.labels, label_set, UNLABELLED_BY_DAY)
     if trajectory is not None:
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
@@ -80,7 +84,7 @@ def write_topview(
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     """(rows, columns, 3) RGB: the class colours, lighter with height, darker beside something higher."""
     palette = (
-        np.vstack([label_set.colours, [[255, 255, 255]], [UNLABELLED_COLOUR]]) / 255
+        np.vstack([label_set.colours, [[255, 255, 255]], [UNLABELLED_BY_DAY]]) / 255
     )  # -2, -1 count from the end
     empty = view.labels == NOTHING
     low, high = np.nanpercentile(view.heights, [2, 98])
@@ -90,14 +94,16 @@ def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
 
 
-def _legend_entries(labels: NDArray[np.int8], label_set: LabelSet) -> list[tuple[str, Colour]]:
+def _legend_entries(
+    labels: NDArray[np.int8], label_set: LabelSet, unlabelled: Colour
+) -> list[tuple[str, Colour]]:
     """Name and colour of the classes among these labels."""
     entries: list[tuple[str, Colour]] = [
         (name, colour)
         for i, (name, colour) in enumerate(zip(label_set.names, label_set.colours, strict=True))
         if (labels == i).any()
     ]
-    return entries + [("unlabelled", UNLABELLED_COLOUR)] * bool((labels == UNLABELLED).any())
+    return entries + [("no camera saw it", unlabelled)] * bool((labels == UNLABELLED).any())
 
 
 def _frame(view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int) -> tuple[Figure, Any]:
@@ -128,7 +134,9 @@ def _draw_track(axes: Any, trajectory: Trajectory) -> None:
     east, north, _ = trajectory.positions.T
     casing = [Stroke(linewidth=2.0, foreground="white"), Normal()]
     axes.plot(east, north, color="black", linewidth=0.9, path_effects=casing)
-    axes.plot(east[:1], north[:1], "o", color="black", markersize=5, markeredgecolor="white")
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    inside = np.flatnonzero((east > left) & (east < right) & (north > low) & (north < high))[:1]
+    axes.plot(east[inside], north[inside], "o", color="black", markersize=5, markeredgecolor="white")
 
 
 def _strip(figure: Figure, strip_px: int) -> Any:
@@ -182,17 +190,19 @@ def write_perspective(
     trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
     map or when the file cannot be written, and MeasurementError when `at_s` lies outside the trajectory.
     """
-    chosen = visible(semantic_map)
-    if not chosen.any():
+    kept = semantic_map.states != State.REMOVED
+    if not kept.any():
         raise DataError(NO_VOXELS)
-    centres, labels = semantic_map.voxels.centres[chosen], semantic_map.labels[chosen]
+    centres, labels = semantic_map.voxels.centres[kept], semantic_map.labels[kept]
     if camera is None:
-        camera = _from_the_south(centres) if trajectory is None else _behind(trajectory, centres, at_s)
+        seen = centres[visible(semantic_map)[kept]]
+        camera = _from_the_south(seen) if trajectory is None else _behind(trajectory, seen, at_s)
     track = np.empty((0, 3)) if trajectory is None else _beads(trajectory)
     half_m = np.repeat([semantic_map.voxels.voxel_size_m / 2, BEAD_M / 2], [len(centres), len(track)])
-    rgb = np.vstack([colours(semantic_map)[chosen], np.tile(TRACK_COLOUR, (len(track), 1))])
+    palette = np.vstack([semantic_map.voxels.label_set.colours, UNLABELLED_BY_NIGHT])  # -1 is the last
+    rgb = np.vstack([palette[labels], np.tile(TRACK_COLOUR, (len(track), 1))])
     image = _lit(np.vstack([centres, track]), half_m, rgb, camera)
-    entries = _legend_entries(labels, semantic_map.voxels.label_set)
+    entries = _legend_entries(labels, semantic_map.voxels.label_set, UNLABELLED_BY_NIGHT)
     if trajectory is not None:
         entries.append(("track", TRACK_COLOUR))
     figure = _with_legend(image, entries)
@@ -207,7 +217,8 @@ def _behind(trajectory: Trajectory, centres: NDArray[np.float64], at_s: float | 
     T_map_imu = trajectory.at([at_s])[0]
     vehicle, forward = T_map_imu[:3, 3], T_map_imu[:3, 0] * (1, 1, 0)
     forward /= np.linalg.norm(forward)
-    return _camera(vehicle - BEHIND_M * forward + np.array([0, 0, ABOVE_M]), vehicle + AHEAD_M * forward)
+    up = np.array([0.0, 0.0, 1.0])
+    return _camera(vehicle - BEHIND_M * forward + ABOVE_M * up, vehicle + AHEAD_M * forward - BELOW_M * up)
 
 
 def _busiest(trajectory: Trajectory, centres: NDArray[np.float64]) -> float:

@@ -1,4 +1,4 @@
-"""The map seen from above: the class of the highest voxel of every column, as an array and as a GeoTIFF."""
+"""The map seen from above: the class of every column, as an array and as a GeoTIFF."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gnss_sem_map.export.atomic import replacing
 from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, visible
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.labels import UNLABELLED
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 NOTHING = -2
 """Label of a cell without any voxel."""
@@ -35,46 +35,44 @@ class TopView:
     north: float
     """m, map frame: upper edge of row 0."""
     labels: NDArray[np.int8]
-    """(rows, columns) class of the highest voxel; -1 unlabelled, -2 no voxel."""
+    """(rows, columns) class; -1 unlabelled, -2 no voxel."""
     heights: NDArray[np.float32]
-    """(rows, columns) m, map frame: top of the highest voxel; NaN where there is none."""
+    """(rows, columns) m, map frame: top of the voxel that is seen; NaN where there is none."""
 
 
 def top_view(semantic_map: SemanticMap, longest_side: int) -> TopView:
-    """Look at the visible voxels from above; the highest of a cell wins.
+    """Look at the map from above: of every cell, the highest labelled voxel, else the highest unlabelled one.
 
-    A cell is one voxel, or as many as keep the longer side within `longest_side` cells. Raises DataError for a map
-    without visible voxels.
+    The view ends where the labelled voxels end; removed ones are not seen. A cell is one voxel, or as many as keep
+    the longer side within `longest_side` cells. Raises DataError for a map without voxels to see.
     """
-    chosen = visible(semantic_map)
-    if not chosen.any():
+    kept = semantic_map.states != State.REMOVED
+    framed = visible(semantic_map)[kept]
+    if not framed.any():
         raise DataError(NO_VOXELS)
-    x, y, z = semantic_map.voxels.indices[chosen].T
-    per_cell = max(1, -(-(1 + max(np.ptp(x), np.ptp(y))) // longest_side))
+    x, y, z = semantic_map.voxels.indices[kept].T
+    per_cell = max(1, -(-(1 + max(np.ptp(x[framed]), np.ptp(y[framed]))) // longest_side))
     columns, rows = x // per_cell, -(y // per_cell)
-    west, north = columns.min(), rows.min()
-    shape = (int(rows.max() - north) + 1, int(columns.max() - west) + 1)
-    cells = np.ravel_multi_index((rows - north, columns - west), shape)
-    upward = np.argsort(z, kind="stable")
-    labels = np.full(shape, NOTHING, np.int8)
-    heights = np.full(shape, np.nan, np.float32)
-    size = semantic_map.voxels.voxel_size_m
-    labels.ravel()[cells[upward]] = semantic_map.labels[chosen][
-        upward
-    ]  # of repeated cells the last one stays
-    heights.ravel()[cells[upward]] = (z[upward] + 1) * size
-    cell_m = per_cell * size
-    return TopView(
-        cell_m, west=float(west * cell_m), north=float((1 - north) * cell_m), labels=labels, heights=heights
-    )
+    west, north = columns[framed].min(), rows[framed].min()
+    shape = (int(rows[framed].max() - north) + 1, int(columns[framed].max() - west) + 1)
+    inside = (columns >= west) & (columns < west + shape[1]) & (rows >= north) & (rows < north + shape[0])
+    order = np.flatnonzero(inside)[np.lexsort((z[inside], framed[inside]))]
+    cells = np.ravel_multi_index((rows[order] - north, columns[order] - west), shape)
+    labels, heights = np.full(shape, NOTHING, np.int8), np.full(shape, np.nan, np.float32)
+    voxel_m = semantic_map.voxels.voxel_size_m
+    labels.ravel()[cells] = semantic_map.labels[kept][order]  # of repeated cells the last one stays
+    heights.ravel()[cells] = (z[order] + 1) * voxel_m
+    cell_m = float(per_cell * voxel_m)
+    return TopView(cell_m, west=west * cell_m, north=(1 - north) * cell_m, labels=labels, heights=heights)
 
 
 def write_topview_geotiff(semantic_map: SemanticMap, frame: LocalFrame, path: Path | str) -> None:
     """Write the top view as a GeoTIFF of class indices in the UTM zone of the map's origin.
 
-    uint8 with a colour table: 254 is unlabelled, 255 no data; tags name the classes. Every pixel takes the cell
-    under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide, or more where
-    the raster would exceed 10,000 on a side. Raises DataError for an empty map or when the file cannot be written.
+    uint8 with a colour table: 254 is mapped but unlabelled, 255 no data; tags name the classes. Every pixel takes
+    the cell under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide, or more
+    where the raster would exceed 10,000 on a side. Raises DataError for an empty map or when the file cannot be
+    written.
     """
     import rasterio
     from rasterio.enums import Resampling

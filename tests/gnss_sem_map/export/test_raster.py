@@ -1,5 +1,6 @@
 """The map from above, against a dictionary of columns; the GeoTIFF, as rasterio and pyproj see it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,34 +9,40 @@ import rasterio
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.raster import GEOTIFF_NODATA, NOTHING, top_view, write_topview_geotiff
+from gnss_sem_map.export.raster import (
+    GEOTIFF_NODATA,
+    GEOTIFF_UNLABELLED,
+    NOTHING,
+    top_view,
+    write_topview_geotiff,
+)
 from gnss_sem_map.export.utm import from_utm, to_utm
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 AT_THE_EDGE_OF_A_ZONE = LocalFrame(60.0, 6.02, 40.0)  # convergence -2.6 degrees
 
 
-def highest(semantic_map: SemanticMap, per_cell: int) -> dict[tuple[int, int], tuple[int, int]]:
-    """(column, row) in cells from the origin -> index along z and label of the highest shown voxel."""
-    best: dict[tuple[int, int], tuple[int, int]] = {}
-    for (x, y, z), label, shown in zip(
-        semantic_map.voxels.indices.tolist(), semantic_map.labels.tolist(), semantic_map.shown, strict=True
+def seen(semantic_map: SemanticMap, per_cell: int) -> dict[tuple[int, int], tuple[bool, int, int]]:
+    """(column, row) in cells from the origin -> labelled or not, index along z, label: the highest of these wins."""
+    best: dict[tuple[int, int], tuple[bool, int, int]] = {}
+    for (x, y, z), label, state in zip(
+        semantic_map.voxels.indices.tolist(), semantic_map.labels.tolist(), semantic_map.states, strict=True
     ):
         cell = (x // per_cell, y // per_cell)
-        if shown and (cell not in best or z >= best[cell][0]):
-            best[cell] = (z, label)
+        if state != State.REMOVED:
+            best[cell] = max(best.get(cell, (False, -999, -1)), (label >= 0, z, label))
     return best
 
 
 @pytest.mark.parametrize(("longest_side", "per_cell"), [(10_000, 1), (300, 1), (299, 2), (75, 4), (30, 10)])
-def test_the_top_view_is_the_highest_voxel_of_every_column(
+def test_the_top_view_is_the_highest_labelled_voxel_of_every_column_else_the_highest(
     street: SemanticMap, longest_side: int, per_cell: int
 ) -> None:
     view = top_view(street, longest_side)
-    expected = highest(street, per_cell)
+    expected = seen(street, per_cell)
     assert view.cell_m == pytest.approx(0.2 * per_cell)
     assert (view.labels != NOTHING).sum() == len(expected)
-    for (column, row), (z, label) in expected.items():
+    for (column, row), (_, z, label) in expected.items():
         i = round(view.north / view.cell_m) - 1 - row
         j = column - round(view.west / view.cell_m)
         assert view.heights[i, j] == pytest.approx(0.2 * (z + 1), abs=1e-5)
@@ -58,7 +65,8 @@ def test_rasterio_finds_every_class_where_pyproj_says_it_is(
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
         assert tiff.crs.to_epsg() == frame.utm_epsg
         found = np.array([value for (value,) in tiff.sample(utm[:, :2])])
-    np.testing.assert_array_equal(found, view.labels[rows, columns])
+    labels = view.labels[rows, columns].astype(int)
+    np.testing.assert_array_equal(found, np.where(labels == -1, GEOTIFF_UNLABELLED, labels))
 
 
 def inside_one_class(labels: np.ndarray) -> np.ndarray:
@@ -72,6 +80,13 @@ def inside_one_class(labels: np.ndarray) -> np.ndarray:
     return np.asarray((labels != NOTHING) & np.all([n == labels for n in neighbours], axis=0))
 
 
+def test_what_lies_outside_the_labelled_part_is_left_out_of_the_frame(street: SemanticMap) -> None:
+    only_the_car = np.where(street.labels == 2, street.labels, -1).astype(np.int8)
+    view = top_view(replace(street, labels=only_the_car), 10_000)
+    assert view.labels.shape == (10, 20)
+    assert (view.labels == 2).all()
+
+
 def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path: Path) -> None:
     write_topview_geotiff(street, AT_THE_EDGE_OF_A_ZONE, tmp_path / "topview_class.tif")
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
@@ -79,7 +94,7 @@ def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path:
     labels = top_view(street, 10_000).labels
     for label in range(5):
         assert (classes == label).sum() == pytest.approx((labels == label).sum(), rel=0.02)
-    assert set(np.unique(classes)) == {0, 1, 2, 3, 4, GEOTIFF_NODATA}
+    assert set(np.unique(classes)) == {0, 1, 2, 3, 4, GEOTIFF_UNLABELLED, GEOTIFF_NODATA}
 
 
 def test_the_geotiff_says_what_its_values_mean(

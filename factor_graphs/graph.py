@@ -31,13 +31,18 @@ def preintegration_params(noise: ImuNoise, frame: LocalFrame) -> gtsam.Preintegr
 
 
 def imu_factors(
-    intervals: ImuIntervals, noise: list[ImuNoise], frame: LocalFrame
+    intervals: ImuIntervals, noise: list[ImuNoise], frame: LocalFrame, first: int = 0
 ) -> Iterator[gtsam.CombinedImuFactor]:
-    """The preintegrated IMU from each keyframe to the next (Forster et al. 2017), bias walk included."""
+    """The preintegrated IMU from each keyframe to the next (Forster et al. 2017), bias walk included.
+
+    The keyframes are numbered from `first`.
+    """
     params = {id(n): preintegration_params(n, frame) for n in noise}
     steps = zip(intervals.specific_force, intervals.angular_rate, intervals.durations.tolist(), strict=True)
-    for i, count in enumerate(np.diff(intervals.bounds).tolist()):
-        pim = gtsam.PreintegratedCombinedMeasurements(params[id(noise[i])])
+    for i, (its_noise, count) in enumerate(
+        zip(noise, np.diff(intervals.bounds).tolist(), strict=True), first
+    ):
+        pim = gtsam.PreintegratedCombinedMeasurements(params[id(its_noise)])
         integrate = pim.integrateMeasurement
         for _ in range(count):
             integrate(*next(steps))

@@ -1,0 +1,149 @@
+"""Fix by fix: the smoother's factors in an incremental fixed-lag smoother (iSAM2).
+
+QR instead of Cholesky, which fails in GNSS outages of more than about 40 s; and when the solver throws all
+the same, it starts again from its last state.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import ArrayLike, NDArray
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.graph import gnss_factors, imu_factors
+from factor_graphs.intervals import ImuIntervals, split
+from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.problem import LOSSES
+from factor_graphs.smoothing import Solution
+
+Array = NDArray[np.float64]
+
+# iSAM2 relinearises what moved by more than the threshold, at every tenth update.
+RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD = 10, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class StreamedState:
+    """The state at the newest fix: `T_map_imu` (4, 4), `velocity` (3,) m/s, `biases` (6,).
+
+    `pose_covariance` (6, 6) in the order and axes of `Trajectory.covariances`.
+    """
+
+    stamp: float
+    T_map_imu: Array
+    velocity: Array
+    biases: Array
+    pose_covariance: Array
+
+
+class StreamingSmoother:
+    """Follows a vehicle online, from where a batch solution of its first seconds ends.
+
+    `start` gives the first state, its covariance and the IMU noise; `p_imu_antenna` (3,) m is the lever arm.
+    `state` is the newest one and `restarts` counts how often the solver had to start again.
+    """
+
+    def __init__(
+        self,
+        start: Solution,
+        frame: LocalFrame,
+        p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
+        lag_s: float = 10.0,
+    ) -> None:
+        self.restarts = 0
+        self._frame, self._lag_s = frame, lag_s
+        self._lever = np.asarray(p_imu_antenna, dtype=np.float64)
+        self._noise, self._keyframe = start.imu_noise, 0
+        end, velocities = start.keyframes, start.keyframes.velocities
+        assert velocities is not None
+        covariance = start.state_covariances[-1]
+        self.state = StreamedState(
+            end.end, end.T_map_imu[-1], velocities[-1], start.biases[-1], covariance[:6, :6]
+        )
+        self._stddevs = np.sqrt(np.diag(covariance))
+        self._begin()
+
+    def add(self, imu: ImuSamples, fix: GnssFixes) -> StreamedState:
+        """The state at one new fix, given the IMU from the last state's stamp (or before) to the fix.
+
+        Raises MeasurementError when it is not one fix, is not newer, or the IMU does not span the time between.
+        """
+        if len(fix) != 1 or not imu.stamps[0] <= self.state.stamp < fix.stamps[0] <= imu.stamps[-1]:
+            raise MeasurementError(
+                f"{len(fix)} fixes at {fix.stamps.tolist()} s, IMU {imu.stamps[0]:.3f}..{imu.stamps[-1]:.3f} s; "
+                f"expected one fix after {self.state.stamp:.3f} s, and the IMU from there to the fix"
+            )
+        intervals = split(_between(imu, self.state.stamp, float(fix.stamps[0])), fix.stamps)
+        try:
+            self._extend(intervals, fix)
+        except RuntimeError:
+            # iSAM2 lost its footing: keep the last state, forget how it came about
+            self.restarts += 1
+            self._begin()
+            self._extend(intervals, fix)
+        return self.state
+
+    def _begin(self) -> None:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR")
+        params.relinearizeSkip = RELINEARIZE_SKIP
+        params.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
+        self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
+        i, stddevs, state = self._keyframe, self._stddevs, self.state
+        diagonal = gtsam.noiseModel.Diagonal.Sigmas
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose, bias = (
+            gtsam.Pose3(state.T_map_imu),
+            gtsam.imuBias.ConstantBias(state.biases[:3], state.biases[3:]),
+        )
+        graph.push_back(gtsam.PriorFactorPose3(X(i), pose, diagonal(stddevs[:6])))
+        graph.push_back(gtsam.PriorFactorVector(V(i), state.velocity, diagonal(stddevs[6:9])))
+        graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, diagonal(stddevs[9:])))
+        values.insert(X(i), pose)
+        values.insert(V(i), state.velocity)
+        values.insert(B(i), bias)
+        self._smoother.update(graph, values, dict.fromkeys((X(i), V(i), B(i)), state.stamp))
+
+    def _extend(self, intervals: ImuIntervals, fix: GnssFixes) -> None:
+        graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), dict[int, float]()
+        first = self._keyframe
+        last = first + len(intervals.keyframes) - 1
+        bias = gtsam.imuBias.ConstantBias(self.state.biases[:3], self.state.biases[3:])
+        ahead = gtsam.NavState(gtsam.Pose3(self.state.T_map_imu), self.state.velocity)
+        for i, factor in enumerate(
+            imu_factors(intervals, intervals.noise(self._noise), self._frame, first), first + 1
+        ):
+            graph.push_back(factor)
+            ahead = factor.preintegratedMeasurements().predict(ahead, bias)
+            values.insert(X(i), ahead.pose())
+            values.insert(V(i), ahead.velocity())
+            values.insert(B(i), bias)
+            stamps |= {key: float(intervals.keyframes[i - first]) for key in (X(i), V(i), B(i))}
+        for gnss in gnss_factors(fix, np.array([last]), self._lever, LOSSES["huber"]):
+            graph.push_back(gnss)
+        self._smoother.update(graph, values, stamps)
+        self._keyframe, self.state = last, self._newest(last, float(fix.stamps[0]))
+
+    def _newest(self, i: int, stamp: float) -> StreamedState:
+        smoother = self._smoother
+        return StreamedState(
+            stamp,
+            smoother.calculateEstimatePose3(X(i)).matrix(),
+            smoother.calculateEstimateVector(V(i)),
+            smoother.calculateEstimateConstantBias(B(i)).vector(),
+            smoother.marginalCovariance(X(i)),
+        )
+
+
+def _between(imu: ImuSamples, first: float, last: float) -> ImuSamples:
+    """The IMU from `first` to `last` s, its ends interpolated."""
+    i, j = np.searchsorted(imu.stamps, [first, last], side="right")
+    stamps = np.concatenate([[first], imu.stamps[i:j], [last]])
+    stamps = stamps[: len(stamps) - (stamps[-2] >= last)]
+    near = slice(max(i - 1, 0), j + 1)
+    both = np.hstack([imu.specific_force[near], imu.angular_rate[near]])
+    at = np.column_stack([np.interp(stamps, imu.stamps[near], column) for column in both.T])
+    return ImuSamples(stamps, at[:, :3], at[:, 3:])

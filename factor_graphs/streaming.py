@@ -5,6 +5,7 @@ the same, it starts again from its last state.
 """
 
 from dataclasses import dataclass
+from typing import SupportsFloat, SupportsInt
 
 import gtsam
 import numpy as np
@@ -27,16 +28,12 @@ RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD = 10, 0.1
 
 @dataclass(frozen=True, eq=False)
 class StreamedState:
-    """The state at the newest fix: `T_map_imu` (4, 4), `velocity` (3,) m/s, `biases` (6,).
-
-    `pose_covariance` (6, 6) in the order and axes of `Trajectory.covariances`.
-    """
+    """The state at the newest fix: `T_map_imu` (4, 4), `velocity` (3,) m/s, `biases` (6,)."""
 
     stamp: float
     T_map_imu: Array
     velocity: Array
     biases: Array
-    pose_covariance: Array
 
 
 class StreamingSmoother:
@@ -59,11 +56,10 @@ class StreamingSmoother:
         self._noise, self._keyframe = start.imu_noise, 0
         end, velocities = start.keyframes, start.keyframes.velocities
         assert velocities is not None
-        covariance = start.state_covariances[-1]
         self.state = StreamedState(
             end.end, end.T_map_imu[-1], velocities[-1], start.biases[-1], covariance[:6, :6]
         )
-        self._stddevs = np.sqrt(np.diag(covariance))
+        self._stddevs = np.sqrt(np.diag(start.state_covariances[-1]))
         self._begin()
 
     def add(self, imu: ImuSamples, fix: GnssFixes) -> StreamedState:
@@ -85,6 +81,10 @@ class StreamingSmoother:
             self._begin()
             self._extend(intervals, fix)
         return self.state
+
+    def pose_covariance(self) -> Array:
+        """Covariance (6, 6) of the newest pose, in the order and axes of `Trajectory.covariances`."""
+        return self._smoother.marginalCovariance(X(self._keyframe))
 
     def _begin(self) -> None:
         params = gtsam.ISAM2Params()
@@ -108,7 +108,11 @@ class StreamingSmoother:
         self._smoother.update(graph, values, dict.fromkeys((X(i), V(i), B(i)), state.stamp))
 
     def _extend(self, intervals: ImuIntervals, fix: GnssFixes) -> None:
-        graph, values, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), dict[int, float]()
+        graph, values, stamps = (
+            gtsam.NonlinearFactorGraph(),
+            gtsam.Values(),
+            dict[SupportsInt, SupportsFloat](),
+        )
         first = self._keyframe
         last = first + len(intervals.keyframes) - 1
         bias = gtsam.imuBias.ConstantBias(self.state.biases[:3], self.state.biases[3:])
@@ -134,15 +138,14 @@ class StreamingSmoother:
             smoother.calculateEstimatePose3(X(i)).matrix(),
             smoother.calculateEstimateVector(V(i)),
             smoother.calculateEstimateConstantBias(B(i)).vector(),
-            smoother.marginalCovariance(X(i)),
         )
 
 
 def _between(imu: ImuSamples, first: float, last: float) -> ImuSamples:
     """The IMU from `first` to `last` s, its ends interpolated."""
-    i, j = np.searchsorted(imu.stamps, [first, last], side="right")
-    stamps = np.concatenate([[first], imu.stamps[i:j], [last]])
-    stamps = stamps[: len(stamps) - (stamps[-2] >= last)]
+    i, j = (int(n) for n in np.searchsorted(imu.stamps, [first, last], side="right"))
+    inner = imu.stamps[i:j]
+    stamps = np.concatenate([[first], inner[inner < last], [last]])
     near = slice(max(i - 1, 0), j + 1)
     both = np.hstack([imu.specific_force[near], imu.angular_rate[near]])
     at = np.column_stack([np.interp(stamps, imu.stamps[near], column) for column in both.T])

@@ -5,7 +5,7 @@ the same, it starts again from its last state.
 """
 
 from dataclasses import dataclass
-from typing import SupportsFloat, SupportsInt
+from typing import SupportsFloat, SupportsIndex, SupportsInt
 
 import gtsam
 import numpy as np
@@ -56,9 +56,7 @@ class StreamingSmoother:
         self._noise, self._keyframe = start.imu_noise, 0
         end, velocities = start.keyframes, start.keyframes.velocities
         assert velocities is not None
-        self.state = StreamedState(
-            end.end, end.T_map_imu[-1], velocities[-1], start.biases[-1], covariance[:6, :6]
-        )
+        self.state = StreamedState(end.end, end.T_map_imu[-1], velocities[-1], start.biases[-1])
         self._stddevs = np.sqrt(np.diag(start.state_covariances[-1]))
         self._begin()
 
@@ -111,7 +109,7 @@ class StreamingSmoother:
         graph, values, stamps = (
             gtsam.NonlinearFactorGraph(),
             gtsam.Values(),
-            dict[SupportsInt, SupportsFloat](),
+            dict[SupportsInt | SupportsIndex, SupportsFloat | SupportsIndex](),
         )
         first = self._keyframe
         last = first + len(intervals.keyframes) - 1

@@ -70,15 +70,129 @@ def run(
     with _progress() as progress:
         result = pipeline.run(log, segment, settings, progress)
         about = run_folder.write_run(out, drive, log, result, settings, write_labels)
-    for warning in result.account.warnings:
-        typer.echo(f"warning: {warning}", err=True)
+    _warn(result.account.warnings)
     _report(about, out, as_json)
+
+
+@app.command()
+def trajectory(
+    drive: Drive,
+    out: Out,
+    config: Config = None,
+    set_: Set = None,
+    drive_format: Format = None,
+    as_json: Json = False,
+) -> None:
+    """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
+    from gnss_sem_map import pipeline
+    from gnss_sem_map.account import Account
+    from gnss_sem_map.export import run_folder
+
+    run_folder.check_replaceable(out)
+    settings = _settings(config, set_)
+    log = _open(drive, drive_format, None)
+    account = Account(skips=list(log.skips))
+    with account.stage("trajectory"):
+        estimate, solution = pipeline.estimate_trajectory(log, settings, account)
+    about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings)
+    _warn(account.warnings)
+    if as_json:
+        typer.echo(json.dumps(about))
+    else:
+        typer.echo(
+            f"{log.name}: {len(estimate)} poses over {estimate.end - estimate.start:.1f} s; results in {out}"
+        )
+
+
+@app.command()
+def evaluate(
+    run_folder: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Folder of a run made with --write-labels.")
+    ],
+    truth: Annotated[Path, typer.Option(help="Truth: a folder of .label files, or one with labels/ in it.")],
+    restrict_to: Annotated[
+        Path | None, typer.Option(help="Score only points that are labelled in these .label files.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
+    from gnss_sem_map import config, labels
+    from gnss_sem_map.io.scoring import score_run
+
+    settings = config.load(run_folder / "config.yaml")
+    metrics = score_run(run_folder, truth, labels.label_set(settings.classes), restrict_to)
+    if as_json:
+        typer.echo(json.dumps(metrics))
+    else:
+        _print_metrics(metrics)
+
+
+@app.command()
+def simulate(
+    out: Out,
+    seconds: Annotated[float, typer.Option(min=0.3, help="Length of the drive, s.")] = 30.0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Town, traffic and noise; the same seed gives the same bytes.")
+    ] = 0,
+) -> None:
+    """Write a simulated drive in KITTI raw format, with the exact truth beside it."""
+    from gnss_sem_map.simulation import simulate as write_drive
+
+    with _progress() as progress:
+        drive = write_drive(out, seconds, seed, lambda done, total: progress("simulate", done, total))
+    typer.echo(f"drive in {drive}")
 
 
 @app.command()
 def config(config: Config = None, set_: Set = None) -> None:
     """Print all settings as YAML, with the values that a run would use."""
     typer.echo(_settings(config, set_).to_yaml(), nl=False)
+
+
+def _warn(warnings: list[str]) -> None:
+    for warning in warnings:
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def _print_metrics(metrics: dict[str, Any]) -> None:
+    """One table: accuracy and IoU per class before and after refinement, then the single figures."""
+    from rich.console import Console
+    from rich.table import Table
+
+    raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
+    table = Table(title="Semantics, % of labelled points")
+    table.add_column("class")
+    for column in ("accuracy raw", "refined", "IoU raw", "refined"):
+        table.add_column(column, justify="right")
+    for name, after in refined["classes"].items():
+        before = raw["classes"][name] or {}
+        after = after or {}
+        cells = (side.get(figure) for figure in ("accuracy", "iou") for side in (before, after))
+        table.add_row(name, *map(_percent, cells))
+    means = (side[f"mean_{figure}"] for figure in ("accuracy", "iou") for side in (raw, refined))
+    table.add_section()
+    table.add_row("mean", *map(_percent, means))
+    console = Console(soft_wrap=True)
+    console.print(table)
+    moving = metrics["dynamic"]
+    lines = [
+        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined, of all points",
+        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
+        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
+        f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",
+    ]
+    if "trajectory" in metrics:
+        t = metrics["trajectory"]
+        lines.append(
+            f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
+            f" heading {t['heading_rms_deg']:.3f} deg, {100 * t['rpe_translation_share']:.2f} % relative"
+        )
+    for line in lines:
+        console.print(line, highlight=False)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"
 
 
 def _settings(file: Path | None, overrides: list[str] | None) -> Settings:

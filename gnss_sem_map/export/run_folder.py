@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from factor_graphs.smoothing import Solution
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import tiles
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
@@ -65,7 +67,7 @@ def write_run(
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
     with new_folder(out) as folder:
         with result.account.stage("export"):
-            write_trajectory(folder, log, result)
+            _write_trajectory(folder, log, result.trajectory)
             tiles.write(result.raw, folder / "map", log.frame)
             tiles.write(result.refined, folder / "refined", log.frame)
             write_ply(result.refined, folder / "map.ply", log.frame)
@@ -76,23 +78,57 @@ def write_run(
             if write_labels:
                 write_point_labels(folder, log, result, settings)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        about = about_run(drive, log, result.account) | {"map": _about_map(result)}
+        about = about_run(drive, log, result.account) | {
+            "trajectory": _about_solution(result.solution),
+            "map": _about_map(result),
+        }
         _write_json(folder / "run.json", about)
         _write_json(folder / "metrics.json", {})
     return about
 
 
-def write_trajectory(folder: Path, log: SensorLog, result: Result) -> None:
-    """The trajectory in every form that others read, over the span of the drive's measurements."""
-    result.trajectory.save(folder / "trajectory.parquet")
-    write_tum(result.trajectory, folder / "trajectory.tum")
-    write_kitti(result.trajectory, folder / "trajectory_kitti.txt")
+def write_trajectory_run(
+    out: Path,
+    drive: Path,
+    log: SensorLog,
+    trajectory: Trajectory,
+    solution: Solution | None,
+    account: Account,
+    settings: Settings,
+) -> dict[str, Any]:
+    """Write a run that stopped after its trajectory; returns the content of run.json."""
+    with new_folder(out) as folder:
+        _write_trajectory(folder, log, trajectory)
+        (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
+        about = about_run(drive, log, account) | {"trajectory": _about_solution(solution)}
+        _write_json(folder / "run.json", about)
+    return about
+
+
+def _write_trajectory(folder: Path, log: SensorLog, trajectory: Trajectory) -> None:
+    trajectory.save(folder / "trajectory.parquet")
+    write_tum(trajectory, folder / "trajectory.tum")
+    write_kitti(trajectory, folder / "trajectory_kitti.txt")
     if log.frame is not None:
-        write_geojson(result.trajectory, log.frame, folder / "trajectory.geojson")
+        write_geojson(trajectory, log.frame, folder / "trajectory.geojson")
+
+
+def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
+    if solution is None:
+        return None
+    return {
+        "chi2_per_dof": solution.chi2_per_dof,
+        "imu_noise_inflation": solution.inflation,
+        "iterations": solution.iterations,
+        "fixes": len(solution.rejected),
+        "fixes_rejected": int(solution.rejected.sum()),
+        "time_offset_s": solution.calibration.time_offset_s,
+        "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
+    }
 
 
 def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: Settings) -> None:
-    """Per original point: the class before (labels_raw/) and after refinement (labels/), how sure, and what was removed.
+    """Per original point: the class before and after refinement, how sure that is, and what was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
     """

@@ -1,0 +1,119 @@
+"""A run folder against the truth: its point labels, its removed points, its trajectory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.accuracy import errors, relative_error
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import evaluation
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.io.point_labels import label_files, read_labels, truth_folder
+from gnss_sem_map.labels import LabelSet
+
+ONE_SECOND = 10
+"""Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
+
+
+def score_run(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None = None) -> dict[str, Any]:
+    """Everything that can be scored of a run folder, as `metrics.json` holds it; also written there.
+
+    `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
+    the imu in the map frame at the scans' stamps). `restrict_to`: only points labelled there. Raises DataError.
+    """
+    metrics = _score_points(out, truth, label_set, restrict_to)
+    path = truth / "trajectory_lidar.tum"
+    if path.is_file():
+        metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", "utf-8")
+    return metrics
+
+
+def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
+    tables = evaluation.Tables.of(label_set)
+    count = len(label_set.names)
+    refined = np.zeros((count, count + 1), np.int64)
+    raw, moved = refined.copy(), np.zeros((3, 2), np.int64)
+    sure = np.zeros((evaluation.CALIBRATION_BINS, 3))
+    for name, true in _truths(out / "labels", truth_folder(truth)):
+        where = f"{out / 'labels' / name}.label"
+        predicted = read_labels(out / "labels" / f"{name}.label")
+        before = read_labels(out / "labels_raw" / f"{name}.label")
+        moved += evaluation.dynamic_counts(
+            read_labels(out / "removed" / f"{name}.label"), true, tables, where
+        )
+        if restrict_to is not None:
+            true = np.where(read_labels(restrict_to / f"{name}.label") & 0xFFFF != 0, true, 0).astype(
+                np.uint32
+            )
+        refined += evaluation.confusion(predicted, true, tables, where)
+        raw += evaluation.confusion(before, true, tables, where)
+        confidence = np.fromfile(out / "confidence" / f"{name}.bin", "<f2")
+        sure += evaluation.calibration_counts(confidence, predicted, true, tables)
+    return {
+        "semantics": {
+            "raw": evaluation.semantics(raw, label_set),
+            "refined": evaluation.semantics(refined, label_set),
+        },
+        "dynamic": evaluation.dynamic(moved),
+        "calibration": evaluation.calibration(sure),
+    }
+
+
+def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32]]]:
+    """Name and true ids of every scan that the run labelled; every one must have a truth, and at least one."""
+    if not predictions.is_dir():
+        raise DataError(f"{predictions}: no point labels in this run; make it again with --write-labels")
+    wanted, known = label_files(predictions), label_files(truth)
+    missing = sorted(set(wanted) - set(known))
+    if missing:
+        raise DataError(
+            f"{truth}: no truth for {len(missing)} of {len(wanted)} scans, first {missing[0]}; is it another drive?"
+        )
+    return [(name, read_labels(known[name])) for name in wanted]
+
+
+def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second."""
+    error = errors(estimate, truth)
+    stamps = error.stamps
+    relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
+    return {
+        "ate_m": error.ate_m,
+        "horizontal_rms_m": error.horizontal_rms_m,
+        "vertical_rms_m": error.vertical_rms_m,
+        "heading_rms_deg": error.heading_rms_deg,
+        "ate_aligned_m": _aligned_rms(estimate.at(stamps)[:, :3, 3], truth.at(stamps)[:, :3, 3]),
+        "rpe_translation_m": relative.translation_m,
+        "rpe_translation_share": relative.translation_share,
+        "rpe_rotation_deg": relative.rotation_deg,
+    }
+
+
+def _aligned_rms(points: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    """Root mean square distance after the best rotation and translation (Kabsch)."""
+    moved, fixed = points - points.mean(axis=0), reference - reference.mean(axis=0)
+    u, _, vt = np.linalg.svd(fixed.T @ moved)
+    proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rest = fixed - moved @ (u @ proper @ vt).T
+    return float(np.sqrt((rest**2).sum(axis=1).mean()))
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read `stamp tx ty tz qx qy qz qw`; raises DataError for anything else."""
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise DataError(f"{path}: {str(error).splitlines()[0]}; expected eight numbers per line") from None
+    if rows.shape[1] != 8 or not np.isfinite(rows).all():
+        raise DataError(f"{path}: found {rows.shape[1]} numbers per line, expected eight finite ones")
+    T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_map_imu[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    T_map_imu[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0], T_map_imu)

@@ -1,0 +1,145 @@
+"""Class probabilities once, for all later runs: one small file per frame, which `labels:` reads."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels import OTHER, LabelSet
+from gnss_sem_map.segmentation import MissingLabels, Segmenter
+from gnss_sem_map.sensor_log import Image, Skip
+
+ABOUT = "about.json"
+"""Says who wrote a cache; frames of two segmenters are not mixed."""
+
+
+@runtime_checkable
+class BatchSegmenter(Protocol):
+    """A segmenter that sees several images in one go."""
+
+    def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
+        """Class probabilities (h, w, c) of every image."""
+        ...
+
+
+@dataclass(frozen=True)
+class CacheReport:
+    """What writing a cache came to."""
+
+    written: int
+    kept: int
+    """Frames that an earlier call had already written."""
+    skips: tuple[Skip, ...]
+    bytes_per_frame: float
+    images_per_second: float
+
+
+def write_cache(
+    images: Sequence[Image],
+    segmenter: Segmenter,
+    label_set: LabelSet,
+    folder: Path,
+    description: str,
+    batch_size: int = 4,
+    progress: Progress = silent,
+) -> CacheReport:
+    """Segment every image that has no file in `folder` yet, and write `<number>.npz`: 8 bits per class and pixel.
+
+    Classes are summed by name into those of `label_set` and `other`. A KITTI image at half its size takes about 110 kB.
+    Every file appears whole or not at all, so an interrupted call is simply made again. `description` (the
+    segmenter's SPEC) must be the one that began the folder. Frames whose image is damaged are skipped and reported.
+    Raises ConfigError for a folder of another segmenter, DataError when it cannot be written or nothing was segmented.
+    """
+    _claim(folder, {"segmenter": description, "class_names": [*label_set.names, OTHER]})
+    waiting = [image for image in images if not _file(folder, image).exists()]
+    kept, skips, sizes, start = len(images) - len(waiting), list[Skip](), list[int](), time.perf_counter()
+    progress("segmenting", kept, len(images))
+    remaining = iter(waiting)
+    while batch := list(islice(remaining, batch_size)):
+        for image, seen in _segment(batch, segmenter, skips):
+            small = quantised(seen, segmenter.class_names, label_set)
+            sizes.append(_write(_file(folder, image), small, label_set))
+        progress("segmenting", kept + len(sizes) + len(skips), len(images))
+    if images and not (kept or sizes):
+        raise DataError(f"none of {len(images)} images could be segmented; first reason: {skips[0].reason}")
+    seconds = max(time.perf_counter() - start, 1e-9)
+    return CacheReport(
+        len(sizes), kept, tuple(skips), float(np.mean(sizes)) if sizes else 0.0, len(sizes) / seconds
+    )
+
+
+def quantised(
+    seen: NDArray[np.uint8] | NDArray[np.float32], class_names: Sequence[str], label_set: LabelSet
+) -> NDArray[np.uint8]:
+    """Probabilities of the segmenter's classes as round(255 p) of the map's classes and `other`: (h, w, c + 1)."""
+    unit = np.float32(1 if seen.dtype == np.uint8 else 255)
+    summed = np.asarray(seen, np.float32) @ label_set.table_from(class_names) * unit
+    return np.asarray(np.rint(np.clip(summed, 0, 255)), np.uint8)
+
+
+def _segment(
+    batch: list[Image], segmenter: Segmenter, skips: list[Skip]
+) -> Iterator[tuple[Image, NDArray[np.uint8] | NDArray[np.float32]]]:
+    """All at once where the segmenter can; one by one where it cannot, or where one of them is damaged."""
+    if isinstance(segmenter, BatchSegmenter) and len(batch) > 1:
+        try:
+            yield from zip(batch, segmenter.segment_many(batch), strict=True)
+            return
+        except DataError:
+            pass  # some image is damaged: the loop below finds out which
+    for image in batch:
+        try:
+            yield image, segmenter(image)
+        except MissingLabels as error:
+            skips.append(Skip("labels", f"frame {image.number}", str(error)))
+        except DataError as error:
+            skips.append(Skip("image", f"frame {image.number}", str(error)))
+
+
+def _claim(folder: Path, about: dict[str, object]) -> None:
+    file = folder / ABOUT
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not file.exists():
+            if any(folder.glob("*.npz")):
+                raise ConfigError(f"cache {folder}: found .npz files but no {ABOUT}; choose an empty folder")
+            file.write_text(json.dumps(about) + "\n")
+        found = json.loads(file.read_text())
+    except OSError as error:
+        raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
+    except json.JSONDecodeError:
+        raise DataError(f"{file}: damaged; remove the folder and write it again") from None
+    if found != about:
+        raise ConfigError(
+            f"cache {folder}: was begun with {found}, now asked for {about}; choose another folder"
+        )
+
+
+def _file(folder: Path, image: Image) -> Path:
+    return folder / f"{image.number:010d}.npz"
+
+
+def _write(path: Path, probabilities: NDArray[np.uint8], label_set: LabelSet) -> int:
+    beside = path.with_suffix(".part")
+    try:
+        with beside.open("wb") as file:
+            np.savez_compressed(
+                file, probabilities=probabilities, class_names=np.array([*label_set.names, OTHER])
+            )
+        beside.replace(path)
+        return path.stat().st_size
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror}); free some space and run again"
+        ) from None

@@ -38,10 +38,10 @@ EXTRA_BYTES = (
 )
 
 
-def colours(semantic_map: SemanticMap) -> NDArray[np.uint8]:
-    """Colour of every voxel's class, grey where it has none: (v, 3) RGB."""
-    palette = np.vstack([semantic_map.voxels.label_set.colours, UNLABELLED_COLOUR]).astype(np.uint8)
-    return palette[semantic_map.labels]  # -1 is the last row
+def colours(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
+    """Colours of labels (v,), grey where there is none: (v, 3) RGB."""
+    palette = np.vstack([label_set.colours, UNLABELLED_COLOUR]).astype(np.uint8)
+    return palette[labels]  # -1 is the last row
 
 
 def visible(semantic_map: SemanticMap) -> NDArray[np.bool_]:
@@ -62,8 +62,8 @@ def write_ply(semantic_map: SemanticMap, path: Path | str, frame: LocalFrame | N
     voxels = semantic_map.voxels[chosen]
     vertices = np.empty(len(voxels), PLY_VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = voxels.centres.T
-    vertices["red"], vertices["green"], vertices["blue"] = colours(semantic_map)[chosen].T
     labels = semantic_map.labels[chosen]
+    vertices["red"], vertices["green"], vertices["blue"] = colours(labels, voxels.label_set).T
     vertices["label"] = np.where(labels < 0, PLY_UNLABELLED, labels)
     vertices["confidence"] = semantic_map.confidence[chosen]
     vertices["hits"] = voxels.hits
@@ -154,7 +154,7 @@ def _las_points(
     points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
     centres = (unpack(voxels.keys[part]).astype(np.float64) + 0.5) * voxels.voxel_size_m
     points.x, points.y, points.z = _placed(centres, frame).T
-    points.red, points.green, points.blue = 257 * colours(semantic_map)[part].T.astype(np.uint16)  # to 16 bit
+    points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
     points.return_number[:] = 1
     points.number_of_returns[:] = 1
     unlabelled = np.where(states == State.UNOBSERVED, NEVER_CLASSIFIED, UNCLASSIFIED)

@@ -1,0 +1,252 @@
+"""One page about a run: what went in, what was left out and why, how good the result is, and what each file is."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from gnss_sem_map.export.atomic import replacing
+
+PICTURES = {
+    "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
+    "topview.png": "The map from above, north up.",
+    "trajectory.png": "The trajectory and the fixes that it was made of.",
+}
+FILES = {
+    "viewer.html": "the map to turn and to ask, in any browser, offline",
+    "map.laz": "every voxel as LAS 1.4 in UTM, with ASPRS codes, confidence and state, for QGIS and CloudCompare",
+    "map.ply": "the labelled voxels in map metres, coloured by class",
+    "topview_class.tif": "the classes from above as GeoTIFF in UTM, for QGIS",
+    "topview.png": PICTURES["topview.png"],
+    "perspective.png": PICTURES["perspective.png"],
+    "trajectory.png": PICTURES["trajectory.png"],
+    "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
+    "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
+    "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
+    "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
+    "map": "the map before refinement, with all evidence, as Parquet tiles",
+    "refined": "the refined map as Parquet tiles",
+    "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
+    "labels_raw": "the same before refinement",
+    "confidence": "the probability of each of these labels, float16",
+    "removed": "1 for every LiDAR point on a moving vehicle that was taken out of the map",
+    "config.yaml": "all settings of this run",
+    "run.json": "what this page says of the run, for programs",
+    "metrics.json": "what this page says of the evaluation, for programs",
+}
+UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
+BAR_PX = 260
+
+
+def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
+    """Write `report.html` into a run folder: one self-contained page, its pictures embedded.
+
+    `run` and `metrics` are the contents of run.json and metrics.json; a section appears only when its data, or its
+    picture in the folder, exist. Raises DataError when the file cannot be written.
+    """
+    folder = Path(folder)
+    title = f"Semantic map of {run.get('name', folder.name)}"
+    sections = [
+        f"<h1>{escape(title)}</h1>",
+        _facts(run),
+        _picture(folder, "perspective.png"),
+        _warnings(run.get("warnings", ())),
+        _section("What went in", _pairs(run.get("counts", {}))),
+        _section("What was left out", _skips(run.get("skips", {}))),
+        _section(
+            "Map", _picture(folder, "topview.png"), _classes(run.get("map", {}), metrics.get("semantics", {}))
+        ),
+        _section("Refinement", _refinement(run.get("map", {}).get("refinement", {}))),
+        _section("Moving vehicles", _pairs(metrics.get("dynamic", {}))),
+        _section("Confidence", _pairs(metrics.get("calibration", {}))),
+        _section(
+            "Trajectory",
+            _picture(folder, "trajectory.png"),
+            _pairs(run.get("trajectory") or {}),
+            _pairs(metrics.get("trajectory", {})),
+        ),
+        _section("Time and memory", _stages(run.get("seconds", {}), run.get("peak_memory_mb", {}))),
+        _section("Files", _files(folder)),
+        _section("Versions", _pairs(run.get("versions", {}))),
+    ]
+    template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
+    page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
+    with replacing(folder / "report.html") as file:
+        file.write(page.encode("utf-8"))
+
+
+def _section(title: str, *parts: str) -> str:
+    content = "\n".join(filter(None, parts))
+    return f"<section><h2>{escape(title)}</h2>\n{content}</section>" if content else ""
+
+
+def _facts(run: Mapping[str, Any]) -> str:
+    facts = []
+    if run.get("epoch_ns") is not None:
+        facts.append(f"{datetime.fromtimestamp(run['epoch_ns'] / 1e9, UTC):%d %B %Y, %H:%M:%S} UTC")
+    origin = run.get("local_frame")
+    if origin:
+        facts.append(
+            f"origin {origin['lat_deg']:.6f}°, {origin['lon_deg']:.6f}°, {origin['alt_m']:.1f} m (WGS 84)"
+        )
+    else:
+        facts.append("not georeferenced")
+    return f'<p class="facts">{escape(" · ".join(facts))}</p>'
+
+
+def _picture(folder: Path, name: str) -> str:
+    if not (folder / name).is_file():
+        return ""
+    data = base64.b64encode((folder / name).read_bytes()).decode("ascii")
+    caption = escape(PICTURES[name])
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _warnings(warnings: Iterable[str]) -> str:
+    return "\n".join(f'<p class="warning">{escape(str(warning))}</p>' for warning in warnings)
+
+
+def _skips(skips: Mapping[str, Any]) -> str:
+    listed = skips.get("listed", ())
+    if not listed:
+        return ""
+    table = _table(
+        ("what", "where", "why"), [(skip["what"], skip["where"], skip["reason"]) for skip in listed]
+    )
+    more = skips.get("count", len(listed)) - len(listed)
+    return table + (f"<p>and {more:,} more</p>" if more > 0 else "")
+
+
+def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
+    """Voxels, accuracy and IoU per class, before and after refinement, as far as they are known."""
+    counts = about_map.get("labelled", {})
+    names = list(dict.fromkeys(n for s in ("raw", "refined") for n in _class_names(counts, semantics, s)))
+    columns: list[tuple[str, list[Any]]] = []
+    for stage in ("raw", "refined"):
+        if stage in counts:
+            columns.append(
+                (f"voxels, {stage}", [*map(counts[stage].get, names), sum(counts[stage].values())])
+            )
+    for stage, scores in semantics.items():
+        for key in ("accuracy", "iou"):
+            each = [(scores.get("classes", {}).get(name) or {}).get(key) for name in names]
+            columns.append((f"{key}, {stage}", [*map(_percent, each), _percent(scores.get(f"mean_{key}"))]))
+    if not columns:
+        return ""
+    rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
+    coverage = {
+        f"of the evaluated points the {stage} map labels": _percent(scores.get("coverage"))
+        for stage, scores in semantics.items()
+    }
+    known = {key: about_map[key] for key in ("voxels", "points") if key in about_map}
+    return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(coverage)
+
+
+def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage: str) -> list[str]:
+    return [*counts.get(stage, {}), *semantics.get(stage, {}).get("classes", {})]
+
+
+def _refinement(refinement: Mapping[str, Any]) -> str:
+    steps = refinement.get("steps", ())
+    changed = [
+        (
+            step["name"],
+            step.get("voxels_changed"),
+            "; ".join(f"{change}: {count:,}" for change, count in step.get("changes", {}).items())
+            or step.get("skipped", ""),
+        )
+        for step in steps
+    ]
+    motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
+    vehicles = {f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))}
+    table = _table(("step", "voxels changed", "of these"), changed) if changed else ""
+    return table + _pairs(vehicles)
+
+
+def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:
+    longest = max(seconds.values(), default=0) or 1
+    rows = "".join(
+        f"<tr><td>{escape(stage)}</td>{_cell(f'{value:,.2f} s', number=True)}"
+        f"{_cell(_value(memory_mb.get(stage)), number=True)}"
+        f'<td><span class="bar" style="width:{BAR_PX * value / longest:.0f}px"></span></td></tr>'
+        for stage, value in seconds.items()
+    )
+    head = (
+        '<tr><th>stage</th><th class="number">time</th><th class="number">peak memory (MB)</th><th></th></tr>'
+    )
+    return f"<table>{head}{rows}</table>" if rows else ""
+
+
+def _files(folder: Path) -> str:
+    rows = "".join(
+        f'<tr><td><a href="{escape(name)}">{escape(name)}</a></td>'
+        f"{_cell(_size(folder / name), number=True)}<td>{escape(what)}</td></tr>"
+        for name, what in FILES.items()
+        if (folder / name).exists()
+    )
+    return f"<table>{rows}</table>" if rows else ""
+
+
+def _size(path: Path) -> str:
+    if path.is_dir():
+        return f"{sum(1 for _ in path.iterdir()):,} files"
+    return f"{path.stat().st_size / 1e3:,.1f} kB"
+
+
+def _pairs(values: Mapping[str, Any]) -> str:
+    """A table of names and values; absent values and nested tables are left out."""
+    rows = [(_words(k), _value(v)) for k, v in values.items() if v is not None and not isinstance(v, Mapping)]
+    return (
+        f"<table>{''.join(f'<tr><th>{escape(k)}</th>{_cell(v)}</tr>' for k, v in rows)}</table>"
+        if rows
+        else ""
+    )
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    lines = [f"<tr>{''.join(_cell(_value(v), number=_is_number(v)) for v in row)}</tr>" for row in rows]
+    titles = "".join(f"<th>{escape(title)}</th>" for title in head)
+    return f'<div class="scroll"><table><tr>{titles}</tr>{"".join(lines)}</table></div>'
+
+
+def _cell(text: str, number: bool = False) -> str:
+    return f'<td class="number">{escape(text)}</td>' if number else f"<td>{escape(text)}</td>"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) or (isinstance(value, str) and value.endswith(" %"))
+
+
+def _percent(share: float | None) -> str | None:
+    return None if share is None else f"{100 * share:.1f} %"
+
+
+def _value(value: Any) -> str:
+    match value:
+        case None:
+            return "-"
+        case bool():
+            return "yes" if value else "no"
+        case int():
+            return f"{value:,}"
+        case float():
+            return f"{value:.4g}"
+        case list() | tuple():
+            return ", ".join(map(_value, value))
+        case _:
+            return str(value)
+
+
+def _words(key: str) -> str:
+    """`peak_memory_mb` -> `peak memory (MB)`."""
+    *words, last = key.split("_")
+    return " ".join([*words, f"({UNITS[last]})"] if words and last in UNITS else [*words, last])

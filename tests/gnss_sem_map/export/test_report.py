@@ -1,0 +1,175 @@
+"""The report says what the run says, and nothing else runs or loads in it."""
+
+import base64
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gnss_sem_map.export.report import write_report
+
+RUN: dict[str, Any] = {
+    "name": "drive 5",
+    "epoch_ns": 1317042272349659964,
+    "local_frame": {"lat_deg": 49.011212804408, "lon_deg": 8.4228850417969, "alt_m": 112.83},
+    "counts": {"scans": 40, "points": 4734738},
+    "warnings": ["the fixes are better than they say"],
+    "skips": {
+        "count": 3,
+        "listed": [{"what": "scan", "where": "frames 0 to 113", "reason": "114 files missing"}],
+    },
+    "seconds": {"mapping": 0.5, "export": 1.25},
+    "peak_memory_mb": {"mapping": 409, "export": 580},
+    "trajectory": {"chi2_per_dof": 1.0312, "time_offset_s": None, "p_imu_antenna_m": [0.0, -0.32, 0.5]},
+    "map": {
+        "voxels": 226572,
+        "labelled": {"raw": {"road": 15841, "vehicle": 15261}, "refined": {"road": 18497, "vehicle": 11227}},
+        "refinement": {
+            "steps": [
+                {"name": "vehicles", "voxels_changed": 12, "changes": {"vehicle to road": 12}, "skipped": ""}
+            ],
+            "objects": [{"motion": "moving"}, {"motion": "static"}, {"motion": "moving"}],
+        },
+    },
+    "versions": {"numpy": "2.4.6", "numba": None},
+}
+SCORES = {
+    "mean_accuracy": 0.9,
+    "mean_iou": 0.8123,
+    "coverage": 0.75,
+    "classes": {"road": {"accuracy": 0.95, "iou": 0.912}, "vehicle": None},
+}
+METRICS: dict[str, Any] = {
+    "semantics": {"raw": SCORES, "refined": SCORES | {"mean_iou": 0.8567}},
+    "dynamic": {"SA": 0.991, "DA": None},
+    "trajectory": {"ate_m": 0.123456},
+    "calibration": {"ece": 0.031},
+}
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+)
+
+
+class Page(HTMLParser):
+    """Tags must close in order; keeps headings, links, picture sources and table rows."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.headings: list[str] = []
+        self.links: list[str] = []
+        self.images: list[str] = []
+        self.rows: list[list[str]] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        values = dict(attrs)
+        if tag == "a":
+            self.links.append(values["href"] or "")
+        elif tag == "img":
+            self.images.append(values["src"] or "")
+        elif tag == "tr":
+            self.rows.append([])
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "h2" in self.open:
+            self.headings.append(data)
+        elif "tr" in self.open and self.open[-1] != "tr":
+            self.rows[-1].append(data)
+
+
+def report(folder: Path, run: dict[str, Any], metrics: dict[str, Any]) -> Page:
+    write_report(folder, run, metrics)
+    return Page((folder / "report.html").read_text("utf-8"))
+
+
+def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
+    page = report(tmp_path, RUN, METRICS)
+    for row in (
+        ["points", "4,734,738"],
+        ["scan", "frames 0 to 113", "114 files missing"],
+        ["road", "15,841", "18,497", "95.0 %", "91.2 %", "95.0 %", "91.2 %"],
+        ["vehicle", "15,261", "11,227", "-", "-", "-", "-"],
+        ["all", "31,102", "29,724", "90.0 %", "81.2 %", "90.0 %", "85.7 %"],
+        ["vehicles", "12", "vehicle to road: 12"],
+        ["vehicles, moving", "2"],
+        ["chi2 per dof", "1.031"],
+        ["p imu antenna (m)", "0, -0.32, 0.5"],
+        ["ate (m)", "0.1235"],
+        ["SA", "0.991"],
+        ["ece", "0.031"],
+        ["export", "1.25 s", "580"],
+        ["numpy", "2.4.6"],
+    ):
+        assert row in page.rows
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "26 September 2011, 13:04:32 UTC" in text
+    assert "49.011213°, 8.422885°, 112.8 m" in text
+    assert "and 2 more" in text
+    assert '<p class="warning">the fixes are better than they say</p>' in text
+
+
+def test_a_section_without_data_does_not_appear(tmp_path: Path) -> None:
+    assert report(tmp_path, {"name": "x"}, {}).headings == []
+    assert report(tmp_path, {"name": "x", "counts": {"scans": 1}}, {}).headings == ["What went in"]
+    everything = ["What went in", "What was left out", "Map", "Refinement", "Moving vehicles", "Confidence"]
+    everything += ["Trajectory", "Time and memory", "Versions"]
+    assert report(tmp_path, RUN, METRICS).headings == everything
+
+
+def test_a_map_without_georeference_says_so(tmp_path: Path) -> None:
+    report(tmp_path, {"name": "x", "local_frame": None}, {})
+    assert "not georeferenced" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_pictures_that_exist_are_embedded_whole_and_files_that_exist_are_linked(tmp_path: Path) -> None:
+    (tmp_path / "topview.png").write_bytes(PNG)
+    (tmp_path / "map.laz").write_bytes(b"LASF")
+    (tmp_path / "refined").mkdir()
+    (tmp_path / "unknown.bin").write_bytes(b"")
+    page = report(tmp_path, RUN, {})
+    (source,) = page.images
+    assert base64.b64decode(source.removeprefix("data:image/png;base64,")) == PNG
+    assert page.links == ["map.laz", "topview.png", "refined"]
+
+
+@pytest.mark.parametrize(
+    "evil", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "$title & ${body}"]
+)
+def test_nothing_that_the_run_says_becomes_markup(evil: str, tmp_path: Path) -> None:
+    run = {
+        "name": evil,
+        "counts": {evil: evil},
+        "warnings": [evil],
+        "skips": {"count": 1, "listed": [{"what": evil, "where": evil, "reason": evil}]},
+        "seconds": {evil: 1.0},
+        "trajectory": {evil: [evil]},
+        "map": {
+            "labelled": {"raw": {evil: 1}},
+            "refinement": {"steps": [{"name": evil, "changes": {evil: 1}}]},
+        },
+        "versions": {evil: evil},
+    }
+    page = report(tmp_path, run, {"semantics": {evil: {"classes": {evil: None}}}})
+    assert page.tags.isdisjoint({"script", "img"})
+    assert [evil, evil] in page.rows
+
+
+def test_the_page_loads_nothing_from_anywhere(tmp_path: Path) -> None:
+    (tmp_path / "topview.png").write_bytes(PNG)
+    report(tmp_path, RUN, METRICS)
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "default-src 'none'" in text
+    assert not re.findall(r"<script|<link|https?://|@import|url\(", text)

@@ -117,10 +117,12 @@ def evaluate(
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
     from gnss_sem_map import config, labels
+    from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
 
     settings = config.load(run_folder / "config.yaml")
     metrics = score_run(run_folder, truth, labels.label_set(settings.classes), restrict_to)
+    write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
@@ -141,6 +143,46 @@ def simulate(
     with _progress() as progress:
         drive = write_drive(out, seconds, seed, lambda done, total: progress("simulate", done, total))
     typer.echo(f"drive in {drive}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the results.")] = Path("demo"),
+    seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
+    seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
+) -> None:
+    """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
+    import shutil
+    import time
+
+    from gnss_sem_map.export.run_folder import check_replaceable
+    from gnss_sem_map.simulation import simulate as write_drive
+    from gnss_sem_map.simulation import write_corrupted_labels
+
+    check_replaceable(out)
+    world = out.with_name(f"{out.name}_drive")
+    shutil.rmtree(world, ignore_errors=True)
+    start = time.perf_counter()
+    with _progress() as progress:
+        drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
+        simulated = time.perf_counter()
+        labels = write_corrupted_labels(
+            drive, world / "probabilities", seed, lambda done, total: progress("segment", done, total)
+        )
+    segmented = time.perf_counter()
+    typer.echo(
+        "Labels: the simulator's class images, corrupted as a network would (blurred borders, confused classes)."
+    )
+    run(drive, out, segmenter=f"labels:{labels}", write_labels=True)
+    evaluate(out, drive / "truth")
+    about = json.loads((out / "run.json").read_text("utf-8"))
+    seconds_of = {"simulate": simulated - start, "segment": segmented - simulated} | about["seconds"]
+    typer.echo(
+        "Time            " + ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds_of.items())
+    )
+    for name in ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html"):
+        if (out / name).is_file():
+            typer.echo(f"Look at         {out / name}")
 
 
 @app.command()

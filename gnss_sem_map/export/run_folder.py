@@ -19,9 +19,12 @@ from gnss_sem_map import tiles
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.pictures import write_topview
+from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.raster import write_topview_geotiff
+from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.mapping import label_points
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement import RefinementReport
@@ -70,11 +73,7 @@ def write_run(
             _write_trajectory(folder, log, result.trajectory)
             tiles.write(result.raw, folder / "map", log.frame)
             tiles.write(result.refined, folder / "refined", log.frame)
-            write_ply(result.refined, folder / "map.ply", log.frame)
-            write_laz(result.refined, log.frame, folder / "map.laz")
-            write_topview(
-                result.refined, folder / "topview.png", trajectory=result.trajectory, title=log.name
-            )
+            _write_exports(folder, log, result)
             if write_labels:
                 write_point_labels(folder, log, result, settings)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
@@ -82,9 +81,31 @@ def write_run(
             "trajectory": _about_solution(result.solution),
             "map": _about_map(result),
         }
+        metrics: dict[str, Any] = {}
         _write_json(folder / "run.json", about)
-        _write_json(folder / "metrics.json", {})
+        _write_json(folder / "metrics.json", metrics)
+        write_report(folder, about, metrics)
     return about
+
+
+def _write_exports(folder: Path, log: SensorLog, result: Result) -> None:
+    """The refined map for everybody's own tools."""
+    semantic_map, trajectory = result.refined, result.trajectory
+    write_ply(semantic_map, folder / "map.ply", log.frame)
+    write_laz(semantic_map, log.frame, folder / "map.laz")
+    if log.frame is not None:
+        write_topview_geotiff(semantic_map, log.frame, folder / "topview_class.tif")
+    driven = _while_mapping(trajectory, log)
+    write_topview(semantic_map, folder / "topview.png", driven, title=log.name)
+    write_perspective(semantic_map, folder / "perspective.png", driven)
+    write_viewer(semantic_map, driven, folder / "viewer.html", title=log.name)
+
+
+def _while_mapping(trajectory: Trajectory, log: SensorLog) -> Trajectory:
+    """The part of the trajectory that was driven while there were scans: what a picture of the map shows."""
+    first, last = log.scans[0].stamp, log.scans[-1].stamp
+    inside = (trajectory.stamps >= first - 0.1) & (trajectory.stamps <= last + 0.1)
+    return Trajectory(trajectory.stamps[inside], trajectory.T_map_imu[inside]) if inside.any() else trajectory
 
 
 def write_trajectory_run(

@@ -13,6 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import C, X
 from numpy.typing import NDArray
 
+from factor_graphs.covariances import eliminate
 from factor_graphs.graph import from_values
 from factor_graphs.problem import Fit, Problem
 
@@ -52,9 +53,9 @@ def correct(
     linear.push_back(
         gtsam.JacobianFactor(C(0), np.diag(1 / stddevs), -moved / stddevs, gtsam.noiseModel.Unit.Create(4))
     )
-    # four unknowns that every fix shares are too much for Cholesky's precision
-    tree = linear.eliminateMultifrontal(function=gtsam.EliminateQR)
-    step, sigma = tree.optimize().at(C(0)), np.sqrt(np.diag(tree.marginalCovariance(C(0))))
+    net = eliminate(linear, len(problem.intervals.keyframes), last=(C(0),))
+    root = np.linalg.inv(net.at(net.size() - 1).R())
+    step, sigma = net.optimize().at(C(0)), np.sqrt(np.sum(root**2, axis=1))
     better = Calibration(
         now.time_offset_s + float(step[0]) if with_time else now.time_offset_s,
         now.p_imu_antenna + step[1:] if with_lever else now.p_imu_antenna,

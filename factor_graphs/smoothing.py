@@ -3,13 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject
@@ -84,7 +83,7 @@ def smooth(
 
 def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
-    covariances = _state_covariances(fit, len(T))
+    covariances = keyframe_covariances(fit.graph, fit.values, len(T))
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, covariances[:, :6, :6])
     noise = problem.noise.scaled(fit.inflation)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
@@ -105,12 +104,6 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         iterations=fit.iterations,
         notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
     )
-
-
-def _state_covariances(fit: Fit, k: int) -> Array:
-    marginals = gtsam.Marginals(fit.graph, fit.values)
-    blocks = [marginals.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix() for i in range(k)]
-    return np.array(blocks)
 
 
 def _residuals(trajectory: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:

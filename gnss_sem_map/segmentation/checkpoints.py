@@ -24,6 +24,11 @@ from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet,
 METADATA = "gnss_sem_map"
 """The entry of a safetensors file that holds what we know beyond the tensors, as JSON."""
 
+LOAD_ERRORS = (
+    pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, IndexError,
+)  # fmt: skip
+"""What torch raises for a file that is damaged, or that holds more than tensors."""
+
 WRAPPERS = ("state_dict", "model", "network", "segmenter")
 """Names under which training programs keep the tensors in a checkpoint."""
 
@@ -67,15 +72,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         return _read_safetensors(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (
-        pickle.UnpicklingError,
-        RuntimeError,
-        EOFError,
-        OSError,
-        ValueError,
-        KeyError,
-        AttributeError,
-    ) as error:
+    except LOAD_ERRORS as error:
         raise DataError(
             f"checkpoint {path}: damaged, or holds code ({type(error).__name__}); expected only tensors: save the"
             " state_dict alone, best as safetensors"

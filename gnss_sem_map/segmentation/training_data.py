@@ -1,0 +1,136 @@
+"""Images with their label images, cut, stretched, mirrored and recoloured: what a network learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
+from gnss_sem_map.segmentation.cached import read_class_ids
+
+IGNORE = 255
+"""Truth of a pixel that nothing is learnt from."""
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledImages:
+    """Pairs of image and label files, and how an id becomes a class."""
+
+    pairs: tuple[tuple[Path, Path], ...]
+    class_names: tuple[str, ...]
+    class_of_id: NDArray[np.uint8]
+    """(256,): class index, IGNORE for void."""
+    known: NDArray[np.bool_]
+    """(256,): whether the taxonomy has that id."""
+
+    def read(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """RGB pixels (h, w, 3) and truth (h, w); raises DataError for damaged files, other sizes and unknown ids."""
+        import cv2
+
+        image_file, label_file = self.pairs[index]
+        content = np.frombuffer(image_file.read_bytes(), np.uint8)
+        bgr = cv2.imdecode(content, cv2.IMREAD_COLOR) if content.size else None
+        if bgr is None:
+            raise DataError(f"{image_file}: damaged image; expected PNG or JPEG")
+        ids = read_class_ids(label_file)
+        if bgr.shape[:2] != ids.shape:
+            raise DataError(
+                f"{label_file}: found {ids.shape} pixels, expected {bgr.shape[:2]} as in {image_file.name}"
+            )
+        used = np.flatnonzero(np.bincount(ids.ravel(), minlength=256))
+        if not self.known[used].all():
+            raise DataError(
+                f"{label_file}: found unknown ids {used[~self.known[used]].tolist()}; are they other ids?"
+            )
+        return np.asarray(bgr[:, :, ::-1], np.uint8), self.class_of_id[ids]
+
+
+def labelled_images(
+    folders: Sequence[tuple[Path, Path]], label_set: LabelSet, taxonomy_name: str, ids: str | None = None
+) -> LabelledImages:
+    """Every image of the first folder of each pair with the PNG of the same name in the second.
+
+    Raises DataError when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
+    """
+    pairs: list[tuple[Path, Path]] = []
+    for images, labels in folders:
+        found = sorted(p for p in images.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+        without = [p.name for p in found if not (labels / f"{p.stem}.png").is_file()]
+        if not found or without:
+            raise DataError(
+                f"{images}: found {len(found)} images, {len(without)} without a PNG of the same name in {labels}"
+                f" ({without[:3]}); expected one for each"
+            )
+        pairs.extend((p, labels / f"{p.stem}.png") for p in found)
+    source = taxonomy(taxonomy_name)
+    kind = ids or next(iter(source.ids))
+    if kind not in source.ids:
+        raise ConfigError(
+            f"taxonomy {taxonomy_name!r} has no ids {kind!r}; expected one of {list(source.ids)}"
+        )
+    classes = source.lookup(label_set, kind)
+    class_of_id = np.where(classes >= 0, classes, IGNORE).astype(np.uint8)
+    return LabelledImages(tuple(pairs), (*label_set.names, OTHER), class_of_id, classes >= UNLABELLED)
+
+
+def class_weights(data: LabelledImages, samples: int = 64) -> NDArray[np.float32]:
+    """Weight 1 / ln(1.02 + frequency) of every class, mean one, from at most `samples` images (Paszke et al., 2016)."""
+    chosen = np.unique(np.linspace(0, len(data.pairs) - 1, samples).astype(int))
+    counts = np.zeros(256)
+    for index in chosen:
+        counts += np.bincount(data.read(int(index))[1].ravel(), minlength=256)
+    counts = counts[: len(data.class_names)]
+    if not counts.any():
+        raise DataError(
+            f"{data.pairs[0][1].parent}: found no pixel of any class; expected labels of {data.class_names}"
+        )
+    weights = 1 / np.log(1.02 + counts / counts.sum())
+    return np.asarray(weights / weights.mean(), np.float32)
+
+
+def augmented(
+    pixels: NDArray[np.uint8],
+    truth: NDArray[np.uint8],
+    crop: tuple[int, int],
+    scales: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """A random cut of (width, height) `crop` at a random scale, mirrored every other time, in another light.
+
+    Scales are drawn evenly in their logarithm; what lies outside a small image is black and IGNORE.
+    """
+    import cv2
+
+    width, height = crop
+    scale = float(np.exp(rng.uniform(*np.log(scales))))
+    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
+    pixels = np.asarray(
+        cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    )
+    truth = np.asarray(cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST_EXACT))
+    left = int(rng.integers(0, max(1, size[0] - width + 1)))
+    top = int(rng.integers(0, max(1, size[1] - height + 1)))
+    cut, cut_truth = (
+        pixels[top : top + height, left : left + width],
+        truth[top : top + height, left : left + width],
+    )
+    seen, said = np.zeros((height, width, 3), np.uint8), np.full((height, width), IGNORE, np.uint8)
+    seen[: cut.shape[0], : cut.shape[1]], said[: cut.shape[0], : cut.shape[1]] = cut, cut_truth
+    if rng.random() < 0.5:
+        seen, said = seen[:, ::-1], said[:, ::-1]
+    return np.ascontiguousarray(_in_another_light(seen, rng)), np.ascontiguousarray(said)
+
+
+def _in_another_light(pixels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Another gamma, gain and tint, by one table per channel."""
+    levels = (np.arange(256) / 255.0) ** np.exp(rng.uniform(-0.3, 0.3))
+    gains = np.exp(rng.uniform(-0.2, 0.2) + rng.uniform(-0.06, 0.06, 3))
+    tables = np.rint(np.clip(255 * levels[:, None] * gains, 0, 255)).astype(np.uint8)
+    return np.stack([tables[pixels[:, :, c], c] for c in range(3)], axis=2)

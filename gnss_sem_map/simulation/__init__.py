@@ -1,5 +1,41 @@
-"""A town to drive through: streets, houses, trees, traffic, and the sensors of a recording vehicle."""
+"""A town to drive through, and the sensors of a car that does: KITTI raw drives with exact truth.
 
+`simulate(folder, seconds, seed)` writes one drive; `prepare(seconds, seed)` builds the same in memory, and its
+`scan(k)` and `image(k)` render single frames. The same seed gives the same bytes, whatever the number of threads.
+
+How the drive's sensors measure (KITTI's conventions, where they were measured on the real data):
+
+- A sweep begins behind the car and turns clockwise; a point of azimuth a is of the time
+  start + (0.5 - a / 2 pi) (end - start), and a scan's stamp is the middle. Files hold ring after ring, azimuth
+  increasing from 0. Points are not motion-compensated; whatever moves is hit where it is at the ray's own time.
+- An image is exposed 2 ms after its scan's stamp and stamped 10.5 ms after it: exposure = stamp - 8.5 ms.
+- oxts rows of the drive follow the scans by 10.7 to 22.6 ms, jittering; the `_extract` twin has all rows, 100 Hz.
+  The position is wrong by a slowly drifting 0.35 m (0.5 m up), as `pos_accuracy` says.
+
+What lies in `truth/` in the drive's folder (stamps in s since the first row of the drive's oxts, positions in m, east,
+north, up of the LocalFrame at that row's position):
+
+- `world.json`: `epoch_ns` (Unix time of stamp zero), `lat_deg`, `lon_deg`, `alt_m` (the LocalFrame), `seed`.
+- `trajectory.tum` (100 Hz) and `trajectory_lidar.tum` (at the scans' stamps): T_map_imu, `stamp tx ty tz qx qy qz qw`.
+- `labels/<frame>.label`: SemanticKITTI, uint32 per point: class in the low 16 bits (252 and above for whoever moves at
+  any time of the drive, also while waiting), instance in the high ones.
+- `train_ids/<frame>.png`: the class image, Cityscapes trainIds, 255 void (parking bays). Sky is 10.
+- `single_frame/<frame>.label`: what that image alone says of each point it shows (40 48 10 50 70), 0 elsewhere.
+- `vehicles.csv`: everybody within 120 m at every scan's stamp: middle of the bottom, yaw, size, moving or not.
+"""
+
+from gnss_sem_map.simulation.camera import Camera as Camera
+from gnss_sem_map.simulation.camera import SimulatedImage as SimulatedImage
+from gnss_sem_map.simulation.camera import render_image as render_image
+from gnss_sem_map.simulation.corruption import corrupt_class_image as corrupt_class_image
+from gnss_sem_map.simulation.corruption import write_corrupted_labels as write_corrupted_labels
 from gnss_sem_map.simulation.drive import Simulation as Simulation
 from gnss_sem_map.simulation.drive import prepare as prepare
 from gnss_sem_map.simulation.drive import simulate as simulate
+from gnss_sem_map.simulation.lidar import Lidar as Lidar
+from gnss_sem_map.simulation.lidar import SimulatedScan as SimulatedScan
+from gnss_sem_map.simulation.lidar import render_scan as render_scan
+from gnss_sem_map.simulation.town import Town as Town
+from gnss_sem_map.simulation.town import build_town as build_town
+from gnss_sem_map.simulation.world import Mover as Mover
+from gnss_sem_map.simulation.world import World as World

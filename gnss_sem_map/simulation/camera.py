@@ -1,16 +1,16 @@
 """A simulated colour camera: sun, shadows, textures, haze, and a sensor with noise and automatic exposure."""
 
+import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import kernel
-from gnss_sem_map.simulation.ground import FAR, Floats, to_town
+from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
+from gnss_sem_map.simulation.ground import FAR, to_town
 from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, value_noise
-from gnss_sem_map.simulation.raycast import GROUND, KERB, cast_ray
+from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray
 from gnss_sem_map.simulation.surfaces import TRAIN_IDS
 from gnss_sem_map.simulation.textures import ground_colour, thing_colour
 from gnss_sem_map.simulation.world import World
@@ -18,7 +18,8 @@ from gnss_sem_map.simulation.world import World
 _REACH_M = 260.0
 _SUN = (1.75, 1.62, 1.42)
 _SKY = (0.50, 0.58, 0.72)
-_DISPLAY = np.round(255.0 * np.linspace(0.0, 1.0, 4096) ** (1.0 / 2.2)).astype(np.uint8)
+_TONES = np.linspace(0.0, 1.0, 4096) ** (1.0 / 2.2)
+_DISPLAY = np.round(255.0 * (0.55 * _TONES + 0.45 * _TONES**2 * (3.0 - 2.0 * _TONES))).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class SimulatedImage:
 
 
 @kernel
-def _sky(dx, dy, dz, sx, sy, sz):
+def _sky(dx: float, dy: float, dz: float, sx: float, sy: float, sz: float) -> Triple:
     """Blue that pales towards the horizon, a few clouds, and the glow around the sun."""
     up = max(dz, 0.02)
     pale = 1.0 / (1.0 + 6.0 * up)
@@ -58,23 +59,48 @@ def _sky(dx, dy, dz, sx, sy, sz):
 
 
 @kernel
-def _light(scene, x, y, z, nx, ny, nz, on_ground, sun):
-    """Light that arrives at a point: from the sky, bounced from the ground, and from the sun unless it is hidden."""
+def _openness(
+    scene: Scene, thing: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, sun: Triple
+) -> int:
+    """1 where the sun shines, plus 2 where the sky is open: a car above the ground hides it."""
+    x, y, z = x + 0.02 * nx, y + 0.02 * ny, z + 0.02 * nz
+    open_sky = thing >= 0 or cast_ray(scene, 1.3, True, 0.5, x, y, z, 0.0, 0.0, 1.0)[0] >= FAR
+    facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
+    sunny = facing > 0.0 and cast_ray(scene, 70.0, True, 0.5, x, y, z, sun[0], sun[1], sun[2])[0] >= FAR
+    return (1 if sunny else 0) + (2 if open_sky else 0)
+
+
+@kernel
+def _light(openness: int, nx: float, ny: float, nz: float, sun: Triple) -> Triple:
+    """Light that arrives at a point: from the sky, bounced from the ground, and from the sun."""
     sky = 0.5 + 0.5 * nz
     bounce = 0.16 * (1.0 - sky)
     r, g, b = _SKY[0] * sky + bounce * 1.1, _SKY[1] * sky + bounce, _SKY[2] * sky + bounce * 0.9
-    x, y, z = x + 0.02 * nx, y + 0.02 * ny, z + 0.02 * nz
-    if on_ground and cast_ray(scene, 1.3, True, 0.5, x, y, z, 0.0, 0.0, 1.0)[0] < FAR:
-        r, g, b = 0.35 * r, 0.35 * g, 0.35 * b  # under a car
-    facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
-    if facing > 0.0 and cast_ray(scene, 70.0, True, 0.5, x, y, z, sun[0], sun[1], sun[2])[0] >= FAR:
+    if openness < 2:
+        r, g, b = 0.35 * r, 0.35 * g, 0.35 * b
+    if openness % 2 == 1:
+        facing = max(0.0, nx * sun[0] + ny * sun[1] + nz * sun[2])
         r, g, b = r + facing * _SUN[0], g + facing * _SUN[1], b + facing * _SUN[2]
     return r, g, b
 
 
 @kernel
-def _expose(scene, T, lens, sun, linear, kinds, depth, things):
-    """Trace one ray per pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it."""
+def _expose(
+    scene: Scene,
+    T: Floats,
+    lens: Triple,
+    sun: Triple,
+    linear: Singles,
+    kinds: Bytes,
+    depth: Singles,
+    things: Integers,
+    shapes: Integers,
+    light: npt.NDArray[np.int8],
+) -> None:
+    """Trace one ray per pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it.
+
+    Shadows are traced once for two neighbouring pixels where these show the same shape.
+    """
     focal, cu, cv = lens
     ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
     for v in range(linear.shape[0]):
@@ -91,7 +117,7 @@ def _expose(scene, T, lens, sun, linear, kinds, depth, things):
                 continue
             surface, kind, n, p, clump = surface_at(scene, thing, shape, 0.5, ox, oy, oz, dx, dy, dz, t)
             near = 1.0 / (1.0 + (t / 18.0) ** 2)
-            mirror, on_ground = 0.0, thing == GROUND or thing == KERB
+            mirror, on_ground = 0.0, thing in (GROUND, KERB)
             if on_ground:
                 a, c = to_town(scene.ground, p[0], p[1])
                 r, g, b = ground_colour(surface, a, c, near)
@@ -102,8 +128,14 @@ def _expose(scene, T, lens, sun, linear, kinds, depth, things):
                     scene.shapes, shape, thing, scene.colours[thing, 0], scene.colours[thing, 1],
                     scene.colours[thing, 2], p[0], p[1], p[2], local_x, local_y, n[2], clump, near,
                 )  # fmt: skip
-            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            lr, lg, lb = _light(scene, x, y, z, n[0], n[1], n[2], on_ground and kind > 0, sun)
+            things[v, u], shapes[v, u] = thing, shape
+            c = u - u % 2
+            if u > c and things[v, c] == thing and shapes[v, c] == shape and light[v, c] >= 0:
+                light[v, u] = light[v, c]
+            else:
+                x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+                light[v, u] = _openness(scene, thing, x, y, z, n[0], n[1], n[2], sun)
+            lr, lg, lb = _light(light[v, u], n[0], n[1], n[2], sun)
             r, g, b = r * lr, g * lg, b * lb
             if mirror > 0.0:
                 facing = dx * n[0] + dy * n[1] + dz * n[2]
@@ -115,32 +147,44 @@ def _expose(scene, T, lens, sun, linear, kinds, depth, things):
             linear[v, u, 0] = r + haze * (0.78 - r)
             linear[v, u, 1] = g + haze * (0.83 - g)
             linear[v, u, 2] = b + haze * (0.90 - b)
-            kinds[v, u], depth[v, u], things[v, u] = kind, t * norm, thing
+            kinds[v, u], depth[v, u] = kind, t * norm
 
 
 @kernel
-def _develop(linear, gain, key, display, rgb):
-    """From light to bytes: vignetting, shot and read noise, the display curve."""
+def _develop(linear: Singles, gain: float, key: int, display: Bytes, rgb: Bytes) -> None:
+    """From light to bytes: the blur of the optics, vignetting, shot and read noise, the display curve."""
     height, width, _ = linear.shape
     for v in range(height):
+        above, below = max(v - 1, 0), min(v + 1, height - 1)
         for u in range(width):
+            left, right = max(u - 1, 0), min(u + 1, width - 1)
             x, y = (u - 0.5 * width) / width, (v - 0.5 * height) / width
             scale = gain * (1.0 - 0.45 * (x * x + y * y))
             for c in range(3):
-                light = max(0.0, linear[v, u, c] * scale)
+                middle = linear[above, u, c] + 4.0 * linear[v, u, c] + linear[below, u, c]
+                before = linear[above, left, c] + 4.0 * linear[v, left, c] + linear[below, left, c]
+                behind = linear[above, right, c] + 4.0 * linear[v, right, c] + linear[below, right, c]
+                light = max(0.0, scale * (before + 4.0 * middle + behind) / 36.0)
                 light += gaussian(key, v, u, c) * (0.0025 + 0.012 * np.sqrt(light))
                 rgb[v, u, c] = display[int(min(4095.0, max(0.0, light * 4095.0)))]
 
 
-def sun_direction(seed: int) -> Floats:
+def sun_direction(seed: int) -> Triple:
     """Unit vector towards the sun of a seed, in the map's axes."""
     rng = np.random.default_rng([seed, 2])
-    azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(38.0, 58.0))
-    return np.array([np.cos(azimuth) * np.cos(height), np.sin(azimuth) * np.cos(height), np.sin(height)])
+    azimuth, height = float(rng.uniform(0, 2 * np.pi)), float(np.radians(rng.uniform(38.0, 58.0)))
+    level = math.cos(height)
+    return math.cos(azimuth) * level, math.sin(azimuth) * level, math.sin(height)
 
 
 def render_image(
-    world: World, T_map_camera: Floats, stamp: float, *, camera: Camera | None = None, seed: int = 0, frame: int = 0
+    world: World,
+    T_map_camera: Floats,
+    stamp: float,
+    *,
+    camera: Camera | None = None,
+    seed: int = 0,
+    frame: int = 0,
 ) -> SimulatedImage:
     """What the camera at `T_map_camera` (4, 4; x right, y down, z forward) sees at a moment (s).
 
@@ -149,15 +193,25 @@ def render_image(
     camera = camera or Camera()
     size = (camera.height, camera.width)
     linear, kinds = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
-    depth, things = np.zeros(size, np.float32), np.full(size, GROUND, np.int32)
+    depth, light = np.zeros(size, np.float32), np.full(size, -1, np.int8)
+    things, shapes = np.full(size, GROUND, np.int32), np.full(size, -1, np.int32)
     lens = (camera.focal_px, camera.centre_u_px, camera.centre_v_px)
-    sun = tuple(float(s) for s in sun_direction(seed))
-    _expose(world.scene(stamp, stamp), T_map_camera, lens, sun, linear, kinds, depth, things)
-    linear = cv2.GaussianBlur(linear, (3, 3), 0.55)
+    _expose(
+        world.scene(stamp, stamp),
+        T_map_camera,
+        lens,
+        sun_direction(seed),
+        linear,
+        kinds,
+        depth,
+        things,
+        shapes,
+        light,
+    )
     # the meter looks at the lower half and follows slowly changing light and its own hunting
-    light = float(linear[size[0] // 3 :: 4, ::4].mean())
-    gain = 0.33 * (0.42 / max(light, 0.05)) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))
+    brightness = max(float(linear[size[0] // 3 :: 4, ::4].mean()), 0.05)
+    gain = 0.62 * (0.42 / brightness) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))
     rgb = np.zeros((*size, 3), np.uint8)
-    _develop(linear, gain, np.int64(seed) * 1_000_003 + frame + 500_009, _DISPLAY, rgb)
+    _develop(linear, gain, seed * 1_000_003 + frame + 500_009, _DISPLAY, rgb)
     instances = np.where(things >= 0, world.instances[things], 0).astype(np.uint16)
     return SimulatedImage(rgb, TRAIN_IDS[kinds], depth, instances)

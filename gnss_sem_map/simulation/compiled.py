@@ -1,12 +1,30 @@
-"""How the simulator's loops are compiled: once, kept on disk, without the interpreter's lock.
+"""How the simulator's loops are compiled, and the arrays they take.
 
-They allocate nothing, so reference counts are switched off: counting alone would double the time of a ray and make
-threads wait for each other. No fastmath: the same operations in the same order give the same bits everywhere.
+They are compiled once, kept on disk, and run without the interpreter's lock. They allocate nothing, so reference counts
+are switched off: counting alone would double the time of a ray and make threads wait for each other. No fastmath: the
+same operations in the same order give the same bits everywhere.
 """
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final, Protocol, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 from numba import njit
 
-kernel: Final = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
-inlined: Final = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always")
+Floats = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
+Bytes = npt.NDArray[np.uint8]
+Triple = tuple[float, float, float]
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+class _Compile(Protocol):
+    def __call__(self, function: _F, /) -> _F: ...
+
+
+_OPTIONS: Final[dict[str, Any]] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
+kernel: Final[_Compile] = njit(**_OPTIONS)
+inlined: Final[_Compile] = njit(**_OPTIONS, inline="always")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,19 +16,19 @@ import numpy.typing as npt
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
-from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
 from gnss_sem_map.simulation.oxts import DATAFORMAT, oxts_rows, row_text, sweep_rows
 from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_imu, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.town import build_town
+from gnss_sem_map.simulation.tracklets import write_tracklets
 from gnss_sem_map.simulation.traffic import EARLY_S, LATE_S, drive_through
 from gnss_sem_map.simulation.truth import (
     seen_alone,
+    seen_boxes,
     write_trajectory,
     write_vehicles,
-    seen_boxes,
 )
-from gnss_sem_map.simulation.tracklets import write_tracklets
 from gnss_sem_map.simulation.world import World
 
 DATE = "2026_04_18"
@@ -87,12 +88,32 @@ class Simulation:
         T_map_camera = self.world.ego.poses([moment])[0] @ camera_in_imu(self.camera)
         return render_image(self.world, T_map_camera, moment, camera=self.camera, seed=self.seed, frame=frame)
 
+    def project(
+        self, frame: int, scan: SimulatedScan
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Floats]:
+        """Pixels u, v and depths of a scan's points in the frame's image: each point where it was at its own stamp,
+        seen from where the camera was at the exposure."""
+        start, end = self.sweeps[frame]
+        columns, column = np.unique(scan.fractions, return_inverse=True)
+        stamps = np.append(start + columns * (end - start), self.stamps[frame] + EXPOSURE_AFTER_SCAN_S)
+        T_map_lidar = self.world.ego.poses(stamps) @ T_IMU_LIDAR
+        T = camera_in_lidar(self.camera) @ np.linalg.inv(T_map_lidar[-1]) @ T_map_lidar[:-1]
+        p = scan.points[:, :3].astype(np.float64)
+        x, y, z = (np.einsum("nij,nj->ni", T[column, :3, :3], p) + T[column, :3, 3]).T
+        f, ahead = self.camera.focal_px, np.maximum(z, 1e-3)
+        u = np.round(f * x / ahead + self.camera.centre_u_px).astype(np.int64)
+        return u, np.round(f * y / ahead + self.camera.centre_v_px).astype(np.int64), z
 
-def prepare(seconds: float, seed: int, lidar: Lidar | None = None, camera: Camera | None = None) -> Simulation:
+
+def prepare(
+    seconds: float, seed: int, lidar: Lidar | None = None, camera: Camera | None = None
+) -> Simulation:
     """Build the town, let everybody drive, and let the navigation unit measure; renders nothing yet."""
     frames = round(10.0 * seconds)
     if frames < 3:
-        raise DataError(f"a drive of {seconds} s has {frames} scans, expected at least 3; ask for 0.3 s or more")
+        raise DataError(
+            f"a drive of {seconds} s has {frames} scans, expected at least 3; ask for 0.3 s or more"
+        )
     town = build_town(seed, crossings=4 + int(seconds / 7.0))
     town, ego, movers = drive_through(town, seconds, seed)
     rng = np.random.default_rng([seed, 5])
@@ -132,7 +153,9 @@ def simulate(
     frames = len(simulation.sweeps)
     seen: list[npt.NDArray[np.uint16]] = []
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        for done, instances in enumerate(pool.map(lambda k: _write_frame(simulation, k, partial), range(frames)), 1):
+        for done, instances in enumerate(
+            pool.map(lambda k: _write_frame(simulation, k, partial), range(frames)), 1
+        ):
             seen.append(instances)
             if progress is not None:
                 progress(done, frames)
@@ -147,7 +170,13 @@ def _twin(drive: Path) -> Path:
 
 def _write_still(simulation: Simulation, partial: Path, drive: Path) -> None:
     """Calibration, oxts, stamps, and the truth that needs no rendering."""
-    for name in ("velodyne_points/data", "image_02/data", "truth/labels", "truth/train_ids", "truth/single_frame"):
+    for name in (
+        "velodyne_points/data",
+        "image_02/data",
+        "truth/labels",
+        "truth/train_ids",
+        "truth/single_frame",
+    ):
         (partial / name).mkdir(parents=True)
     write_calibration(drive.parent, simulation.camera)
     _write_oxts(partial, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
@@ -189,15 +218,13 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.
     (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
     _write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
     _write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids)
-    start, end = simulation.sweeps[k]
-    T = simulation.world.ego.poses([*(start + scan.fractions * (end - start)), simulation.stamps[k] + EXPOSURE_AFTER_SCAN_S])
-    alone = seen_alone(scan, image, T[:-1], T[-1], T_IMU_LIDAR, camera_in_lidar(simulation.camera), simulation.camera)
+    alone = seen_alone(image, *simulation.project(k, scan))
     (drive / "truth" / "single_frame" / f"{name}.label").write_bytes(alone.astype("<u4").tobytes())
     numbers, counts = np.unique(image.instances, return_counts=True)
     return numbers[(numbers > 0) & (counts >= 60)]
 
 
-def _write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
+def _write_png(path: Path, pixels: npt.NDArray[Any]) -> None:
     ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:
         raise DataError(f"{path}: the image could not be encoded")

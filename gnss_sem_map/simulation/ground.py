@@ -1,7 +1,8 @@
 """The ground of the town: a gently curved sheet with streets, and blocks raised by a kerb.
 
-Town axes (u, v) are the map's east and north turned by `heading`. Streets run along lines u = const and v = const; what
-they leave are the blocks, rectangles with rounded corners. The height is a quadratic form, so a ray meets it in closed form.
+Town axes (u, v) are the map's east and north turned by `heading`. Streets run along lines u = const and
+v = const; what they leave are the blocks, rectangles with rounded corners. The height is a quadratic form, so that a
+ray meets it in closed form.
 """
 
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import inlined, kernel
+from gnss_sem_map.simulation.compiled import Floats, inlined, kernel
 from gnss_sem_map.simulation.noise import uniform
 from gnss_sem_map.simulation.surfaces import Surface
 
@@ -17,8 +18,6 @@ FAR = 1e9
 _OUTSKIRTS_M = 5000.0  # the outermost blocks go on to here
 _ASPHALT, _MARKING, _PAVING = int(Surface.ASPHALT), int(Surface.MARKING), int(Surface.PAVING)
 _KERB, _GRASS, _SKY = int(Surface.KERB), int(Surface.GRASS), int(Surface.SKY)
-
-Floats = npt.NDArray[np.float64]
 
 
 class Ground(NamedTuple):
@@ -38,14 +37,14 @@ class Ground(NamedTuple):
 
 
 @inlined
-def to_town(ground, x, y):
+def to_town(ground: Ground, x: float, y: float) -> tuple[float, float]:
     """Town coordinates (u, v) of a point of the map."""
     a, b = x - ground.origin[0], y - ground.origin[1]
     return ground.heading[0] * a + ground.heading[1] * b, ground.heading[0] * b - ground.heading[1] * a
 
 
 @inlined
-def street_height(ground, x, y):
+def street_height(ground: Ground, x: float, y: float) -> float:
     """Height of the street's sheet, without kerbs."""
     q = ground.curvature
     return (
@@ -54,14 +53,14 @@ def street_height(ground, x, y):
 
 
 @inlined
-def height_gradient(ground, x, y):
+def height_gradient(ground: Ground, x: float, y: float) -> tuple[float, float]:
     """Slope of the sheet along x and y."""
     q = ground.curvature
     return ground.slope[0] + q[0] * x + q[1] * y, ground.slope[1] + q[1] * x + q[2] * y
 
 
 @inlined
-def _span(streets, x):
+def _span(streets: Floats, x: float) -> tuple[int, float, float]:
     """The gap between streets that x falls in: its number, and where its kerbs are."""
     n = 0
     while n < streets.shape[0] and streets[n, 0] <= x:
@@ -72,7 +71,7 @@ def _span(streets, x):
 
 
 @kernel
-def inside_block(ground, u, v):
+def inside_block(ground: Ground, u: float, v: float) -> tuple[float, int]:
     """Signed distance to the kerb, positive on the block; also the block's number."""
     i, u0, u1 = _span(ground.streets_u, u)
     j, v0, v1 = _span(ground.streets_v, v)
@@ -85,7 +84,7 @@ def inside_block(ground, u, v):
 
 
 @kernel
-def ground_height(ground, x, y):
+def ground_height(ground: Ground, x: float, y: float) -> float:
     """Height of the ground, kerbs included."""
     u, v = to_town(ground, x, y)
     inside, _ = inside_block(ground, u, v)
@@ -93,7 +92,9 @@ def ground_height(ground, x, y):
 
 
 @kernel
-def _sheet_hit(ground, lift, ox, oy, oz, dx, dy, dz):
+def _sheet_hit(
+    ground: Ground, lift: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> float:
     """Distance along the ray to the sheet raised by `lift` (the smaller positive root of a quadratic)."""
     q = ground.curvature
     gx, gy = height_gradient(ground, ox, oy)
@@ -105,7 +106,8 @@ def _sheet_hit(ground, lift, ox, oy, oz, dx, dy, dz):
     discriminant = b * b - 4.0 * a * c
     if discriminant < 0.0:
         return FAR
-    half = -0.5 * (b + (np.sqrt(discriminant) if b >= 0.0 else -np.sqrt(discriminant)))
+    root = float(np.sqrt(discriminant))
+    half = -0.5 * (b + (root if b >= 0.0 else -root))
     first, second = half / a, (c / half if half != 0.0 else FAR)
     if first > second:
         first, second = second, first
@@ -115,7 +117,9 @@ def _sheet_hit(ground, lift, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def hit_ground(ground, ox, oy, oz, dx, dy, dz):
+def hit_ground(
+    ground: Ground, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> tuple[float, bool]:
     """Where a ray from above meets the ground: distance, and whether it is the kerb's face.
 
     Over the block's level the ray either lands on the block or goes on to the road, and on this stretch it may run
@@ -145,7 +149,7 @@ def hit_ground(ground, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def _nearest(streets, x):
+def _nearest(streets: Floats, x: float) -> int:
     """The street whose centre line is nearest."""
     nearest = 0
     for k in range(streets.shape[0]):
@@ -155,7 +159,7 @@ def _nearest(streets, x):
 
 
 @kernel
-def _marked(along, across, half, crossing):
+def _marked(along: float, across: float, half: float, crossing: Floats) -> bool:
     """Whether paint covers a point of a street: along it, and across from its centre line (right is negative)."""
     nearest = _nearest(crossing, along)
     to_crossing = abs(along - crossing[nearest, 0]) - crossing[nearest, 1]
@@ -163,22 +167,20 @@ def _marked(along, across, half, crossing):
         return False
     lateral = abs(across)
     if to_crossing < 7.2:  # the zebra
-        return lateral < half - 0.4 and (across / 1.0 - np.floor(across / 1.0)) < 0.5
+        return lateral < half - 0.4 and across - float(np.floor(across)) < 0.5
     if to_crossing < 8.0:
         return False
     if to_crossing < 8.4:  # the stop line, for those who come towards the crossing on the right
         towards = along < crossing[nearest, 0]
         return (across < -0.15 if towards else across > 0.15) and lateral < half - 2.2
     if lateral < 0.07:
-        return to_crossing < 22.0 or (along / 6.0 - np.floor(along / 6.0)) < 0.5
+        return to_crossing < 22.0 or along / 6.0 - float(np.floor(along / 6.0)) < 0.5
     # the edge of the parking lane, worn in places
-    return (
-        abs(lateral - (half - 2.15)) < 0.06 and uniform(7, np.int64(np.floor(along / 0.7)), nearest, 0) < 0.9
-    )
+    return abs(lateral - (half - 2.15)) < 0.06 and uniform(7, int(np.floor(along / 0.7)), nearest, 0) < 0.9
 
 
 @kernel
-def ground_surface(ground, x, y, kerb_face):
+def ground_surface(ground: Ground, x: float, y: float, kerb_face: bool) -> int:
     """What the ground is made of at a point that a ray met."""
     if kerb_face:
         return _KERB
@@ -192,7 +194,7 @@ def ground_surface(ground, x, y, kerb_face):
         for p in range(ground.patch_start[block], ground.patch_start[block + 1]):
             inside_u = ground.patches[p, 0] <= u < ground.patches[p, 1]
             if inside_u and ground.patches[p, 2] <= v < ground.patches[p, 3]:
-                return np.int64(ground.patches[p, 4])
+                return int(ground.patches[p, 4])
         return _GRASS
     i, j = _nearest(ground.streets_u, u), _nearest(ground.streets_v, v)
     from_u, from_v = u - ground.streets_u[i, 0], v - ground.streets_v[j, 0]

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from gnss_sem_map.simulation.compiled import kernel
+from gnss_sem_map.simulation.compiled import Triple, kernel
 from gnss_sem_map.simulation.ground import ground_surface, height_gradient
-from gnss_sem_map.simulation.raycast import GROUND, KERB, into_thing
+from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, into_thing
 from gnss_sem_map.simulation.shapes import shape_normal
 from gnss_sem_map.simulation.surfaces import Kind, Surface
 
@@ -21,10 +21,22 @@ for _surface, _kind in {
 
 
 @kernel
-def surface_at(scene, thing, shape, fraction, ox, oy, oz, dx, dy, dz, t):
+def surface_at(
+    scene: Scene,
+    thing: int,
+    shape: int,
+    fraction: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    t: float,
+) -> tuple[int, int, Triple, Triple, float]:
     """What a ray hit after a distance t: surface, kind, normal in the map, place in the model, clump of leaves."""
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-    if thing == GROUND or thing == KERB:
+    if thing in (GROUND, KERB):
         surface = ground_surface(scene.ground, x, y, thing == KERB)
         gx, gy = height_gradient(scene.ground, x, y)
         nx, ny, nz = -gx, -gy, 1.0

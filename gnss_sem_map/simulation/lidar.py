@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import kernel
-from gnss_sem_map.simulation.ground import FAR, Floats
+from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, kernel
+from gnss_sem_map.simulation.ground import FAR
 from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, uniform
-from gnss_sem_map.simulation.raycast import GROUND, cast_ray
+from gnss_sem_map.simulation.raycast import GROUND, Scene, cast_ray
 from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
 from gnss_sem_map.simulation.textures import window_at
 from gnss_sem_map.simulation.world import World
@@ -24,7 +24,9 @@ _CABIN, _FACADE = int(Surface.CABIN), int(Surface.FACADE)
 
 
 def _hdl_64e() -> Floats:
-    return np.radians(np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.87, -24.9, 32)]))
+    return np.asarray(
+        np.radians(np.concatenate([np.linspace(2.0, -8.33, 32), np.linspace(-8.87, -24.9, 32)]))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,19 @@ class SimulatedScan:
 
 
 @kernel
-def _sweep(scene, T, directions, fractions, reflectances, lidar, key, ranges, intensities, kinds, things):
+def _sweep(
+    scene: Scene,
+    T: Floats,
+    directions: Floats,
+    fractions: Floats,
+    reflectances: Floats,
+    lidar: tuple[float, float, float, float],
+    key: int,
+    ranges: Floats,
+    intensities: Floats,
+    kinds: Bytes,
+    things: Integers,
+) -> None:
     """Cast all rays of a sweep: rings by columns. `lidar`: reach, blind range, range noise, dropout."""
     reach, blind, noise, dropout = lidar
     for ring in range(directions.shape[0]):
@@ -108,12 +122,14 @@ def render_scan(
     scene, fractions = world.scene(start, end), lidar.fractions
     T = world.ego.poses(start + fractions * (end - start)) @ T_imu_lidar
     a, e = lidar.azimuths[None, :], lidar.elevations[:, None]
-    directions = np.stack(np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1)
+    directions = np.stack(
+        np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1
+    )
     shape = directions.shape[:2]
     ranges, intensities = np.zeros(shape), np.zeros(shape)
     kinds, things = np.zeros(shape, np.uint8), np.full(shape, GROUND, np.int32)
     numbers = (lidar.range_m, lidar.blind_m, lidar.range_stddev_m, lidar.dropout)
-    key = np.int64(seed) * 1_000_003 + frame
+    key = seed * 1_000_003 + frame
     _sweep(scene, T, directions, fractions, REFLECTANCES, numbers, key, ranges, intensities, kinds, things)
     hit = ranges > 0
     xyz = np.round(ranges[hit][:, None] * directions[hit], 3)

@@ -1,14 +1,13 @@
-"""Models of what stands in a town, each a handful of shapes in its own axes (x forward or along, y left or inwards, z up)."""
+"""Models of what stands in a town: a handful of shapes each, x forward or along, y left or inwards, z up."""
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.shapes import SHAPE_COLUMNS, Form
 from gnss_sem_map.simulation.surfaces import Kind, Surface
 
-Floats = npt.NDArray[np.float64]
 Row = list[float]
 
 
@@ -21,7 +20,9 @@ class Model:
 
     def __post_init__(self) -> None:
         if self.shapes.ndim != 2 or self.shapes.shape[1] != SHAPE_COLUMNS:
-            raise ValueError(f"model {self.name}: shapes are {self.shapes.shape}, expected (k, {SHAPE_COLUMNS})")
+            raise ValueError(
+                f"model {self.name}: shapes are {self.shapes.shape}, expected (k, {SHAPE_COLUMNS})"
+            )
 
     @property
     def bounds(self) -> Floats:
@@ -99,7 +100,7 @@ def car(name: str, length: float, width: float, height: float, bonnet: float, bo
         _block((-x - 0.03, x + 0.03), (-y + 0.06, y - 0.06), (0.26, 0.42), Surface.RUBBER, kind),
         _block((x - 0.1, x + 0.04), (-0.26, 0.26), (0.36, 0.47), Surface.MARKING, kind),
         _block((-x - 0.04, -x + 0.1), (-0.26, 0.26), (0.44, 0.55), Surface.MARKING, kind),
-        *_lamps(x - 0.02, y - 0.06, (0.56, 0.70), kind),
+        *_lamps(x - 0.005, y - 0.06, (0.56, 0.70), kind),
         *_wheels(0.30 * length, y - 0.09, 0.31, kind),
     ]
     for side in (-1.0, 1.0):  # mirrors
@@ -126,7 +127,7 @@ def van() -> Model:
             _block((-x - 0.01, -x + 0.2), (-0.72, 0.72), (1.15, 1.75), Surface.CABIN, kind, (0.0, 0.05, 0.0)),
             _block((-x - 0.03, x + 0.03), (-y + 0.05, y - 0.05), (0.30, 0.46), Surface.RUBBER, kind),
             _block((-x - 0.04, -x + 0.1), (-0.26, 0.26), (0.50, 0.61), Surface.MARKING, kind),
-            *_lamps(x - 0.03, y - 0.05, (0.72, 0.92), kind),
+            *_lamps(x, y - 0.05, (0.72, 0.92), kind),
             *_wheels(1.55, y - 0.09, 0.34, kind),
         ],
     )
@@ -143,7 +144,7 @@ def truck() -> Model:
             _block((1.85, 3.7), (-y + 0.08, y - 0.08), (0.45, 1.55), Surface.PAINT, kind),
             _block((1.85, 3.7), (-y + 0.08, y - 0.08), (1.55, 2.5), Surface.CABIN, kind, (0.30, 0.0, 0.06)),
             _block((1.90, 3.35), (-y + 0.16, y - 0.16), (2.5, 2.62), Surface.PAINT, kind),
-            *_lamps(3.68, y - 0.12, (0.72, 0.92), kind),
+            *_lamps(3.7, y - 0.12, (0.72, 0.92), kind),
             *_wheels(2.55, y - 0.17, 0.46, kind),
         ],
     )
@@ -193,7 +194,7 @@ def cyclist() -> Model:
 
 def tree(name: str, rng: np.random.Generator, height: float, reach: float) -> Model:
     """A trunk, limbs, and a crown of a few overlapping volumes with gaps between the leaves."""
-    clear, girth = 0.36 * height, 0.035 * height * rng.uniform(0.75, 1.1)
+    clear, girth = 0.36 * height, 0.022 * height * rng.uniform(0.75, 1.1)
     crown_top, middle = 0.5 * (height - clear), 0.5 * (height + clear)
     rows = [
         _round(
@@ -204,7 +205,7 @@ def tree(name: str, rng: np.random.Generator, height: float, reach: float) -> Mo
             Kind.TRUNK,
         )
     ]
-    leaves = (float(rng.uniform(0.40, 0.52)), 0.34)
+    leaves = (float(rng.uniform(0.42, 0.54)), 0.30)
     rows.append(
         _round(
             Form.ELLIPSOID,

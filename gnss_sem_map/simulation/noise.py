@@ -15,7 +15,7 @@ _LOW16 = np.uint64(0xFFFF)
 
 
 @kernel
-def hash_bits(seed, i, j, k):
+def hash_bits(seed: int, i: int, j: int, k: int) -> np.uint64:
     """64 well mixed bits of four integers (the finaliser of SplitMix64, Steele et al. 2014)."""
     x = (np.uint64(seed) + _K1) * _K2 + np.uint64(i) * _K1 + np.uint64(j) * _K3 + np.uint64(k) * _K4
     x = (x ^ (x >> _S30)) * _M1
@@ -24,13 +24,13 @@ def hash_bits(seed, i, j, k):
 
 
 @kernel
-def uniform(seed, i, j, k):
+def uniform(seed: int, i: int, j: int, k: int) -> float:
     """A number in [0, 1) that belongs to these four integers."""
     return np.float64(hash_bits(seed, i, j, k) >> _S11) * (1.0 / 9007199254740992.0)
 
 
 @kernel
-def gaussian(seed, i, j, k):
+def gaussian(seed: int, i: int, j: int, k: int) -> float:
     """A number of mean 0 and variance 1: the sum of four uniforms, so within 3.5 and free of libm."""
     bits = hash_bits(seed, i, j, k)
     total = 0.0
@@ -41,12 +41,13 @@ def gaussian(seed, i, j, k):
 
 
 @kernel
-def value_noise(seed, x, y):
+def value_noise(seed: int, x: float, y: float) -> float:
     """Smooth noise in [0, 1): the lattice has unit spacing."""
     fx, fy = np.floor(x), np.floor(y)
-    i, j = np.int64(fx), np.int64(fy)
+    i, j = int(fx), int(fy)
     a, b = x - fx, y - fy
     a, b = a * a * (3.0 - 2.0 * a), b * b * (3.0 - 2.0 * b)
     low = uniform(seed, i, j, 0) * (1.0 - a) + uniform(seed, i + 1, j, 0) * a
     high = uniform(seed, i, j + 1, 0) * (1.0 - a) + uniform(seed, i + 1, j + 1, 0) * a
-    return low * (1.0 - b) + high * b
+    blend: float = low * (1.0 - b) + high * b
+    return blend

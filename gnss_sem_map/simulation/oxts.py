@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.simulation import Motion, simulate_gnss, simulate_imu
-from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.compiled import Floats
 
 POSITION_STDDEVS_M = (0.35, 0.35, 0.5)
 NOISE = ImuNoise(
@@ -25,10 +25,38 @@ NOISE = ImuNoise(
     accelerometer_bias_stddev=0.01,
     gyroscope_bias_stddev=2e-4,
 )
-COLUMNS = (
-    "lat lon alt roll pitch yaw vn ve vf vl vu ax ay az af al au wx wy wz wf wl wu"
-    " pos_accuracy vel_accuracy navstat numsats posmode velmode orimode"
-).split()
+COLUMNS = [
+    "lat",
+    "lon",
+    "alt",
+    "roll",
+    "pitch",
+    "yaw",
+    "vn",
+    "ve",
+    "vf",
+    "vl",
+    "vu",
+    "ax",
+    "ay",
+    "az",
+    "af",
+    "al",
+    "au",
+    "wx",
+    "wy",
+    "wz",
+    "wf",
+    "wl",
+    "wu",
+    "pos_accuracy",
+    "vel_accuracy",
+    "navstat",
+    "numsats",
+    "posmode",
+    "velmode",
+    "orimode",
+]
 
 _MEANINGS = {
     "lat": "latitude (deg)", "lon": "longitude (deg)", "alt": "altitude (m)",
@@ -51,7 +79,12 @@ DATAFORMAT = "".join(f"{name + ':':<14} {_MEANINGS[name]}\n" for name in COLUMNS
 def oxts_rows(motion: Motion, stamps: Floats, frame: LocalFrame, rng: np.random.Generator) -> Floats:
     """The 30 columns at these stamps (100 Hz): (n, 30)."""
     fixes = simulate_gnss(
-        motion, stamps, (0.002, 0.002, 0.003), rng=rng, correlated_stddevs=POSITION_STDDEVS_M, correlation_time_s=120.0
+        motion,
+        stamps,
+        (0.002, 0.002, 0.003),
+        rng=rng,
+        correlated_stddevs=POSITION_STDDEVS_M,
+        correlation_time_s=120.0,
     )
     imu = simulate_imu(motion, stamps, frame, NOISE, rng)
     rate = 1.0 / float(np.median(np.diff(stamps)))

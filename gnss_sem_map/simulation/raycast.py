@@ -8,20 +8,18 @@ the first one that it enters behind its best hit. What moves is listed in chains
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import inlined, kernel
-from gnss_sem_map.simulation.ground import FAR, Floats, Ground, hit_ground
+from gnss_sem_map.simulation.compiled import Floats, Integers, inlined, kernel
+from gnss_sem_map.simulation.ground import FAR, Ground, hit_ground
 from gnss_sem_map.simulation.shapes import hit_shape
 
 CELL_M = 4.0
+_STEEPEST = 0.1  # no street is as steep as this
 GROUND, KERB = -1, -2  # what a ray hit, when it is no thing
 
 # 0 x, y, z; 3 yaw, its cosine and sine; 6 shear along, across; 8 change per sweep of x, y, z, yaw; 12 whether it moves;
 # 13 smallest and 16 largest x, y, z of its shapes; 19 reach in the plane; 20 first shape, 21 the one after its last
 THING_COLUMNS: Final = 22
-
-Integers = npt.NDArray[np.int32]
 
 
 class Scene(NamedTuple):
@@ -40,7 +38,9 @@ class Scene(NamedTuple):
 
 
 @inlined
-def into_thing(things, k, fraction, ox, oy, oz, dx, dy, dz):
+def into_thing(
+    things: Floats, k: int, fraction: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> tuple[float, float, float, float, float, float]:
     """A ray in a thing's own axes, at this fraction of the sweep (0.5 is the frame's stamp)."""
     px, py, pz, c, s = ox - things[k, 0], oy - things[k, 1], oz - things[k, 2], things[k, 4], things[k, 5]
     if things[k, 12] != 0.0:
@@ -55,7 +55,7 @@ def into_thing(things, k, fraction, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def _clip_slab(t0, t1, low, high, o, d):
+def _clip_slab(t0: float, t1: float, low: float, high: float, o: float, d: float) -> tuple[float, float]:
     if abs(d) < 1e-12:
         return (t0, t1) if low <= o <= high else (FAR, -FAR)
     inverse = 1.0 / d
@@ -64,13 +64,34 @@ def _clip_slab(t0, t1, low, high, o, d):
 
 
 @kernel
-def hit_thing(things, shapes, k, best, fraction, ox, oy, oz, dx, dy, dz):
+def hit_thing(
+    things: Floats,
+    shapes: Floats,
+    k: int,
+    best: float,
+    fraction: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> tuple[float, int]:
     """The nearest shape of one thing that is closer than `best`: distance and shape, or `best` and -1."""
-    which = -1
-    beside = (things[k, 0] - ox) * dy - (things[k, 1] - oy) * dx
-    reach = things[k, 19]
-    if beside * beside > reach * reach * (dx * dx + dy * dy):
+    which, reach = -1, things[k, 19]
+    px, py, level = things[k, 0] - ox, things[k, 1] - oy, dx * dx + dy * dy
+    beside = px * dy - py * dx
+    if beside * beside > reach * reach * level:
         return best, which
+    if level > 1e-12:  # the stretch of the ray above the circle around it, and how high it runs there
+        middle, half = (px * dx + py * dy) / level, reach / np.sqrt(level)
+        enter, leave = max(middle - half, 0.0), min(middle + half, best)
+        low, high = oz + dz * enter - things[k, 2], oz + dz * leave - things[k, 2]
+        if low > high:
+            low, high = high, low
+        lean = _STEEPEST * reach
+        if enter > leave or high < things[k, 15] - lean or low > things[k, 18] + lean:
+            return best, which
     ox, oy, oz, dx, dy, dz = into_thing(things, k, fraction, ox, oy, oz, dx, dy, dz)
     t0, t1 = _clip_slab(0.0, best, things[k, 13], things[k, 16], ox, dx)
     t0, t1 = _clip_slab(t0, t1, things[k, 14], things[k, 17], oy, dy)
@@ -83,14 +104,25 @@ def hit_thing(things, shapes, k, best, fraction, ox, oy, oz, dx, dy, dz):
         ahead = px * dx + py * dy + pz * dz
         if px * px + py * py + pz * pz - ahead * ahead * inverse > shapes[row, 14]:
             continue  # the ray passes beside the sphere around it
-        t = hit_shape(shapes, row, k, ox, oy, oz, dx, dy, dz)
+        t = hit_shape(shapes, row, k, best, ox, oy, oz, dx, dy, dz)
         if t < best:
             best, which = t, row
     return best, which
 
 
 @kernel
-def cast_ray(scene, reach, shadow, fraction, ox, oy, oz, dx, dy, dz):
+def cast_ray(
+    scene: Scene,
+    reach: float,
+    shadow: bool,
+    fraction: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> tuple[float, int, int]:
     """First hit of a ray within `reach`: distance (FAR if none), thing (GROUND or KERB for these), shape.
 
     A shadow ray asks whether anything stands in its way: any thing will do, and the ground does not count.
@@ -104,7 +136,7 @@ def cast_ray(scene, reach, shadow, fraction, ox, oy, oz, dx, dy, dz):
     nx, ny = top.shape
     x, y = (ox - scene.corner[0]) / CELL_M, (oy - scene.corner[1]) / CELL_M
     ux, uy = dx / CELL_M, dy / CELL_M
-    i, j = np.int64(np.floor(x)), np.int64(np.floor(y))
+    i, j = int(np.floor(x)), int(np.floor(y))
     step_i, step_j = (1 if ux > 0.0 else -1), (1 if uy > 0.0 else -1)
     every_i = abs(1.0 / ux) if ux != 0.0 else FAR
     every_j = abs(1.0 / uy) if uy != 0.0 else FAR
@@ -119,7 +151,7 @@ def cast_ray(scene, reach, shadow, fraction, ox, oy, oz, dx, dy, dz):
             cell = i * ny + j
             for m in range(start[cell], start[cell + 1]):
                 candidate = members[m]
-                if candidate == last or candidate == before:
+                if candidate in (last, before):
                     continue
                 before, last = last, candidate
                 closer, which = hit_thing(things, shapes, candidate, best, fraction, ox, oy, oz, dx, dy, dz)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.simulation.camera import Camera
-from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.compiled import Floats
 
 _CALIB_TIME: Final = "01-Jan-2026 12:00:00"
 
@@ -19,17 +19,20 @@ def _transform(R: Floats, t: tuple[float, float, float]) -> Floats:
 
 
 # The LiDAR sits ahead of the imu and above it, the cameras below the LiDAR; nothing is mounted quite straight.
-_FORWARD: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x right, y down, z forward
+_FORWARD: Final = np.array(
+    [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
+)  # x right, y down, z forward
 T_LIDAR_IMU: Final[Floats] = _transform(
     Rotation.from_euler("ZYX", [0.05, -0.12, 0.85], degrees=True).as_matrix(), (-0.81, 0.32, -0.80)
 )
 _T_CAMERA0_LIDAR: Final[Floats] = _transform(
-    _FORWARD @ Rotation.from_euler("ZYX", [-0.43, 0.85, 0.04], degrees=True).as_matrix(), (-0.004, -0.076, -0.272)
+    _FORWARD @ Rotation.from_euler("ZYX", [-0.43, 0.85, 0.04], degrees=True).as_matrix(),
+    (-0.004, -0.076, -0.272),
 )
 _R_RECT: Final[Floats] = Rotation.from_euler("ZYX", [-0.56, -0.43, 0.25], degrees=True).as_matrix()
 _P_SHIFTS: Final = ((0.0, 0.0, 0.0), (-387.57, 0.0, 0.0), (44.857, 0.2164, 0.00275), (-339.52, 2.2, 0.00273))
 
-T_IMU_LIDAR: Final[Floats] = np.linalg.inv(T_LIDAR_IMU)
+T_IMU_LIDAR: Final[Floats] = np.asarray(np.linalg.inv(T_LIDAR_IMU))
 
 
 def _projection(camera: Camera, number: int) -> Floats:

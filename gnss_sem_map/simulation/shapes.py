@@ -1,8 +1,8 @@
 """Ray against shape: tapered blocks, ellipsoids, cylinders, and volumes of leaves.
 
-A shape is a row of SHAPE_COLUMNS numbers in its model's own axes (x forward, y left, z up). Every function wants the ray
-in those axes and answers in the ray's own parameter. Kernels take the whole table and a row's number: a view of a row
-costs more than the arithmetic.
+A shape is a row of SHAPE_COLUMNS numbers in its model's own axes (x forward, y left, z up). Every function wants
+the ray in those axes and answers in the ray's own parameter. Kernels take the whole table and a row's number: a view
+of a row costs more than the arithmetic.
 """
 
 from enum import IntEnum
@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from gnss_sem_map.simulation.compiled import inlined, kernel
+from gnss_sem_map.simulation.compiled import Floats, Triple, inlined, kernel
 from gnss_sem_map.simulation.ground import FAR
 from gnss_sem_map.simulation.noise import hash_bits
 from gnss_sem_map.simulation.surfaces import Surface
@@ -34,7 +34,7 @@ _FENCE, _LEAVES = int(Surface.FENCE), int(Surface.LEAVES)
 
 
 @inlined
-def _clip(t0, t1, distance, rate):
+def _clip(t0: float, t1: float, distance: float, rate: float) -> tuple[float, float]:
     """The part of [t0, t1] where distance + t rate <= 0."""
     if rate > 1e-12:
         return t0, min(t1, -distance / rate)
@@ -44,7 +44,9 @@ def _clip(t0, t1, distance, rate):
 
 
 @kernel
-def _block_span(shapes, row, ox, oy, oz, dx, dy, dz):
+def _block_span(
+    shapes: Floats, row: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> tuple[float, float]:
     hx, hy, hz = shapes[row, 3], shapes[row, 4], shapes[row, 5]
     front, rear, side = shapes[row, 6], shapes[row, 7], shapes[row, 8]
     rise = 0.5 / hz
@@ -62,7 +64,7 @@ def _block_span(shapes, row, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def _round_span(a, b, c):
+def _round_span(a: float, b: float, c: float) -> tuple[float, float]:
     """Where a t^2 + 2 b t + c <= 0."""
     if a < 1e-14:
         return (-FAR, FAR) if c <= 0.0 else (FAR, -FAR)
@@ -74,7 +76,9 @@ def _round_span(a, b, c):
 
 
 @kernel
-def _span(shapes, row, ox, oy, oz, dx, dy, dz):
+def _span(
+    shapes: Floats, row: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> tuple[float, float]:
     """Where the ray (already relative to the shape's centre) is inside the shape."""
     form = int(shapes[row, 11])
     if form == _BLOCK:
@@ -95,7 +99,7 @@ def _span(shapes, row, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def leaf(thing, i, j, k, share):
+def leaf(thing: int, i: int, j: int, k: int, share: float) -> tuple[bool, float, float, float, float]:
     """The clump of leaves of one cell: whether it is there, its radius and centre in parts of the cell."""
     bits = hash_bits(thing, i, j, k)
     if np.float64(bits & np.uint64(0xFFFF)) >= share * 65536.0:
@@ -110,13 +114,25 @@ def leaf(thing, i, j, k, share):
 
 
 @kernel
-def _first_leaf(thing, size, share, t0, t1, ox, oy, oz, dx, dy, dz):
+def _first_leaf(
+    thing: int,
+    size: float,
+    share: float,
+    t0: float,
+    t1: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> float:
     """The first clump of leaves between t0 and t1: a walk through the cells (Amanatides and Woo 1987)."""
     ox, oy, oz = ox / size, oy / size, oz / size
     dx, dy, dz = dx / size, dy / size, dz / size
-    i = np.int64(np.floor(ox + t0 * dx))
-    j = np.int64(np.floor(oy + t0 * dy))
-    k = np.int64(np.floor(oz + t0 * dz))
+    i = int(np.floor(ox + t0 * dx))
+    j = int(np.floor(oy + t0 * dy))
+    k = int(np.floor(oz + t0 * dz))
     step_x, step_y, step_z = (1 if dx > 0.0 else -1), (1 if dy > 0.0 else -1), (1 if dz > 0.0 else -1)
     every_x = abs(1.0 / dx) if dx != 0.0 else FAR
     every_y = abs(1.0 / dy) if dy != 0.0 else FAR
@@ -145,15 +161,28 @@ def _first_leaf(thing, size, share, t0, t1, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def hit_shape(shapes, row, thing, ox, oy, oz, dx, dy, dz):
-    """Distance to the first point of the shape in front of the ray's start, FAR if there is none."""
+def hit_shape(
+    shapes: Floats,
+    row: int,
+    thing: int,
+    best: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+) -> float:
+    """Distance to the first point of the shape in front of the ray's start and nearer than `best`, else FAR."""
     ox, oy, oz = ox - shapes[row, 0], oy - shapes[row, 1], oz - shapes[row, 2]
     t0, t1 = _span(shapes, row, ox, oy, oz, dx, dy, dz)
-    if t0 >= t1 or t1 <= 0.0:
+    if t0 >= t1 or t1 <= 0.0 or t0 >= best:
         return FAR
     surface = int(shapes[row, 12])
     if surface == _LEAVES:
-        return _first_leaf(thing, shapes[row, 10], shapes[row, 9], max(t0, 0.0), t1, ox, oy, oz, dx, dy, dz)
+        return _first_leaf(
+            thing, shapes[row, 10], shapes[row, 9], max(t0, 0.0), min(t1, best), ox, oy, oz, dx, dy, dz
+        )
     if t0 <= 0.0:
         return FAR
     if surface == _FENCE:  # upright slats and two rails, air between them
@@ -164,14 +193,16 @@ def hit_shape(shapes, row, thing, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def shape_normal(shapes, row, thing, px, py, pz, dx, dy, dz):
+def shape_normal(
+    shapes: Floats, row: int, thing: int, px: float, py: float, pz: float, dx: float, dy: float, dz: float
+) -> tuple[float, float, float, float]:
     """Outward unit normal at a point that a ray of direction d hit, and a number for the clump of leaves."""
     px, py, pz = px - shapes[row, 0], py - shapes[row, 1], pz - shapes[row, 2]
     form, clump = int(shapes[row, 11]), 0.5
     if int(shapes[row, 12]) == _LEAVES:
         size, nudge = shapes[row, 10], 1e-7
         ax, ay, az = (px + nudge * dx) / size, (py + nudge * dy) / size, (pz + nudge * dz) / size
-        i, j, k = np.int64(np.floor(ax)), np.int64(np.floor(ay)), np.int64(np.floor(az))
+        i, j, k = int(np.floor(ax)), int(np.floor(ay)), int(np.floor(az))
         _, _, cx, cy, cz = leaf(thing, i, j, k, shapes[row, 9])
         nx, ny, nz = ax - i - cx, ay - j - cy, az - k - cz
         clump = np.float64(hash_bits(thing, i, j, k) >> np.uint64(48)) / 65536.0
@@ -190,7 +221,7 @@ def shape_normal(shapes, row, thing, px, py, pz, dx, dy, dz):
 
 
 @kernel
-def _block_normal(shapes, row, x, y, z):
+def _block_normal(shapes: Floats, row: int, x: float, y: float, z: float) -> Triple:
     """The normal of the face that the point lies on: the plane that it is nearest to."""
     hx, hy, hz = shapes[row, 3], shapes[row, 4], shapes[row, 5]
     rise = 0.5 / hz

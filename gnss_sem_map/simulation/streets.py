@@ -1,13 +1,13 @@
-"""The street network: a grid of streets with uneven spacing, the routes through it, and the kerb sides of its blocks."""
+"""The street network: a grid of streets with uneven spacing, routes through it, and the kerbs of its blocks."""
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.ground import Ground, inside_block
 
-Floats = npt.NDArray[np.float64]
 Node = tuple[int, int]
 
 LANE_M = 1.65  # from the centre line to the middle of the lane
@@ -71,7 +71,7 @@ def lay_streets(rng: np.random.Generator, count: int = 6) -> Streets:
 
     def lines() -> Floats:
         at = np.cumsum(rng.uniform(62.0, 90.0, count))
-        return at - at.mean()
+        return np.asarray(at - at.mean())
 
     return Streets(lines(), rng.uniform(5.2, 6.0, count), lines(), rng.uniform(5.2, 6.0, count))
 
@@ -132,7 +132,7 @@ def _turned(heading: Node, quarter: int) -> Node:
 def lane_path(streets: Streets, route: list[Node], step_m: float = 1.5) -> Floats:
     """The middle of the right-hand lane along a route, (k, 2) town coordinates, from and to the ends of the route."""
     spots = [streets.position(node) for node in route]
-    courses = [(b - a) / np.linalg.norm(b - a) for a, b in zip(spots[:-1], spots[1:], strict=True)]
+    courses = [(b - a) / np.linalg.norm(b - a) for a, b in itertools.pairwise(spots)]
     rights = [np.array([c[1], -c[0]]) for c in courses]
     pieces, begin = [], spots[0] + LANE_M * rights[0]
     for k in range(1, len(courses)):

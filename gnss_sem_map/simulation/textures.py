@@ -2,45 +2,57 @@
 
 import numpy as np
 
-from gnss_sem_map.simulation.compiled import inlined, kernel
+from gnss_sem_map.simulation.compiled import Floats, Triple, inlined, kernel
 from gnss_sem_map.simulation.noise import uniform, value_noise
 from gnss_sem_map.simulation.surfaces import Surface
 
+Colour = tuple[float, float, float, float]  # red, green, blue, and the share of mirrored sky
+
 _ASPHALT, _MARKING, _PAVING = int(Surface.ASPHALT), int(Surface.MARKING), int(Surface.PAVING)
-_KERB, _PARKING, _GRASS, _FACADE = int(Surface.KERB), int(Surface.PARKING), int(Surface.GRASS), int(Surface.FACADE)
+_KERB, _PARKING, _GRASS, _FACADE = (
+    int(Surface.KERB),
+    int(Surface.PARKING),
+    int(Surface.GRASS),
+    int(Surface.FACADE),
+)
 _ROOF, _STONE, _WALL, _FENCE = int(Surface.ROOF), int(Surface.STONE), int(Surface.WALL), int(Surface.FENCE)
 _LEAVES, _BARK, _STEEL, _SIGN = int(Surface.LEAVES), int(Surface.BARK), int(Surface.STEEL), int(Surface.SIGN)
-_LIGHT, _PAINT, _CABIN, _RUBBER = int(Surface.LIGHT), int(Surface.PAINT), int(Surface.CABIN), int(Surface.RUBBER)
+_LIGHT, _PAINT, _CABIN, _RUBBER = (
+    int(Surface.LIGHT),
+    int(Surface.PAINT),
+    int(Surface.CABIN),
+    int(Surface.RUBBER),
+)
 _HEADLAMP, _TAILLAMP, _CLOTH = int(Surface.HEADLAMP), int(Surface.TAILLAMP), int(Surface.CLOTH)
 _SKIN, _CARGO = int(Surface.SKIN), int(Surface.CARGO)
 
 
 @inlined
-def _part(x, size):
-    return x / size - np.floor(x / size)
+def _part(x: float, size: float) -> float:
+    return float(x / size - np.floor(x / size))
 
 
 @inlined
-def window_at(x, z):
+def window_at(x: float, z: float) -> tuple[float, float]:
     """Where a facade's point lies in its window: two numbers in [0, 1] inside the pane, negative outside."""
     a, b = (_part(x, 2.4) - 0.26) / 0.48, (_part(z - 1.0, 3.1) - 0.27) / 0.52
     return (a, b) if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and z > 1.0 else (-1.0, -1.0)
 
 
 @kernel
-def _bricks(x, z, width, height):
+def _bricks(x: float, z: float, width: float, height: float) -> tuple[float, float]:
     """1 on a brick, 0 in a joint, and a number for the brick."""
     row = np.floor(z / height)
     shifted = x + 0.5 * width * (row % 2.0)
     joint = _part(shifted, width) < 0.04 or _part(z, height) < 0.10
-    return (0.0 if joint else 1.0), uniform(11, np.int64(np.floor(shifted / width)), np.int64(row), 0)
+    return (0.0 if joint else 1.0), uniform(11, int(np.floor(shifted / width)), int(row), 0)
 
 
 @kernel
-def ground_colour(surface, u, v, near):
+def ground_colour(surface: int, u: float, v: float, near: float) -> Triple:
     """Colour of the ground at town coordinates; `near` in [0, 1] fades what is too fine to be seen."""
     broad = value_noise(1, u * 0.25, v * 0.25)
-    if surface == _ASPHALT or surface == _MARKING:
+    if surface in (_ASPHALT, _MARKING):
         speckle = (value_noise(2, u * 18.0, v * 18.0) - 0.5) * near
         patch = 0.86 if value_noise(3, u * 0.11 + 7.0, v * 0.11) > 0.66 else 1.0
         crack = abs(value_noise(4, u * 0.55, v * 0.55) - 0.5)
@@ -68,7 +80,9 @@ def ground_colour(surface, u, v, near):
 
 
 @kernel
-def _facade(r, g, b, thing, x, y, z, nx, ny, near):
+def _facade(
+    r: float, g: float, b: float, thing: int, x: float, y: float, z: float, nx: float, ny: float, near: float
+) -> Colour:
     """Plaster or brick with rows of windows on the long sides and a door."""
     front = abs(ny) > abs(nx)
     along = x if front else y
@@ -85,7 +99,7 @@ def _facade(r, g, b, thing, x, y, z, nx, ny, near):
     if a >= 0.0:
         if min(a, 1.0 - a) < 0.07 or min(c, 1.0 - c) < 0.05 or abs(a - 0.5) < 0.03:
             return 0.70, 0.69, 0.66, 0.0
-        curtain = uniform(23, thing, np.int64(np.floor(x / 2.4)), np.int64(np.floor(z / 3.1)))
+        curtain = uniform(23, thing, int(np.floor(x / 2.4)), int(np.floor(z / 3.1)))
         dark = 0.30 if curtain < 0.35 and c > 0.35 else 0.045
         return dark, dark, dark * 1.05, 0.30
     sill = front and z > 1.0 and abs((_part(z - 1.0, 3.1) - 0.25) * 3.1) < 0.07 and 0.2 < _part(x, 2.4) < 0.8
@@ -95,9 +109,15 @@ def _facade(r, g, b, thing, x, y, z, nx, ny, near):
 
 
 @kernel
-def _cabin(shapes, row, r, g, b, x, y, z, nx, ny):
+def _cabin(
+    shapes: Floats, row: int, r: float, g: float, b: float, x: float, y: float, z: float, nx: float, ny: float
+) -> Colour:
     """Panes between pillars in the colour of the car."""
-    x, y, up = x - shapes[row, 0], y - shapes[row, 1], (z - shapes[row, 2] + shapes[row, 5]) * 0.5 / shapes[row, 5]
+    x, y, up = (
+        x - shapes[row, 0],
+        y - shapes[row, 1],
+        (z - shapes[row, 2] + shapes[row, 5]) * 0.5 / shapes[row, 5],
+    )
     front, rear = shapes[row, 3] - shapes[row, 6] * up, -shapes[row, 3] + shapes[row, 7] * up
     beside = shapes[row, 4] - shapes[row, 8] * up
     if abs(nx) > abs(ny):
@@ -110,7 +130,7 @@ def _cabin(shapes, row, r, g, b, x, y, z, nx, ny):
 
 
 @kernel
-def _wheel(shapes, row, x, z, ny):
+def _wheel(shapes: Floats, row: int, x: float, z: float, ny: float) -> Colour:
     """A tyre around a rim with spokes; bumpers are of the same rubber."""
     dx, dz = x - shapes[row, 0], z - shapes[row, 2]
     radius = np.sqrt(dx * dx + dz * dz) / shapes[row, 3]
@@ -122,7 +142,7 @@ def _wheel(shapes, row, x, z, ny):
 
 
 @kernel
-def _sign(thing, y, z, nx):
+def _sign(thing: int, y: float, z: float, nx: float) -> Colour:
     """A round or square face with a rim; grey from behind."""
     if nx > 0.5:
         return 0.35, 0.36, 0.37, 0.05
@@ -137,11 +157,27 @@ def _sign(thing, y, z, nx):
 
 
 @kernel
-def thing_colour(shapes, row, thing, r, g, b, x, y, z, nx, ny, nz, clump, near):
+def thing_colour(
+    shapes: Floats,
+    row: int,
+    thing: int,
+    r: float,
+    g: float,
+    b: float,
+    x: float,
+    y: float,
+    z: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    clump: float,
+    near: float,
+) -> Colour:
     """Colour at a point of a thing's model (coordinates and normal in its axes), and how much it mirrors the sky."""
     surface = int(shapes[row, 12])
     if surface == _LEAVES:
-        light = 0.55 + 0.8 * clump + 0.5 * (value_noise(41, (x + z) * 11.0, (y - z) * 11.0) - 0.5) * near
+        light = 0.50 + 0.75 * clump + 1.5 * (value_noise(41, (x + z) * 16.0, (y - z) * 16.0) - 0.45) * near
+        light = max(0.15, light)
         dry = 1.0 + 0.35 * max(0.0, clump - 0.7)
         return r * light * dry, g * light, b * light, 0.0
     if surface == _FACADE:
@@ -165,7 +201,7 @@ def thing_colour(shapes, row, thing, r, g, b, x, y, z, nx, ny, nz, clump, near):
         light = 0.46 + 0.10 * value_noise(61, (x + y) * 2.0, z * 2.0)
         return light * 1.03, light, light * 0.94, 0.0
     if surface == _FENCE:
-        light = 0.7 + 0.5 * uniform(71, np.int64(np.floor(x / 0.16)), thing, 0)
+        light = 0.7 + 0.5 * uniform(71, int(np.floor(x / 0.16)), thing, 0)
         return 0.27 * light, 0.18 * light, 0.11 * light, 0.0
     if surface == _BARK:
         light = 0.5 + 0.8 * value_noise(81, (x - y) * 25.0, z * 3.0)
@@ -174,7 +210,9 @@ def thing_colour(shapes, row, thing, r, g, b, x, y, z, nx, ny, nz, clump, near):
 
 
 @kernel
-def _small_part(surface, thing, r, g, b, y, z, nx):
+def _small_part(
+    surface: int, thing: int, r: float, g: float, b: float, y: float, z: float, nx: float
+) -> Colour:
     """Everything that is too small to need a pattern of its own."""
     if surface == _SIGN:
         return _sign(thing, y, z, nx)
@@ -182,7 +220,11 @@ def _small_part(surface, thing, r, g, b, y, z, nx):
         red = y * y + (z - 3.28) ** 2 < 0.011 and nx < -0.5
         return (0.95, 0.05, 0.03, 0.0) if red else (0.03, 0.03, 0.03, 0.05)
     if surface == _MARKING:  # a number plate
-        return (0.05, 0.05, 0.05, 0.0) if abs(_part(y, 0.07) - 0.5) < 0.22 and abs(y) < 0.2 else (0.8, 0.8, 0.78, 0.0)
+        return (
+            (0.05, 0.05, 0.05, 0.0)
+            if abs(_part(y, 0.07) - 0.5) < 0.22 and abs(y) < 0.2
+            else (0.8, 0.8, 0.78, 0.0)
+        )
     if surface == _HEADLAMP:
         return 0.80, 0.82, 0.85, 0.25
     if surface == _TAILLAMP:

@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.simulation import models
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.ground import Ground, ground_height, height_gradient
 from gnss_sem_map.simulation.models import Model
 from gnss_sem_map.simulation.streets import Node, Side, Streets, lay_streets, random_route, sides
 from gnss_sem_map.simulation.surfaces import Surface
 
-Floats = npt.NDArray[np.float64]
 Colour = tuple[float, float, float]
 
 CAR_COLOURS: list[Colour] = [

@@ -42,7 +42,10 @@ def write_tracklets(path: Path, tracklets: list[Tracklet]) -> None:
 
 
 def _item(tracklet: Tracklet, first: bool) -> str:
-    marks = [' class_id="1" tracking_level="0" version="0"', ' class_id="2" tracking_level="0" version="0"'] * first
+    marks = [
+        ' class_id="1" tracking_level="0" version="0"',
+        ' class_id="2" tracking_level="0" version="0"',
+    ] * first
     item, poses = marks or ["", ""]
     boxes = [_pose(box, first and k == 0) for k, box in enumerate(tracklet.boxes)]
     return (

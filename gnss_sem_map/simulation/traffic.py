@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factor_graphs.simulation import Motion, follow
-from gnss_sem_map.simulation.ground import Floats
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.streets import LANE_M, STOP_LINE_M, Node, lane_path
 from gnss_sem_map.simulation.town import CAR_COLOURS, CYCLIST, PERSON, Colour, Thing, Town
 from gnss_sem_map.simulation.world import Mover
@@ -16,7 +16,13 @@ EARLY_S, LATE_S = 0.6, 1.0  # how long before and after the drive everybody's mo
 _GREEN_S = 10.5  # when the light at the first crossing turns green
 _START_M = 56.0  # how far before the first crossing the drive begins
 _GAIN, _BRAKE, _SIDEWAYS = 1.5, 1.8, 2.0  # m/s2
-_CLOTHES: list[Colour] = [(0.5, 0.08, 0.08), (0.1, 0.2, 0.45), (0.75, 0.72, 0.66), (0.12, 0.3, 0.16), (0.7, 0.5, 0.1)]
+_CLOTHES: list[Colour] = [
+    (0.5, 0.08, 0.08),
+    (0.1, 0.2, 0.45),
+    (0.75, 0.72, 0.66),
+    (0.12, 0.3, 0.16),
+    (0.7, 0.5, 0.1),
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +48,12 @@ def _path(town: Town, uv: Floats) -> _Path:
 
 
 def _profile(
-    path: _Path, start: float, speed: float, limit: float, stops: Sequence[tuple[float, float]], seconds: float
+    path: _Path,
+    start: float,
+    speed: float,
+    limit: float,
+    stops: Sequence[tuple[float, float]],
+    seconds: float,
 ) -> tuple[Floats, Floats]:
     """Stamps and speeds of somebody who keeps a limit, slows in curves, and waits at stops (way, until stamp)."""
     way = np.arange(start, path.way[-1] - 0.5, 0.25)
@@ -106,7 +117,10 @@ class _Crowd:
     def admit(self, name: str, model: int, colour: Colour, motion: Motion) -> bool:
         """Take somebody in who keeps clear of all others."""
         bounds = self.town.models[model].bounds
-        mine, radius = self._discs(motion.poses(self.stamps), 0.75 * (bounds[3] - bounds[0])), 0.5 * bounds[4] + 0.15
+        mine, radius = (
+            self._discs(motion.poses(self.stamps), 0.75 * (bounds[3] - bounds[0])),
+            0.5 * bounds[4] + 0.15,
+        )
         for other in self.discs:
             gap = np.linalg.norm(mine[:, :, None] - other[:, None, :], axis=-1).min()
             if gap < radius + 1.05:
@@ -131,7 +145,9 @@ def drive_through(town: Town, seconds: float, seed: int) -> tuple[Town, Motion, 
     start = length - _START_M
     line = length - town.streets.crossing_edge(town.route[0], town.route[1]) - STOP_LINE_M
     if not start < line < first + 20.0:
-        raise ValueError(f"route {town.route[:2]}: the stop line at {line:.1f} m is not behind the start {start:.1f} m")
+        raise ValueError(
+            f"route {town.route[:2]}: the stop line at {line:.1f} m is not behind the start {start:.1f} m"
+        )
     cruise = {"speed": 7.0, "limit": 8.5}
     ego = _drive(
         own, seconds, start=start, stops=_stops(line - 10.2), lift=IMU_HEIGHT_M, suspension_deg=0.25, **cruise
@@ -165,7 +181,9 @@ def _meet_at_the_light(town: Town, crowd: _Crowd, seconds: float, rng: np.random
     opposite += [(here[0] + step[0], here[1] + step[1]), here, before]
     path = _path(town, lane_path(town.streets, _within(town, opposite)))
     line = _length(town, opposite[0], opposite[1]) * (len(_within(town, opposite)) == 4)
-    line += _length(town, opposite[1], here) - town.streets.crossing_edge(opposite[1], here) - STOP_LINE_M - 2.6
+    line += (
+        _length(town, opposite[1], here) - town.streets.crossing_edge(opposite[1], here) - STOP_LINE_M - 2.6
+    )
     for late in (0.7, 4.0, 7.0, 10.0):
         stop = [(line, _GREEN_S + late)]
         motion = _drive(path, seconds, start=line - 16.0, speed=4.0, limit=8.5, stops=stop)
@@ -196,14 +214,22 @@ def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generato
         step = (b[0] - a[0], b[1] - a[1])
         nodes = _within(town, [(b[0] + k * step[0], b[1] + k * step[1]) for k in (2, 1, 0, -1, -2)])
         path = _path(town, lane_path(town.streets, nodes))
-        reach, bicycle = path.way[-1], np.diff(town.streets.position(nodes[-1]) - town.streets.position(nodes[0]))
+        reach, bicycle = (
+            path.way[-1],
+            np.diff(town.streets.position(nodes[-1]) - town.streets.position(nodes[0])),
+        )
         for k in range(8):
             start = float(rng.uniform(0.05, 0.7) * reach)
             halt = (start + float(rng.uniform(15, 40)), float(rng.uniform(6, 14)))
             stops = [halt, (halt[0] + 9.0, halt[1] + 5.0)] if k % 3 == 0 else []
             speed = float(rng.uniform(5.5, 8.5))
             motion = _drive(path, seconds, start=start, speed=speed, limit=speed + 1.0, stops=stops)
-            crowd.admit("stop and go" if stops else "oncoming", int(rng.choice([0, 1, 2, 3, 4, 5])), _colour(rng), motion)
+            crowd.admit(
+                "stop and go" if stops else "oncoming",
+                int(rng.choice([0, 1, 2, 3, 4, 5])),
+                _colour(rng),
+                motion,
+            )
         if number == 0 and bicycle.size:
             kerb = town.streets.half_width(a, b) - 2.6
             side = _path(town, _shifted(lane_path(town.streets, nodes), kerb - LANE_M))
@@ -279,4 +305,9 @@ def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator
     zebra = pb - course * (town.streets.crossing_edge(a, b) + 5.7)
     half = town.streets.half_width(a, b) + 1.6
     line = zebra + right * half - np.arange(0.0, 2 * half + 12.0, 1.5)[:, None] * right
-    crowd.admit("crosses on foot", PERSON, _CLOTHES[0], _drive(_path(town, line), seconds, start=0.0, speed=1.4, limit=1.4))
+    crowd.admit(
+        "crosses on foot",
+        PERSON,
+        _CLOTHES[0],
+        _drive(_path(town, line), seconds, start=0.0, speed=1.4, limit=1.4),
+    )

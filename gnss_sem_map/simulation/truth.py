@@ -8,9 +8,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.simulation import Motion
-from gnss_sem_map.simulation.camera import Camera, SimulatedImage
-from gnss_sem_map.simulation.ground import Floats
-from gnss_sem_map.simulation.lidar import SimulatedScan
+from gnss_sem_map.simulation.camera import SimulatedImage
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.models import Model
 from gnss_sem_map.simulation.rig import T_LIDAR_IMU
 from gnss_sem_map.simulation.tracklets import Box, Tracklet
@@ -29,7 +28,9 @@ def write_trajectory(
 ) -> None:
     """T_map_imu in TUM format, stamps in seconds since the log's epoch."""
     T = motion.poses(stamps)
-    rows = np.column_stack([stamps - zero_s, to_map(T[:, :3, 3]), Rotation.from_matrix(T[:, :3, :3]).as_quat()])
+    rows = np.column_stack(
+        [stamps - zero_s, to_map(T[:, :3, 3]), Rotation.from_matrix(T[:, :3, :3]).as_quat()]
+    )
     np.savetxt(path, rows, fmt="%.9f")
 
 
@@ -65,8 +66,12 @@ def write_vehicles(
 def _everybody(world: World) -> list[tuple[int, str, Model, bool]]:
     """Instance number, model's name, model, and whether it moves during the drive."""
     town = world.town
-    parked = [(int(n), town.models[t.model]) for n, t in zip(world.instances, town.things, strict=False) if n > 0]
-    moving = zip(world.instances[len(town.things) :], (town.models[m.model] for m in world.movers), strict=True)
+    parked = [
+        (int(n), town.models[t.model]) for n, t in zip(world.instances, town.things, strict=False) if n > 0
+    ]
+    moving = zip(
+        world.instances[len(town.things) :], (town.models[m.model] for m in world.movers), strict=True
+    )
     return [(n, m.name, m, False) for n, m in parked] + [(int(n), m.name, m, True) for n, m in moving]
 
 
@@ -79,8 +84,8 @@ def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]])
     """A tracklet for everybody who is seen, from the first frame to the last one that shows it."""
     details = {number: (name, model) for number, name, model, _ in _everybody(world)}
     span: dict[int, tuple[int, int]] = {}
-    for frame, numbers in enumerate(seen):
-        for number in numbers.tolist():
+    for frame, shown in enumerate(seen):
+        for number in shown.tolist():
             span[number] = (span.get(number, (frame, frame))[0], frame)
     boxes: dict[int, list[Box]] = {number: [] for number in span}
     for frame, stamp in enumerate(sweeps.mean(axis=1)):
@@ -96,49 +101,24 @@ def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]])
     for number in sorted(span):
         name, model = details[number]
         length, width, height = _size(model)
-        tracklets.append(Tracklet(_TRACKLET_KINDS.get(name, "Car"), height, width, length, tuple(boxes[number])))
+        tracklets.append(
+            Tracklet(_TRACKLET_KINDS.get(name, "Car"), height, width, length, tuple(boxes[number]))
+        )
     return tracklets
 
 
 def seen_alone(
-    scan: SimulatedScan,
-    image: SimulatedImage,
-    T_map_imu: Floats,
-    T_map_imu_exposure: Floats,
-    T_imu_lidar: Floats,
-    T_camera_lidar: Floats,
-    camera: Camera,
+    image: SimulatedImage, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], z: Floats
 ) -> npt.NDArray[np.uint32]:
     """What the true class image says of every point of its scan: 40 48 10 50 70, and 0 where it shows another thing.
 
-    `T_map_imu` (n, 4, 4) at the points' own stamps, and at the exposure. A point counts as seen when the image's true
-    depth there is its own.
+    `u`, `v`, `z`: the points' pixels and depths. A point counts as seen when the image's true depth there is its own.
     """
-    u, v, z = project(scan, T_map_imu, T_map_imu_exposure, T_imu_lidar, T_camera_lidar, camera)
-    inside = (z > 0.5) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    labels = np.zeros(len(scan.points), np.uint32)
+    height, width = image.depth.shape
+    inside = (z > 0.5) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    labels = np.zeros(len(z), np.uint32)
     rows, columns = v[inside], u[inside]
     depth = image.depth[rows, columns]
     visible = (depth > 0) & (np.abs(z[inside] - depth) < 0.15 + 0.03 * z[inside])
     labels[inside] = np.where(visible, _SCORED[image.train_ids[rows, columns]], 0)
     return labels
-
-
-def project(
-    scan: SimulatedScan,
-    T_map_imu: Floats,
-    T_map_imu_exposure: Floats,
-    T_imu_lidar: Floats,
-    T_camera_lidar: Floats,
-    camera: Camera,
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Floats]:
-    """Pixels u, v and depth z at the moment of exposure of points that were measured each at its own stamp."""
-    p = scan.points[:, :3].astype(np.float64)
-    T_map_lidar = T_map_imu @ T_imu_lidar
-    p_map = np.einsum("nij,nj->ni", T_map_lidar[:, :3, :3], p) + T_map_lidar[:, :3, 3]
-    T = T_camera_lidar @ np.linalg.inv(T_map_imu_exposure @ T_imu_lidar)
-    x, y, z = (p_map @ T[:3, :3].T + T[:3, 3]).T
-    ahead = np.maximum(z, 1e-6)
-    u = np.round(camera.focal_px * x / ahead + camera.centre_u_px)
-    v = np.round(camera.focal_px * y / ahead + camera.centre_v_px)
-    return np.clip(u, -1e6, 1e6).astype(np.int64), np.clip(v, -1e6, 1e6).astype(np.int64), z

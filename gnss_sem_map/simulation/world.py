@@ -6,11 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from factor_graphs.simulation import Motion
+from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.ground import height_gradient
 from gnss_sem_map.simulation.raycast import CELL_M, THING_COLUMNS, Scene
 from gnss_sem_map.simulation.town import Colour, Town
 
-Floats = npt.NDArray[np.float64]
 _MARGIN_M = 60.0
 
 
@@ -34,7 +34,9 @@ class World:
         self.town, self.ego, self.movers = town, ego, movers
         vehicles = np.array([thing.is_vehicle for thing in town.things])
         numbers = np.where(vehicles, np.cumsum(vehicles), 0)
-        self.instances = np.concatenate([numbers, numbers.max() + 1 + np.arange(len(movers))]).astype(np.int32)
+        self.instances = np.concatenate([numbers, numbers.max() + 1 + np.arange(len(movers))]).astype(
+            np.int32
+        )
         self._colours = np.array([t.colour for t in town.things] + [m.colour for m in movers])
         self._shapes = np.concatenate([model.shapes for model in town.models])
         self._still = self._rows(np.array([t.model for t in town.things]))

@@ -22,21 +22,38 @@ EXTRAPOLATE_S = 0.15
 def points_in_map(
     points: Points, stamp: float, trajectory: Trajectory, T_imu_lidar: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Points (n, 3) of one sweep in the map frame, m.
+    """The finite points of one sweep in the map frame, m; else as `usable_points_in_map`."""
+    return usable_points_in_map(points, stamp, trajectory, T_imu_lidar)[0]
+
+
+def usable_points_in_map(
+    points: Points,
+    stamp: float,
+    trajectory: Trajectory,
+    T_imu_lidar: NDArray[np.float64],
+    nearest_m: float = 0.0,
+    farthest_m: float = np.inf,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The points of one sweep that are finite and in range, in the map frame (m, 3) m, and which those are (n,).
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
     """
-    n = len(points.xyz)
-    stamps = points.stamps if points.stamps is not None else np.full(n, stamp)
-    if n == 0:
-        return np.empty((0, 3))
-    first, last = float(stamps.min()), float(stamps.max())
-    count = max(2, int(np.ceil((last - first) / KNOT_STEP_S)) + 1)
-    step_s = (last - first) / (count - 1) or 1.0
-    T_map_imu = trajectory.at(np.linspace(first, last, count), EXTRAPOLATE_S)
-    T_map_lidar = T_map_imu @ T_imu_lidar
-    p_map = np.empty((n, 3))
-    voxel_kernels.transform_along(
-        points.xyz, stamps, first, step_s, np.ascontiguousarray(T_map_lidar[:, :3]), p_map
-    )
-    return p_map
+    stamps = np.empty(0) if points.stamps is None else points.stamps
+    valid = np.empty(len(points.xyz), np.bool_)
+    count, first, last = voxel_kernels.usable(points.xyz, stamps, nearest_m, farthest_m, valid)
+    p_map = np.empty((count, 3))
+    if count:
+        first, last = (first, last) if len(stamps) else (stamp, stamp)
+        step_s, poses = _poses(trajectory, T_imu_lidar, first, last)
+        voxel_kernels.transform_along(points.xyz, stamps, valid, first, step_s, poses, p_map)
+    return p_map, valid
+
+
+def _poses(
+    trajectory: Trajectory, T_imu_lidar: NDArray[np.float64], first: float, last: float
+) -> tuple[float, NDArray[np.float64]]:
+    """Poses of the lidar from the first stamp to the last (k, 3, 8), each with its difference to the next."""
+    steps = max(1, int(np.ceil((last - first) / KNOT_STEP_S)))
+    T_map_lidar = trajectory.at(np.linspace(first, last, steps + 1), EXTRAPOLATE_S) @ T_imu_lidar
+    poses = np.concatenate([T_map_lidar[:-1, :3], np.diff(T_map_lidar[:, :3], axis=0)], axis=2)
+    return (last - first) / steps or 1.0, poses

@@ -61,6 +61,15 @@ class ClassImage:
         """The same pixels as one list, (h w, c + 1)."""
         return self.probabilities.reshape(-1, self.probabilities.shape[2])
 
+    def seen(self, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The probabilities (m, c + 1) of the pixels that some point saw; renumbers `pixels` (n,) to rows of these.
+
+        However the image lies in memory, only what is needed is touched.
+        """
+        classes = np.empty((np.count_nonzero(pixels >= 0), self.probabilities.shape[2]), np.uint8)
+        voxel_kernels.gather(self.probabilities, pixels, classes)
+        return classes
+
 
 def class_image(
     probabilities: NDArray[np.uint8] | NDArray[np.floating],
@@ -81,7 +90,7 @@ def class_image(
     shrink = _shrink(probabilities.shape[:2], image_size, where)
     wanted = (*label_set.names, "other")
     if probabilities.dtype == np.uint8 and tuple(class_names) == wanted:
-        return ClassImage(np.ascontiguousarray(probabilities), shrink)
+        return ClassImage(np.asarray(probabilities, np.uint8), shrink)
     table = label_set.table_from(class_names)
     scale = 1.0 if probabilities.dtype == np.uint8 else 255.0
     summed = np.rint(np.asarray(probabilities, np.float32) * np.float32(scale) @ table)
@@ -128,15 +137,15 @@ def pixels_seen(
     width, height = calibration.image_size
     n = len(p_map)
     u, v = np.empty(n, np.int32), np.empty(n, np.int32)
-    depth, zbuffer = np.empty(n), np.empty((height, width))
+    depth, nearest = np.empty(n, np.float32), np.empty((height, width), np.float32)
     voxel_kernels.project(
         p_map, np.ascontiguousarray(calibration.K @ T_camera_map[:3]), NEAREST_DEPTH_M,
-        settings.occlusion_rows_px // 2, settings.occlusion_columns_px // 2, u, v, depth, zbuffer,
+        settings.occlusion_columns_px // 2, u, v, depth, nearest,
     )  # fmt: skip
     pixels = np.empty(n, np.int32)
     class_height, class_width = classes.probabilities.shape[:2]
     voxel_kernels.visible(
-        u, v, depth, zbuffer, settings.occlusion_ratio, settings.occlusion_m,
+        u, v, depth, nearest, settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
         classes.shrink, class_width, class_height, pixels,
     )  # fmt: skip
     return pixels

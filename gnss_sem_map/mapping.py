@@ -15,7 +15,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import labels
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.config import Settings
-from gnss_sem_map.deskew import points_in_map
+from gnss_sem_map.deskew import usable_points_in_map
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labelling import ClassImage, class_image, exposure_stamp, pixels_seen
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
@@ -80,9 +80,9 @@ def map_points(
     points: Points, scan: Scan, trajectory: Trajectory, log: SensorLog, settings: MappingSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The points of a sweep that are finite and in range, in the map (m, 3) m, and which of all those are (n,)."""
-    ranges = np.sqrt(np.einsum("ij,ij->i", points.xyz, points.xyz))
-    valid = (ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)  # False for NaN
-    return points_in_map(points[valid], scan.stamp, trajectory, log.calibration.T_imu_lidar), valid
+    return usable_points_in_map(
+        points, scan.stamp, trajectory, log.calibration.T_imu_lidar, settings.nearest_m, settings.farthest_m
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,10 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, FIRST_SUM, UNITS_PER_NAT
 
-SMALLEST_TABLE_BITS = 18
+SMALLEST_TABLE = 1 << 18
+LARGE_TABLE = 1 << 20
+"""Rows (32 MB for five classes) up to which a table doubles; beyond, it grows by a twelfth and stays under 50 bytes
+per voxel, for growing reads and writes memory in order and is cheap."""
 HIGHEST_LOAD = 0.7
 
 
@@ -86,15 +89,15 @@ class VoxelMap:
                 f"cannot add a map of {other.voxel_size_m} m voxels and classes {list(other.label_set.names)} to one of"
                 f" {self.voxel_size_m} m and {list(self.label_set.names)}; build both with the same settings"
             )
-        keys, places = np.unique(np.concatenate([self.keys, other.keys]), return_inverse=True)
-        evidence = np.zeros((len(keys), self.evidence.shape[1]), np.int64)
-        hits = np.zeros(len(keys), np.int64)
-        for part, where in ((self, places[: len(self)]), (other, places[len(self) :])):
-            evidence[where] += part.evidence
-            hits[where] += part.hits
-        if (evidence < -voxel_kernels.EVIDENCE_LIMIT).any() or (hits > np.iinfo(np.uint32).max).any():
+        room, c = len(self) + len(other), self.evidence.shape[1]
+        keys, evidence = np.empty(room, np.int64), np.empty((room, c), np.int32)
+        hits = np.empty(room, np.uint32)
+        count = voxel_kernels.merge(
+            self.keys, self.evidence, self.hits, other.keys, other.evidence, other.hits, keys, evidence, hits
+        )
+        if count < 0:
             raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
-        return replace(self, keys=keys, evidence=evidence.astype(np.int32), hits=hits.astype(np.uint32))
+        return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
 
     def __getitem__(self, selection: NDArray[np.bool_]) -> VoxelMap:
         """The voxels where a boolean mask holds."""
@@ -184,14 +187,17 @@ class VoxelTable:
             raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
         self.voxel_size_m, self.label_set = voxel_size_m, label_set
         self._floor_percent = round(100 * probability_floor)
-        self._words = (2 + len(label_set.names) + 1 + 1) // 2
+        self._words = (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
         self._count = 0
-        self._allocate(SMALLEST_TABLE_BITS)
+        self._rows = np.zeros((SMALLEST_TABLE, self._words), np.int64)
         self._log_table = log_table(len(label_set.names), self._floor_percent)
+        self._log_percent = self._log_table[100 * np.arange(256)]
 
-    def _allocate(self, bits: int) -> None:
-        self._bits = bits
-        self._rows = np.zeros((1 << bits, self._words), np.int64)
+    def _grow(self) -> None:
+        size = len(self._rows)
+        larger = np.zeros((2 * size if size < LARGE_TABLE else size + size // 12, self._words), np.int64)
+        voxel_kernels.rehash(self._rows, larger)
+        self._rows = larger
 
     def __len__(self) -> int:
         return self._count
@@ -214,19 +220,25 @@ class VoxelTable:
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
             classes = np.zeros((1, len(self.label_set.names) + 1), np.uint8)
-        while self._count + len(keys) > HIGHEST_LOAD * len(self._rows):
-            old = self._rows
-            self._allocate(self._bits + 1)
-            voxel_kernels.rehash(old, self._rows, self._bits)
-        count = voxel_kernels.fuse(
-            self._rows, self._rows.view(np.int32), self._bits, self._count,
-            keys, pixels, classes, self._log_table, self._floor_percent,
-        )  # fmt: skip
-        if count < 0:
-            raise DataError(
-                "a voxel was seen so often that its evidence overflows; does the vehicle stand for hours?"
-            )
-        self._count = count
+        done = 0
+        while done < len(keys):
+            self._count, done = voxel_kernels.fuse(
+                self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
+                keys, pixels, classes, self._log_table, self._log_percent, self._floor_percent,
+            )  # fmt: skip
+            if done < 0:
+                place = unpack(keys[[-1 - done]])[0]
+                raise DataError(
+                    f"voxel {place.tolist()} was seen so often that its evidence overflows; does the vehicle stand"
+                    " there for hours?"
+                )
+            if done < len(keys):
+                self._grow()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the table takes."""
+        return self._rows.nbytes
 
     def to_map(self) -> VoxelMap:
         """Everything collected so far, sorted by key."""

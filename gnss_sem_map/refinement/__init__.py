@@ -18,6 +18,7 @@ from gnss_sem_map.refinement import count_grid, vehicles
 from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.ground import height_over_ground
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
+from gnss_sem_map.refinement.verdicts import MotionSettings
 from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, softmax
 
@@ -51,6 +52,7 @@ class RefinementSettings(BaseModel):
     )
     columns: CountGridSettings = Field(default=CountGridSettings(), description="Numbers of the count grids.")
     support: VehicleSettings = Field(default=VehicleSettings(), description="Numbers of the vehicle rules.")
+    motion: MotionSettings = Field(default=MotionSettings(), description="Numbers of the evidence of motion.")
 
 
 @dataclass(frozen=True)

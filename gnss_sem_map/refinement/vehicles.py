@@ -92,7 +92,7 @@ def paper(
     clusters = dbscan(indices[members], settings.eps_m / voxel_size_m, settings.min_voxels)
     moving = np.zeros(len(labels), np.bool_)
     objects = []
-    for number, group in enumerate(_groups(clusters)):
+    for number, group in enumerate(groups(clusters)):
         voxels = members[group]
         length = _length(indices[voxels]) * voxel_size_m
         moved = len(voxels) >= settings.largest_parked_voxels or length >= settings.longest_parked_m
@@ -120,7 +120,7 @@ def supported(
     clusters = dbscan(indices[members], settings.eps_m / voxel_size_m, settings.min_voxels)
     kept = np.zeros(len(labels), np.bool_)
     objects = []
-    for number, group in enumerate(_groups(clusters)):
+    for number, group in enumerate(groups(clusters)):
         voxels, share = members[group], over_road[group].mean()
         stands = share > settings.road_share
         kept[voxels] = stands
@@ -134,13 +134,18 @@ def supported(
 
 
 def _describe(
-    number: int, motion: Motion, reason: str, indices: NDArray[np.int32], length_m: float, voxel_size_m: float
+    number: int,
+    motion: Motion,
+    reason: str,
+    indices: NDArray[np.int32],
+    length_m: float,
+    voxel_size_m: float,
 ) -> VehicleObject:
     centre = (indices.mean(axis=0) + 0.5) * voxel_size_m
     return VehicleObject(number, motion, reason, len(indices), centre, float(length_m))
 
 
-def _groups(clusters: NDArray[np.int32]) -> list[NDArray[np.int64]]:
+def groups(clusters: NDArray[np.int32]) -> list[NDArray[np.int64]]:
     """The members of every cluster, noise left out."""
     order = np.argsort(clusters, kind="stable")
     starts = np.searchsorted(clusters[order], np.arange(clusters.max(initial=NOISE) + 1))

@@ -1,0 +1,225 @@
+"""Moving objects by evidence: a segment of one scan that other scans look through was not there to stay.
+
+Every scan is observed once, in time order: its range image and the points of its segments are kept, and those points
+held back from the map. `decide` then follows the segments through time, looks at their places in all scans, and says
+which of the held points belong to something that moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.refinement import range_images
+from gnss_sem_map.refinement.segments import VOXEL_M, find_segments, height_over_ground, near
+from gnss_sem_map.refinement.tracks import Segment
+from gnss_sem_map.refinement.vehicles import groups
+from gnss_sem_map.refinement.verdicts import GONE, MotionSettings, TrackedObject, judge
+from gnss_sem_map.voxel_map import keys_of
+
+FOOT_M, BODY_M = 0.05, 0.2
+"""An object's body begins this high over the lowest ground around; its foot is what lies between, right under it."""
+FOOT_REACH_M = 0.2
+HIDING_M = 0.5
+"""What is nearer by this hides the side of an object."""
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObjects:
+    """Which points of every scan belong to something that moved, and the objects that were judged."""
+
+    points: Mapping[int, NDArray[np.int64]]
+    """Frame number -> places of those points among the points that were observed."""
+    objects: tuple[TrackedObject, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Observation:
+    """What is kept of one scan; h points are held."""
+
+    number: int
+    stamp: float
+    T_lidar_map: NDArray[np.float64]
+    image: NDArray[np.uint16]
+    places: NDArray[np.int64]
+    """(h,) where the held points are in the scan."""
+    p_map: NDArray[np.float64]
+    """(h, 3) m."""
+    is_object: NDArray[np.bool_]
+    """(h,) whether the image calls it a vehicle."""
+    is_body: NDArray[np.bool_]
+    """(h,) whether it is higher than the foot of an object."""
+    segments: NDArray[np.int32]
+    """(h,) segment of the scan; -1 for points that only stand beside one."""
+    cut: NDArray[np.bool_]
+    """(s,) segments that the edge of the view or something nearer cuts."""
+
+
+class MovingObjectDetector:
+    """Collects scans in time order; memory: two windows of scans, 122 kB and the held points of each."""
+
+    def __init__(self, settings: MotionSettings | None = None) -> None:
+        self._settings = settings or MotionSettings()
+        self._observations: list[_Observation] = []
+        self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
+        """Range images and poses of settled scans, which still testify."""
+        self._last_stamp = -np.inf
+
+    def observe(
+        self,
+        number: int,
+        stamp: float,
+        p_map: NDArray[np.float64],
+        T_map_lidar: NDArray[np.float64],
+        is_object: NDArray[np.bool_],
+        is_known: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.bool_]:
+        """Take in one scan, and say which of its points to hold back until `decide`: (n,).
+
+        `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) says
+        which points are called vehicle, `is_known` (n,) which have been called anything (default: all). Raises
+        DataError when the stamps do not increase.
+        """
+        if stamp <= self._last_stamp:
+            raise DataError(
+                f"scan {number} at {stamp:.3f} s follows one at {self._last_stamp:.3f} s;"
+                " give scans in time order, each once"
+            )
+        self._last_stamp = stamp
+        settings = self._settings
+        T_lidar_map = np.asarray(np.linalg.inv(T_map_lidar), np.float64)
+        image = range_images.empty_image()
+        range_images.draw(p_map, T_lidar_map, image)
+        heights = height_over_ground(p_map)
+        above = np.flatnonzero((heights > FOOT_M) & _within(p_map, T_map_lidar, settings.farthest_held_m))
+        body = heights[above] > BODY_M
+        known = np.ones(len(above), np.bool_) if is_known is None else is_known[above]
+        segments = np.full(len(above), -1, np.int32)
+        segments[body], cut = find_segments(
+            p_map[above[body]], is_object[above[body]], known[body], settings.segment_eps_m
+        )
+        cut |= range_images.hidden_sides(p_map[above], segments, T_lidar_map, image, len(cut), HIDING_M)
+        keep = near(p_map[above], segments >= 0, settings.grow_m)
+        places = above[keep]
+        seen = _Observation(
+            number=number,
+            stamp=stamp,
+            T_lidar_map=T_lidar_map,
+            image=image,
+            places=places,
+            p_map=p_map[places],
+            is_object=is_object[places],
+            is_body=body[keep],
+            segments=segments[keep],
+            cut=cut,
+        )
+        self._observations.append(seen)
+        held = np.zeros(len(p_map), np.bool_)
+        held[places] = True
+        return held
+
+    def settle(self) -> MovingObjects:
+        """Decide about the scans that a whole window of later ones has testified on: often none."""
+        window = self._settings.window_scans
+        return self._decide(window) if len(self._observations) >= 2 * window else MovingObjects({}, ())
+
+    def decide(self) -> MovingObjects:
+        """Decide about all scans that are not settled yet."""
+        return self._decide(len(self._observations))
+
+    def _decide(self, count: int) -> MovingObjects:
+        """Decide about the oldest scans, by the testimony of all, and let go of their points."""
+        if count == 0:
+            return MovingObjects({}, ())
+        segments, of_point = _all_segments(self._observations)
+        hits, throughs = self._testimony(np.concatenate(of_point), len(segments))
+        objects = judge(segments, hits, throughs, self._settings)
+        gone = np.zeros(len(segments) + 1, np.bool_)  # the last one: points of no segment
+        for one in objects:
+            gone[list(one.segments)] = one.motion in GONE
+        settled, self._observations = self._observations[:count], self._observations[count:]
+        points = {
+            seen.number: seen.places[_grown(seen, gone[numbers], self._settings.grow_m)]
+            for seen, numbers in zip(settled, of_point, strict=False)
+        }
+        self._past += [(seen.image, seen.T_lidar_map) for seen in settled]
+        del self._past[: -self._settings.window_scans]
+        begun = tuple(one for one in objects if segments[one.segments[0]].scan < count)
+        return MovingObjects(points, begun)
+
+    def _testimony(
+        self, of_point: NDArray[np.int64], count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How often the points of every segment were hit and seen through by other scans: (s,) each."""
+        settings, observations = self._settings, self._observations
+        p_map = np.concatenate([seen.p_map for seen in observations])[of_point >= 0]
+        voxel = np.unique(keys_of(p_map, VOXEL_M), return_inverse=True)[1]
+        points = np.bincount(voxel)
+        centroids = np.stack([np.bincount(voxel, p_map[:, axis]) / points for axis in range(3)], axis=1)
+        hits, throughs = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        witnesses = self._past + [(seen.image, seen.T_lidar_map) for seen in observations]
+        images, poses = zip(*witnesses, strict=True)
+        range_images.look_at(
+            centroids,
+            np.stack(images),
+            np.stack(poses),
+            settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
+            hits, throughs,
+        )  # fmt: skip
+        hits = np.maximum(hits - 1, 0)  # the scan that found it
+        numbers = of_point[of_point >= 0]
+        return _sums(numbers, hits[voxel], count), _sums(numbers, throughs[voxel], count)
+
+
+def _sums(numbers: NDArray[np.int64], values: NDArray[np.int32], count: int) -> NDArray[np.float64]:
+    return np.asarray(np.bincount(numbers, values, count), np.float64)
+
+
+def _within(
+    p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64], reach_m: float
+) -> NDArray[np.bool_]:
+    offset = p_map[:, :2] - T_map_lidar[:2, 3]
+    return np.asarray(np.einsum("ij,ij->i", offset, offset) <= reach_m**2)
+
+
+def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list[NDArray[np.int64]]]:
+    """The segments of all scans in time order, and for each scan that of every held point, -1 for none."""
+    segments: list[Segment] = []
+    of_point = []
+    for scan, seen in enumerate(observations):
+        of_point.append(np.where(seen.segments >= 0, seen.segments + np.int64(len(segments)), -1))
+        for number, part in enumerate(groups(seen.segments)):
+            xy = seen.p_map[part, :2]
+            segments.append(
+                Segment(
+                    scan=scan,
+                    stamp=seen.stamp,
+                    centroid=xy.mean(axis=0),
+                    lowest=xy.min(axis=0),
+                    highest=xy.max(axis=0),
+                    points=len(part),
+                    shown=bool(seen.is_object[part].any()),
+                    cut=bool(seen.cut[number]),
+                )
+            )
+    return segments, of_point
+
+
+def _grown(seen: _Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
+    """The held points of segments that are gone, the bodies beside them and their feet: (h,)."""
+    grown = gone.copy()
+    if not gone.any() or reach_m == 0:
+        return grown
+    rest = np.flatnonzero((seen.segments < 0) & seen.is_body)
+    distances = cKDTree(seen.p_map[gone]).query(seen.p_map[rest], distance_upper_bound=reach_m)[0]
+    grown[rest[np.isfinite(distances)]] = True
+    feet = np.flatnonzero(~seen.is_body)
+    above = cKDTree(seen.p_map[grown, :2])
+    distances = above.query(seen.p_map[feet, :2], distance_upper_bound=FOOT_REACH_M)[0]
+    grown[feet[np.isfinite(distances)]] = True
+    return grown

@@ -1,0 +1,129 @@
+"""The objects of one scan: what the image calls a vehicle, and what stands around the car and is no larger than one."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from gnss_sem_map.refinement.dbscan import dbscan
+from gnss_sem_map.voxel_map import keys_of, unpack
+
+VOXEL_M = 0.2
+PART_M = 0.2
+"""A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
+GROUND_CELL_M = 1.0
+LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 4.0, 0.6
+"""A segment that reaches beyond what the image shows is no larger than this, and one that no image shows no lower."""
+LEAST_POINTS = 20
+"""A segment that no image shows has at least so many points."""
+
+
+@njit(cache=True, nogil=True)
+def _boxes(points, clusters, count):  # type: ignore[no-untyped-def]
+    """Lowest and highest corner of the points (n, d) of every cluster: (count, d) each."""
+    low, high = np.full((count, points.shape[1]), np.inf), np.full((count, points.shape[1]), -np.inf)
+    for i in range(len(points)):
+        for axis in range(points.shape[1]):
+            low[clusters[i], axis] = min(low[clusters[i], axis], points[i, axis])
+            high[clusters[i], axis] = max(high[clusters[i], axis], points[i, axis])
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _whole(low, high):  # type: ignore[no-untyped-def]
+    """The cluster that each one is part of: its own, or the first of vehicle size whose box (s, 2) holds its box."""
+    owners = np.arange(len(low))
+    for i in range(len(low)):
+        for j in range(len(low)):
+            if (
+                np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) <= LONGEST_M
+                and i != j
+                and owners[j] == j
+                and (low[i] >= low[j] - PART_M).all()
+                and (high[i] <= high[j] + PART_M).all()
+            ):
+                owners[i] = j
+                break
+    for i in range(len(low)):  # a holder may have found its own holder later
+        while owners[owners[i]] != owners[i]:
+            owners[i] = owners[owners[i]]
+    return np.searchsorted(np.unique(owners), owners)
+
+
+@njit(cache=True, nogil=True)
+def _cells(p_map, size_m):  # type: ignore[no-untyped-def]
+    """Cell in x and y of every point (n, 3), from 0, and how many cells there are."""
+    cells = np.empty((len(p_map), 2), np.int64)
+    for i in range(len(p_map)):
+        cells[i, 0], cells[i, 1] = np.floor(p_map[i, 0] / size_m), np.floor(p_map[i, 1] / size_m)
+    for axis in range(2):
+        cells[:, axis] -= cells[:, axis].min()
+    return cells, (cells[:, 0].max() + 1, cells[:, 1].max() + 1)
+
+
+@njit(cache=True, nogil=True)
+def _lowest(cells, z, ground):  # type: ignore[no-untyped-def]
+    for i in range(len(z)):
+        ground[cells[i, 0], cells[i, 1]] = min(ground[cells[i, 0], cells[i, 1]], z[i])
+
+
+def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Height of every point of one scan (n, 3) over the lowest of its 1 m cell and the eight around it: (n,) m."""
+    if len(p_map) == 0:
+        return np.zeros(0)
+    cells, shape = _cells(p_map, GROUND_CELL_M)
+    ground = np.full(shape, np.inf)
+    _lowest(cells, p_map[:, 2], ground)
+    ground = ndimage.minimum_filter(ground, size=3, mode="constant", cval=np.inf)
+    return np.asarray(p_map[:, 2] - ground[cells[:, 0], cells[:, 1]])
+
+
+def find_segments(
+    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], is_known: NDArray[np.bool_], eps_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Segment of every point above ground (n, 3), -1 for none; and which segments (s,) the edge of the view cuts.
+
+    `is_object` says which points the image calls a vehicle, `is_known` which it shows at all. A vehicle at the edge
+    of the view goes on in the points around it, if the whole is no larger than a vehicle; else its shown part is a
+    segment, marked as cut. Where nothing is known, whatever has a vehicle's size is a segment.
+    """
+    segments = np.full(len(p_map), -1, np.int32)
+    candidates = np.flatnonzero(is_object | ~is_known)
+    clusters = _cluster(p_map[candidates], eps_m)
+    if len(clusters) == 0:
+        return segments, np.zeros(0, np.bool_)
+    clusters = _whole(*_boxes(p_map[candidates, :2], clusters, clusters.max() + 1))[clusters]
+    shown = np.bincount(clusters, is_object[candidates]) > 0
+    points = np.bincount(clusters)
+    low, high = _boxes(p_map[candidates], clusters, len(points))
+    length, height = np.hypot(*(high - low)[:, :2].T), (high - low)[:, 2]
+    fits = (length <= LONGEST_M) & (height <= HIGHEST_M)
+    fits &= shown | ((height >= LEAST_HEIGHT_M) & (points >= LEAST_POINTS))
+    numbers = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)
+    segments[candidates] = numbers[clusters]
+    rest = candidates[~fits[clusters] & is_object[candidates]]
+    parts = _cluster(p_map[rest], eps_m)
+    segments[rest] = parts + fits.sum()
+    joined = points > np.bincount(clusters, is_object[candidates])  # with points that the image does not show
+    cut = np.zeros(parts.max(initial=-1) + 1, np.bool_)
+    cut[parts] = joined[clusters[~fits[clusters] & is_object[candidates]]]
+    return segments, np.concatenate([np.zeros(fits.sum(), np.bool_), cut])
+
+
+def _cluster(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int32]:
+    """Cluster of every point (n, 3): those of neighbouring 0.2 m voxels belong together."""
+    keys, voxel = np.unique(keys_of(p_map, VOXEL_M), return_inverse=True)
+    return dbscan(unpack(keys), eps_m / VOXEL_M, min_samples=1)[voxel]
+
+
+def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
+    """Points (n, 3) in a square cell of `reach_m` that holds a marked point, or beside one."""
+    if reach_m == 0 or not marked.any():
+        return marked
+    cells, shape = _cells(p_map, reach_m)
+    grid = np.zeros(shape, np.bool_)
+    grid[cells[marked, 0], cells[marked, 1]] = True
+    grid = ndimage.binary_dilation(grid, np.ones((3, 3), np.bool_))
+    return np.asarray(grid[cells[:, 0], cells[:, 1]])

@@ -21,6 +21,8 @@ FITTING_CHI2 = (0.8, 1.3)
 INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 # A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
+# Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
+LONG_ENOUGH_S = 120.0
 # After the second linearisation the constraints are exact to three digits.
 CONSTRAINT_ROUNDS = 2
 
@@ -60,6 +62,8 @@ def calibrate(
     with_time, with_lever = settings.estimate_time_offset, settings.estimate_lever_arm
     calibration = Calibration(0.0, given)
     problem, fit = fit_to(calibration)
+    if with_time is None and problem.intervals.keyframes[-1] - problem.intervals.keyframes[0] < LONG_ENOUGH_S:
+        with_time = False
     if with_time is False and not with_lever:
         return problem, fit, calibration
     least = BEYOND_DOUBT if with_time is None and not with_lever else NEGLIGIBLE

@@ -138,6 +138,8 @@ def optimise(
         graph.push_back(constraint)
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(problem.settings.max_iterations)
+    # Cholesky stalls and throws where a stiff IMU meets weak fixes: short drives, outages
+    params.setLinearSolverType("MULTIFRONTAL_QR")
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
     values = optimiser.optimize()
     if optimiser.iterations() >= problem.settings.max_iterations:

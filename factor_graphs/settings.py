@@ -23,7 +23,7 @@ class SmootherSettings(BaseModel):
     max_speed_mps: float = Field(70.0, gt=0, description="A fix that would need more speed is dropped.")
     estimate_time_offset: bool | None = Field(
         None,
-        description="Find how much later than its stamp a fix is. Empty: only where the data leave no doubt.",
+        description="Find how much later than its stamp a fix is. Empty: only in a long drive that leaves no doubt.",
     )
     estimate_lever_arm: bool = Field(
         False, description="Find where the antenna is, starting from where it is said."

@@ -1,0 +1,318 @@
+"""LiDAR odometry: every sweep, deskewed, against a local map of those before it -> relative poses with covariance.
+
+The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP); what stands here is what it
+needs to be trusted: a start from the trajectory, a covariance that knows which directions the scene leaves open,
+and a verdict on every match. Positions drift, steps do not: the graph takes the steps. No loop is closed here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.relative_poses import RelativePoses
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.deskew import EXTRAPOLATE_S, points_in_map
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
+
+Array = NDArray[np.float64]
+
+# small_gicp takes every point for a small plane of variances (1e-3, 1, 1) m² along and across its normal. Two of
+# them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
+TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
+MAX_ITERATIONS = 30
+# A point's plane is that of so many neighbours. Planes are computed side by side; sums are not, so that they repeat.
+NEIGHBOURS, THREADS = 6, 2
+
+
+class ScanMatchingSettings(BaseModel):
+    """How sweeps are matched; the defaults suit a spinning LiDAR of 16 to 128 beams on a road vehicle."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    nearest_m: float = Field(2.5, ge=0, description="Nearer returns are of the car itself.")
+    farthest_m: float = Field(80.0, gt=0, description="Farther returns are too sparse to match.")
+    downsampling_m: float = Field(0.5, gt=0, description="One point of a sweep per cube of this edge.")
+    voxel_size_m: float = Field(0.5, gt=0, description="Edge of the local map's voxels.")
+    map_scans: int = Field(
+        100, gt=0, description="What was not seen for so many sweeps leaves the local map."
+    )
+    min_points: int = Field(300, gt=0, description="A sweep with fewer downsampled points is not matched.")
+    min_inlier_share: float = Field(0.5, gt=0, le=1, description="Least share of points that find the map.")
+    max_correction_m: float = Field(
+        1.0, gt=0, description="A match farther than this from its start diverged."
+    )
+    max_correction_deg: float = Field(5.0, gt=0, description="Likewise, in rotation.")
+    max_gap_s: float = Field(1.0, gt=0, description="After a longer gap a new local map is begun.")
+    steps: tuple[int, ...] = Field((1, 10), min_length=1, description="Relative poses over so many sweeps.")
+    translation_stddev_m: float = Field(0.005, gt=0, description="No relative position is trusted more.")
+    rotation_stddev_rad: float = Field(0.0005, gt=0, description="No relative rotation is trusted more.")
+    degenerate_share: float = Field(
+        0.001, gt=0, lt=1, description="A direction that less than this share of the points hold is open."
+    )
+    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in an open direction.")
+
+
+@dataclass(frozen=True, eq=False)
+class ScanMatches:
+    """What scan matching found."""
+
+    relative_poses: RelativePoses
+    """Between the stamps of matched sweeps, in the imu frame."""
+    skips: tuple[Skip, ...]
+    """Sweeps that were not matched, each with the reason."""
+    counts: Counter[str]
+    """"scans matched", "scans not matched", "scans with an open direction", "local maps"."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """A sweep in its place in the local map; `covariance` (6, 6) of the tangent in lidar axes."""
+
+    scan: Scan
+    number: int
+    local_map: int
+    T_local_lidar: Array
+    covariance: Array
+    is_open: bool
+
+
+class _NoMatch(Exception):
+    """Why a sweep cannot be matched."""
+
+
+def match_scans(
+    log: SensorLog,
+    trajectory: Trajectory,
+    settings: ScanMatchingSettings | None = None,
+    progress: Progress = silent,
+) -> ScanMatches:
+    """Relative poses from the sweeps of a drive; a drive without a usable sweep has none.
+
+    `trajectory` is the first guess: it deskews every sweep, and its steps are where each registration starts.
+    Sweeps that cannot be read or matched are left out, and reported.
+    """
+    settings = settings or ScanMatchingSettings()
+    odometry = _Odometry(settings)
+    matches: list[_Match] = []
+    skips = []
+    for done, scan in enumerate(log.scans):
+        try:
+            cloud, T_map_lidar = _deskewed(scan, trajectory, log.calibration.T_imu_lidar, settings)
+            matches.append(odometry.match(scan, cloud, T_map_lidar))
+        except (DataError, MeasurementError, _NoMatch) as error:
+            skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
+        progress("scan matching", done + 1, len(log.scans))
+    counts = Counter(
+        {
+            "scans matched": len(matches),
+            "scans not matched": len(skips),
+            "scans with an open direction": sum(match.is_open for match in matches),
+            "local maps": odometry.local_maps,
+        }
+    )
+    pairs = [pair for step in settings.steps for pair in _pairs(matches, step)]
+    return ScanMatches(_relative_poses(pairs, log.calibration.T_imu_lidar, settings), tuple(skips), counts)
+
+
+def _deskewed(
+    scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
+) -> tuple[Array, Array]:
+    """The sweep's points as if all were seen at its stamp (n, 3), lidar frame, and where that is in the map."""
+    points = scan.read()
+    ranges = np.sqrt(np.einsum("ij,ij->i", points.xyz, points.xyz))
+    points = points[(ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)]  # False for NaN
+    T_map_lidar = trajectory.at([scan.stamp], EXTRAPOLATE_S)[0] @ T_imu_lidar
+    p_map = points_in_map(points, scan.stamp, trajectory, T_imu_lidar)
+    return (p_map - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3], T_map_lidar
+
+
+class _Odometry:
+    """The local map, and where the last matched sweep was: in the local map and by the trajectory."""
+
+    def __init__(self, settings: ScanMatchingSettings) -> None:
+        self.local_maps = 0
+        self._settings = settings
+        self._last: tuple[Scan, Array, Array] | None = None
+        self._number = -1
+
+    def match(self, scan: Scan, cloud: Array, T_map_lidar: Array) -> _Match:
+        """Register a sweep and add it to the local map; raises _NoMatch, and leaves the map as it was."""
+        self._number += 1
+        points = self._downsampled(cloud)
+        if self._last is None or scan.stamp - self._last[0].stamp > self._settings.max_gap_s:
+            self._map = small_gicp.GaussianVoxelMap(self._settings.voxel_size_m)
+            self._map.set_lru(horizon=self._settings.map_scans)
+            self.local_maps += 1
+            T, covariance, is_open = np.eye(4), np.zeros((6, 6)), False
+        else:
+            _, T_last, T_map_last = self._last
+            guess = T_last @ np.linalg.inv(T_map_last) @ T_map_lidar
+            T, covariance, is_open = self._register(points, guess)
+        self._map.insert(points, T)
+        self._last = scan, T, T_map_lidar
+        return _Match(scan, self._number, self.local_maps, T, covariance, is_open)
+
+    def _downsampled(self, cloud: Array) -> small_gicp.PointCloud:
+        """One point per cube, each with its plane; sampled by one thread, for two keep other points every time."""
+        settings = self._settings
+        points = small_gicp.PointCloud(cloud)
+        if len(cloud):
+            points = small_gicp.voxelgrid_sampling(points, settings.downsampling_m)
+        if points.size() < settings.min_points:
+            raise _NoMatch(
+                f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
+            )
+        tree = small_gicp.KdTree(points)
+        small_gicp.estimate_covariances(points, tree, NEIGHBOURS, num_threads=THREADS)
+        return points
+
+    def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:
+        settings = self._settings
+        result = small_gicp.align(
+            self._map,
+            points,
+            guess,
+            max_correspondence_distance=settings.voxel_size_m,
+            max_iterations=MAX_ITERATIONS,
+        )
+        T = _rigid(result.T_target_source)
+        found = result.num_inliers / points.size()
+        _refuse_divergence(result.converged, found, np.linalg.inv(guess) @ T, settings)
+        information, weight = _information(result, points)
+        length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
+        return _close_open_directions(guess, T, information, weight, length, settings)
+
+
+def _refuse_divergence(
+    converged: bool, found: float, correction: Array, settings: ScanMatchingSettings
+) -> None:
+    shift = float(np.linalg.norm(correction[:3, 3]))
+    turn = float(np.degrees(Rotation.from_matrix(correction[:3, :3]).magnitude()))
+    if not converged:
+        raise _NoMatch(f"the registration did not converge in {MAX_ITERATIONS} iterations")
+    if found < settings.min_inlier_share:
+        raise _NoMatch(
+            f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
+        )
+    if shift > settings.max_correction_m or turn > settings.max_correction_deg:
+        raise _NoMatch(
+            f"the registration went {shift:.2f} m and {turn:.1f}° from its start, expected at most"
+            f" {settings.max_correction_m:g} m and {settings.max_correction_deg:g}°"
+        )
+
+
+def _information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
+    """What the planes of the scene tell of the pose: (6, 6), lidar axes, and the weight of one point across its plane.
+
+    The registration's own Hessian also holds the weight that it gives along the planes. That is no knowledge of the
+    pose: the centre of a voxel's points lies anywhere on its wall. So it is taken off, for T p with
+    T Exp(r, t): J = [-R [p]x, R]. Residuals of another size than small_gicp presumes rescale the rest.
+    """
+    p = np.asarray(points.points())[:, :3]
+    along = np.zeros((6, 6))
+    along[:3, :3] = np.sum(p * p) * np.eye(3) - p.T @ p
+    along[:3, 3:] = _cross_matrix(p.sum(axis=0))
+    along[3:, :3] = along[:3, 3:].T
+    along[3:, 3:] = len(p) * np.eye(3)
+    planes = result.H - TANGENTIAL_WEIGHT * result.num_inliers / len(p) * along
+    scale = result.num_inliers / max(2 * result.error, 1e-9)  # 1 / mean squared whitened residual
+    return scale * planes, scale * NORMAL_WEIGHT * result.num_inliers
+
+
+def _close_open_directions(
+    guess: Array, T: Array, information: Array, weight: float, length: float, settings: ScanMatchingSettings
+) -> tuple[Array, Array, bool]:
+    """Pose and covariance (6, 6) of a match; along directions that the scene leaves open, the guess stays.
+
+    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length`, so that they
+    compare with translations. A direction is open when its information is below a share of `weight`, that of all
+    points across their planes; its standard deviation is then the setting's.
+    """
+    scale = np.repeat([length, 1.0], 3)
+    eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
+    is_open = eigenvalues < settings.degenerate_share * weight
+    variances = np.where(is_open, settings.degenerate_stddev_m**2, 1 / np.where(is_open, 1.0, eigenvalues))
+    covariance = (axes * variances) @ axes.T / np.outer(scale, scale)
+    if is_open.any():
+        held = axes[:, ~is_open]
+        T = guess @ _exp(held @ (held.T @ (scale * _log(np.linalg.inv(guess) @ T))) / scale)
+    return T, covariance, bool(is_open.any())
+
+
+def _pairs(matches: list[_Match], step: int) -> Iterator[tuple[_Match, _Match]]:
+    """Matched sweeps `step` apart, counted without the missing ones, of one local map.
+
+    Over several sweeps only where none in between had an open direction: there the local map itself has slipped.
+    """
+    slips = np.cumsum([0, *(match.is_open for match in matches)])
+    for i in range(len(matches) - step):
+        earlier, later = matches[i], matches[i + step]
+        if earlier.local_map == later.local_map and (step == 1 or slips[i] == slips[i + step + 1]):
+            yield earlier, later
+
+
+def _relative_poses(
+    pairs: list[tuple[_Match, _Match]], T_imu_lidar: Array, settings: ScanMatchingSettings
+) -> RelativePoses:
+    """Pairs of matches as motion of the imu. Both ends err against the local map, and no less than the floor."""
+    T_lidar_imu = np.linalg.inv(T_imu_lidar)
+    to_imu = _adjoint(T_imu_lidar)
+    floor = np.diag(np.repeat([settings.rotation_stddev_rad**2, settings.translation_stddev_m**2], 3))
+    T, covariances = np.zeros((len(pairs), 4, 4)), np.zeros((len(pairs), 6, 6))
+    for k, (earlier, later) in enumerate(pairs):
+        T_earlier_later = _rigid(np.linalg.inv(earlier.T_local_lidar) @ later.T_local_lidar)
+        back = _adjoint(_inverse(T_earlier_later))
+        in_lidar = later.covariance + back @ earlier.covariance @ back.T
+        T[k] = _rigid(T_imu_lidar @ T_earlier_later @ T_lidar_imu)
+        covariances[k] = to_imu @ in_lidar @ to_imu.T + floor
+    stamps = np.array([(a.scan.stamp, b.scan.stamp) for a, b in pairs]).reshape(-1, 2)
+    return RelativePoses(stamps, T, (covariances + np.swapaxes(covariances, 1, 2)) / 2)
+
+
+def _rigid(T: Array) -> Array:
+    """The nearest rigid transform: products of many drift off the rotations by rounding."""
+    rigid = np.eye(4)
+    rigid[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+    rigid[:3, 3] = T[:3, 3]
+    return rigid
+
+
+def _inverse(T: Array) -> Array:
+    inverse: Array = np.linalg.inv(T)  # type: ignore[assignment]
+    return inverse
+
+
+def _cross_matrix(v: Array) -> Array:
+    return np.cross(v, np.eye(3)).T
+
+
+def _adjoint(T: Array) -> Array:
+    """(6, 6) with T Exp(x) T⁻¹ = Exp(adjoint x), x = (rotation, translation)."""
+    R = T[:3, :3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[3:, :3] = _cross_matrix(T[:3, 3]) @ R
+    return adjoint
+
+
+def _log(T: Array) -> Array:
+    """Rotation vector and translation of a small motion, (6,)."""
+    return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+
+
+def _exp(x: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix()
+    T[:3, 3] = x[3:]
+    return T

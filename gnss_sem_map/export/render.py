@@ -59,17 +59,18 @@ def draw_cubes(centres: NDArray[np.float64], half_m: NDArray[np.float64], camera
     picture = Picture(
         np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int32), np.zeros(shape, np.int8)
     )
-    _draw(
-        centres - camera.eye, half_m, camera.axes, camera.focal_px, picture.depth, picture.cube, picture.face
-    )
+    seen = centres - camera.eye
+    near_first = np.argsort(seen @ camera.axes[2], kind="stable")  # what is hidden then costs little
+    buffers = (picture.depth, picture.cube, picture.face)
+    _draw(seen, half_m, near_first, camera.axes, camera.focal_px, *buffers)
     return picture
 
 
 @njit(cache=True, nogil=True)
-def _draw(centres, half, axes, focal, depth, cube, face):  # type: ignore[no-untyped-def]
+def _draw(centres, half, order, axes, focal, depth, cube, face):  # type: ignore[no-untyped-def]
     """Ray against box (slabs) for all pixels of every cube's bounding square; rays have forward component 1."""
     height, width = depth.shape
-    for i in range(len(centres)):
+    for i in order:
         c, h = centres[i], half[i]
         forward = axes[2, 0] * c[0] + axes[2, 1] * c[1] + axes[2, 2] * c[2]
         reach = 1.7320508 * h
@@ -81,6 +82,8 @@ def _draw(centres, half, axes, focal, depth, cube, face):  # type: ignore[no-unt
         u, v = 0.5 * width + scale * right, 0.5 * height + scale * down
         for row in range(max(0, int(v - spread)), min(height, int(v + spread) + 1)):
             for column in range(max(0, int(u - spread)), min(width, int(u + spread) + 1)):
+                if depth[row, column] <= forward - reach:
+                    continue
                 x, y = (column + 0.5 - 0.5 * width) / focal, (row + 0.5 - 0.5 * height) / focal
                 enter, leave, side = 0.0, np.inf, 0
                 for k in range(3):

@@ -45,8 +45,36 @@ SCHEMES = {
     "hf": "hf:MODEL_OR_FOLDER[?classes=..&scale=1&shrink=2]",
     "onnx": "onnx:FILE[?classes=..&mean=..&std=..&order=rgb|bgr&pixel_max=1|255&scale=1&shrink=2]",
     "python": "python:package.module:callable[?classes=..]",
+    "demo": "demo (for the simulator's images only)",
 }
 """How a segmenter is asked for, by the word before the colon."""
+
+
+DEMO_NETWORK = Path(__file__).parent / "demo_network" / "network.safetensors"
+"""Trained on simulated streets; its README says how, and how well."""
+
+
+def no_segmenter_message(drive: str) -> str:
+    """What to do for a drive of real streets that has no labels: three networks, how to get them, their licences."""
+    lines = [f"{drive}: no segmenter given and no labels found; the map needs one of, for instance:"]
+    for model, about in (
+        ("tue-mps/cityscapes_semantic_eomt_large_1024", "EoMT, best, wants a GPU; MIT licence"),
+        (
+            "facebook/mask2former-swin-large-cityscapes-semantic",
+            "Mask2Former, wants a GPU; licence in its model card",
+        ),
+        (
+            "nvidia/segformer-b1-finetuned-cityscapes-1024-1024",
+            "SegFormer, runs on a CPU; NVIDIA, not for commerce",
+        ),
+    ):
+        lines.append(
+            f"  hf download {model} && gnss-sem-map run {drive} --segmenter hf:{model} ...   ({about})"
+        )
+    lines.append(
+        "Labels that you already have: --segmenter labels:FOLDER. Several runs: `gnss-sem-map segment` once."
+    )
+    return "\n".join(lines)
 
 
 def open_segmenter(
@@ -84,6 +112,11 @@ def open_segmenter(
 
             _only(options, spec, "classes")
             return PythonSegmenter(place, label_set, **options)
+        case "demo":
+            _only(options, spec, "shrink")
+            with _needs("segmentation", spec):
+                from gnss_sem_map.segmentation.checkpoints import open_refinenet
+            return open_refinenet(DEMO_NETWORK, label_set, device, **options)
     raise ConfigError(
         f"segmenter {spec!r}: unknown kind {scheme!r}; expected one of {list(SCHEMES.values())}"
     )
@@ -93,7 +126,7 @@ def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
     scheme, colon, rest = spec.partition(":")
     place, mark, query = rest.partition("?")
     options = dict(parse_qsl(query, keep_blank_values=True))
-    if scheme in SCHEMES and (not colon or not place):
+    if scheme in SCHEMES and scheme != "demo" and (not colon or not place):
         raise ConfigError(f"segmenter {spec!r}: found nothing after {scheme!r}; expected {SCHEMES[scheme]}")
     if mark and not options:
         raise ConfigError(

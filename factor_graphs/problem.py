@@ -25,6 +25,9 @@ GOOD_MEAN = float(3 * chi2.cdf(GATE, 5) / chi2.cdf(GATE, 3))
 # Prior of the first keyframe's position m and speed m/s: finite, and no information.
 START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
 
+# The cost stands still when it changes by less than this share.
+RELATIVE_TOLERANCE = 1e-5
+
 LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
     "quadratic": None,
     "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
@@ -130,29 +133,49 @@ def optimise(
     loss: str,
     constraints: Iterable[gtsam.NonlinearFactor] = (),
 ) -> Fit:
-    """The most probable states (Levenberg-Marquardt); raises EstimationError when it stops at its limit."""
+    """The most probable states, given a loss for the fixes; raises EstimationError when they are not found."""
     graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
     for factor in gnss_factors(problem.fixes, problem.at, problem.p_imu_antenna, kernel):
         graph.push_back(factor)
     for constraint in constraints:
         graph.push_back(constraint)
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(problem.settings.max_iterations)
-    # Cholesky stalls and throws where a stiff IMU meets weak fixes: short drives, outages
-    params.setLinearSolverType("MULTIFRONTAL_QR")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
-    values = optimiser.optimize()
-    if optimiser.iterations() >= problem.settings.max_iterations:
-        raise EstimationError(
-            f"the optimiser stopped at its limit of {problem.settings.max_iterations} iterations, cost "
-            f"{optimiser.error():.4g}; check lever arm and axes of the IMU, or raise max_iterations"
-        )
+    values, iterations = _minimise(graph, start, problem.settings.max_iterations)
     squares = _squares(problem, values)
     good = squares < GATE
     chi2_per_dof = (2 * motion.error(values) + squares[good].sum()) / (GOOD_MEAN * max(good.sum(), 1))
     weights = np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
-    return Fit(
-        inflation, loss, motion, graph, values, optimiser.iterations(), squares, weights, float(chi2_per_dof)
+    return Fit(inflation, loss, motion, graph, values, iterations, squares, weights, float(chi2_per_dof))
+
+
+def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int) -> tuple[gtsam.Values, int]:
+    """Levenberg-Marquardt; where its damping makes it crawl, undamped steps from where it was.
+
+    By QR: Cholesky stalls and throws where a stiff IMU meets weak fixes, in short drives and outages.
+    """
+    damped, undamped = gtsam.LevenbergMarquardtParams(), gtsam.GaussNewtonParams()
+    damped.setMaxIterations(limit)
+    damped.setLinearSolverType("MULTIFRONTAL_QR")
+    undamped.setLinearSolverType("MULTIFRONTAL_QR")
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, damped)
+    try:
+        values = optimiser.optimize()
+        if optimiser.iterations() < limit:
+            return values, optimiser.iterations()
+        newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), np.inf
+        for iteration in range(limit, 2 * limit):
+            newton.iterate()
+            if (
+                abs(cost - newton.error()) <= RELATIVE_TOLERANCE * cost
+                and newton.error() <= optimiser.error()
+            ):
+                return newton.values(), iteration
+            cost = newton.error()
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise EstimationError(f"the equations of the graph have no solution: {reason}") from error
+    raise EstimationError(
+        f"the optimiser stopped at its limit of {limit} iterations, cost {optimiser.error():.4g}; "
+        "check units, axes and lever arm of the log, or raise max_iterations"
     )
 
 

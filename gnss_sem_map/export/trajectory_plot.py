@@ -1,0 +1,111 @@
+"""One picture of a trajectory that an engineer would want to see before believing it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import GnssFixes
+from factor_graphs.smoothing import Solution, heading_stddevs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Array = NDArray[np.float64]
+
+AXES = ("east", "north", "up")
+COLOURS = ("tab:red", "tab:green", "tab:blue")
+
+
+def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
+    """Write track, residuals, standard deviations and biases as one PNG, with rejected fixes and all notes.
+
+    `fixes` are those given to the smoother. The file is written where `path` says, whatever its name ends with.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 10), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(4, 2, width_ratios=[1.1, 1.0])
+    _track(figure.add_subplot(grid[:, 0]), solution, fixes)
+    below = figure.add_subplot(grid[3, 1])
+    for row, draw in enumerate((_residuals, _stddevs, _heading)):
+        axes = figure.add_subplot(grid[row, 1], sharex=below)
+        axes.tick_params(labelbottom=False)
+        draw(axes, solution, fixes)
+    _biases(below, solution)
+    figure.suptitle(_title(solution, fixes), fontsize=10, ha="left", x=0.01)
+    figure.savefig(path, format="png")
+
+
+def _title(solution: Solution, fixes: GnssFixes) -> str:
+    span = solution.trajectory.end - solution.trajectory.start
+    used = int(np.count_nonzero(solution.fix_weights > 0))
+    first = f"{span:.0f} s, {used} of {len(fixes)} fixes used, chi2 per degree of freedom {solution.chi2_per_dof:.2f}"
+    return "\n".join([first, *solution.notes])
+
+
+def _track(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+    positions, rejected = solution.trajectory.positions, solution.rejected
+    axes.plot(*positions[:, :2].T, color="black", linewidth=1.2, label="trajectory")
+    axes.plot(*fixes.positions[~rejected, :2].T, ".", color="tab:blue", markersize=3, label="fixes")
+    axes.plot(*fixes.positions[rejected, :2].T, "x", color="tab:red", markersize=5, label="rejected fixes")
+    axes.plot(*positions[0, :2], "o", color="tab:green", label="start")
+    # a fix kilometres away must not shrink the drive to a dot
+    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+    margin = 30.0 + 0.05 * float(np.max(high - low))
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    axes.set(xlabel="east, m", ylabel="north, m")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="best", fontsize=8)
+    axes.grid(alpha=0.3)
+
+
+def _residuals(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+    for name, colour, residual in zip(AXES, COLOURS, solution.fix_residuals.T, strict=True):
+        good = ~solution.rejected
+        axes.plot(fixes.stamps[good], residual[good], ".", color=colour, markersize=3, label=name)
+    limit = 4.0 * float(np.median(fixes.stddevs, axis=0).max()) if len(fixes) else 1.0
+    far = np.abs(np.nan_to_num(solution.fix_residuals)).max(axis=1)
+    edge = np.full(int(solution.rejected.sum()), limit)
+    axes.plot(
+        fixes.stamps[solution.rejected],
+        np.minimum(edge, far[solution.rejected]),
+        "x",
+        color="black",
+        markersize=4,
+    )
+    axes.set(ylim=(-1.1 * limit, 1.1 * limit), ylabel="fix - antenna, m")
+    axes.legend(loc="upper right", fontsize=7, ncols=3)
+    axes.grid(alpha=0.3)
+
+
+def _stddevs(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+    stddevs = solution.trajectory.position_stddevs
+    for name, colour, stddev in zip(AXES, COLOURS, stddevs.T, strict=True):
+        axes.plot(solution.trajectory.stamps, stddev, color=colour, linewidth=1, label=name)
+    axes.set(ylabel="position stddev, m")
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+
+
+def _heading(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+    stddev = np.degrees(heading_stddevs(solution.trajectory))
+    axes.plot(solution.trajectory.stamps, stddev, color="tab:purple", linewidth=1)
+    axes.set(ylabel="heading stddev, °")
+    axes.set_ylim(bottom=0.0)
+    axes.grid(alpha=0.3)
+
+
+def _biases(axes: "Axes", solution: Solution) -> None:
+    stamps = solution.keyframes.stamps
+    rates = axes.twinx()
+    for i, (name, colour) in enumerate(zip("xyz", COLOURS, strict=True)):
+        axes.plot(stamps, solution.biases[:, i], color=colour, linewidth=1, label=name)
+        rates.plot(stamps, np.degrees(solution.biases[:, 3 + i]), ":", color=colour, linewidth=1.2)
+    axes.set(xlabel="time, s", ylabel="accelerometer bias, m/s² (lines)")
+    rates.set(ylabel="gyroscope bias, °/s (dots)")
+    axes.legend(loc="upper right", fontsize=7, ncols=3)
+    axes.grid(alpha=0.3)

@@ -6,7 +6,9 @@ pixel only; we need all of them (Cheng et al., "MaskFormer", NeurIPS 2021, secti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,6 +23,7 @@ from transformers import (
     AutoTokenizer,
 )
 from transformers.image_processing_base import ImageProcessingMixin
+from transformers.utils import logging
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
@@ -62,30 +65,49 @@ def open_huggingface(
 
 def _load(model: str) -> tuple[Any, Any]:
     try:
-        config = AutoConfig.from_pretrained(model, local_files_only=True)
-        kind: Any
-        if type(config) in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING:
-            kind = AutoModelForUniversalSegmentation
-        elif type(config) in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING:
-            kind = AutoModelForSemanticSegmentation
-        else:
-            raise DataError(
-                f"hf:{model}: a {config.model_type} is no segmentation network; expected one, such as segformer"
+        with _quiet():
+            config = AutoConfig.from_pretrained(model, local_files_only=True)
+            network, report = _kind(config, model).from_pretrained(
+                model, local_files_only=True, output_loading_info=True
             )
-        network, report = kind.from_pretrained(model, local_files_only=True, output_loading_info=True)
+    except DataError:
+        raise
     except (OSError, ValueError, RuntimeError) as error:
-        if isinstance(error, DataError):
-            raise
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(
-            f"hf:{model}: cannot be read ({reason}); get it once with `hf download {model}`"
-        ) from None
+        if not Path(model).is_dir():
+            raise DataError(
+                f"hf:{model}: not on this machine; get it once with `hf download {model}`"
+            ) from None
+        raise DataError(f"hf:{model}: cannot be read ({' '.join(str(error).split())[:200]})") from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
         raise DataError(
             f"hf:{model}: the file lacks {len(unset)} tensors of the network, such as {unset[:3]}"
         )
     return config, network
+
+
+def _kind(config: Any, model: str) -> Any:
+    if not _gives_logits(config):
+        return AutoModelForUniversalSegmentation
+    if type(config) in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING:
+        return AutoModelForSemanticSegmentation
+    raise DataError(
+        f"hf:{model}: a {config.model_type} is no segmentation network; expected one, such as segformer"
+    )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No progress bars and no tables of the library: what is wrong is said by our own errors."""
+    verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity_error()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(verbosity)
+        if bars:
+            logging.enable_progress_bar()
 
 
 def _gives_logits(config: Any) -> bool:

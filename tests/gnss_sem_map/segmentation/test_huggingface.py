@@ -183,6 +183,13 @@ def test_classes_can_be_named_where_the_model_has_only_numbers(tmp_path: Path) -
     assert segment.class_names[:2] == ("sky", "building")
 
 
+def test_opening_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    saved(tmp_path, segformer())
+    capfd.readouterr()
+    open_segmenter(f"hf:{tmp_path}", URBAN, device="cpu")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_model_that_is_not_on_this_machine_is_answered_with_how_to_get_it() -> None:
     with pytest.raises(DataError, match="hf download nobody/nothing"):
         open_segmenter("hf:nobody/nothing", URBAN)

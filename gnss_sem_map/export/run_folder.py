@@ -24,6 +24,7 @@ from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.mapping import label_points
 from gnss_sem_map.pipeline import Result
@@ -70,7 +71,7 @@ def write_run(
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
     with new_folder(out) as folder:
         with result.account.stage("export"):
-            _write_trajectory(folder, log, result.trajectory)
+            _write_trajectory(folder, log, result.trajectory, result.solution)
             tiles.write(result.raw, folder / "map", log.frame)
             tiles.write(result.refined, folder / "refined", log.frame)
             _write_exports(folder, log, result)
@@ -119,19 +120,23 @@ def write_trajectory_run(
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with new_folder(out) as folder:
-        _write_trajectory(folder, log, trajectory)
+        _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, account) | {"trajectory": _about_solution(solution)}
         _write_json(folder / "run.json", about)
     return about
 
 
-def _write_trajectory(folder: Path, log: SensorLog, trajectory: Trajectory) -> None:
+def _write_trajectory(
+    folder: Path, log: SensorLog, trajectory: Trajectory, solution: Solution | None
+) -> None:
     trajectory.save(folder / "trajectory.parquet")
     write_tum(trajectory, folder / "trajectory.tum")
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
     if log.frame is not None:
         write_geojson(trajectory, log.frame, folder / "trajectory.geojson")
+    if solution is not None and log.gnss is not None:
+        write_trajectory_plot(solution, log.gnss, folder / "trajectory.png")
 
 
 def _about_solution(solution: Solution | None) -> dict[str, Any] | None:

@@ -186,7 +186,7 @@ def write_perspective(
 ) -> None:
     """Draw the map as PNG, as a camera sees it that flies behind and above the vehicle, with legend and track.
 
-    The vehicle is where it was at the stamp `at_s`, by default where most of the map lies ahead; without a
+    The vehicle is where it was at the stamp `at_s`, by default where the camera sees most of the map; without a
     trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
     map or when the file cannot be written, and MeasurementError when `at_s` lies outside the trajectory.
     """
@@ -195,8 +195,12 @@ def write_perspective(
         raise DataError(NO_VOXELS)
     centres, labels = semantic_map.voxels.centres[kept], semantic_map.labels[kept]
     if camera is None:
-        seen = centres[visible(semantic_map)[kept]]
-        camera = _from_the_south(seen) if trajectory is None else _behind(trajectory, seen, at_s)
+        framed, voxel_m = visible(semantic_map)[kept], semantic_map.voxels.voxel_size_m
+        if trajectory is None:
+            camera = _from_the_south(centres[framed])
+        else:
+            at_s = _best_stamp(trajectory, centres, framed, voxel_m) if at_s is None else at_s
+            camera = _behind(trajectory, at_s)
     track = np.empty((0, 3)) if trajectory is None else _beads(trajectory)
     half_m = np.repeat([semantic_map.voxels.voxel_size_m / 2, BEAD_M / 2], [len(centres), len(track)])
     palette = np.vstack([semantic_map.voxels.label_set.colours, UNLABELLED_BY_NIGHT])  # -1 is the last
@@ -210,10 +214,8 @@ def write_perspective(
         figure.savefig(file, format="png", dpi=DPI)
 
 
-def _behind(trajectory: Trajectory, centres: NDArray[np.float64], at_s: float | None) -> Camera:
+def _behind(trajectory: Trajectory, at_s: float) -> Camera:
     """Behind and above the vehicle, looking along its way."""
-    if at_s is None:
-        at_s = _busiest(trajectory, centres)
     T_map_imu = trajectory.at([at_s])[0]
     vehicle, forward = T_map_imu[:3, 3], T_map_imu[:3, 0] * (1, 1, 0)
     forward /= np.linalg.norm(forward)
@@ -221,15 +223,21 @@ def _behind(trajectory: Trajectory, centres: NDArray[np.float64], at_s: float | 
     return _camera(vehicle - BEHIND_M * forward + ABOVE_M * up, vehicle + AHEAD_M * forward - BELOW_M * up)
 
 
-def _busiest(trajectory: Trajectory, centres: NDArray[np.float64]) -> float:
-    """The stamp, out of a few, with the most voxels in the 60 m ahead."""
-    stamps = np.linspace(trajectory.start, trajectory.end, 25)
-    some = centres[:: 1 + len(centres) // 100_000, :2]
-    ahead = []
-    for T_map_imu in trajectory.at(stamps):
-        offset = (some - T_map_imu[:2, 3]) @ T_map_imu[:2, :2]
-        ahead.append(np.count_nonzero((offset[:, 0] > 0) & (offset[:, 0] < 60) & (abs(offset[:, 1]) < 20)))
-    return float(stamps[int(np.argmax(ahead))])
+def _best_stamp(
+    trajectory: Trajectory, centres: NDArray[np.float64], framed: NDArray[np.bool_], voxel_m: float
+) -> float:
+    """The stamp, out of a few with some way still ahead, at which the most of the framed voxels are to be seen."""
+    along = _along(trajectory)
+    stamps = trajectory.stamps[along <= max(0.0, along[-1] - AHEAD_M / 2)]
+    stamps = stamps[:: 1 + len(stamps) // 20]
+    seen = []
+    for at_s in stamps:
+        camera = _behind(trajectory, at_s)
+        near = np.flatnonzero(np.linalg.norm(centres - camera.target, axis=1) < 2 * (AHEAD_M + BEHIND_M))
+        sketch = replace(camera, width_px=camera.width_px // 6, height_px=camera.height_px // 6)
+        cubes = np.unique(draw_cubes(centres[near], np.full(len(near), voxel_m / 2), sketch).cube)
+        seen.append(np.count_nonzero(framed[near[cubes[cubes >= 0]]]))
+    return float(stamps[np.argmax(seen)])
 
 
 def _from_the_south(centres: NDArray[np.float64]) -> Camera:
@@ -245,10 +253,14 @@ def _camera(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Camera:
 
 def _beads(trajectory: Trajectory) -> NDArray[np.float64]:
     """Points (n, 3) m along the track, so near to one another that they make a line."""
-    p = trajectory.positions
-    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1)))
+    along = _along(trajectory)
     steps = np.arange(0.0, along[-1], BEAD_M / 2)
-    return np.column_stack([np.interp(steps, along, axis) for axis in p.T])
+    return np.column_stack([np.interp(steps, along, axis) for axis in trajectory.positions.T])
+
+
+def _along(trajectory: Trajectory) -> NDArray[np.float64]:
+    """Way driven up to every pose, (k,) m."""
+    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)))
 
 
 def _lit(

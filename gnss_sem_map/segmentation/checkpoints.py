@@ -148,6 +148,7 @@ def write_network(
     about = {METADATA: json.dumps({"class_names": class_names, "scale": scale})}
     beside = path.with_name(path.name + ".part")
     save_file(tensors, beside, about)
+    beside.chmod(0o644)  # it comes readable by nobody else
     beside.replace(path)
 
 

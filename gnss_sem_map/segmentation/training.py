@@ -36,6 +36,7 @@ from gnss_sem_map.segmentation.pixels import scaled
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 from gnss_sem_map.segmentation.training_data import (
     IGNORE,
+    LabelledFolder,
     LabelledImages,
     augmented,
     class_weights,
@@ -89,8 +90,8 @@ class TrainingReport:
 
 
 def train(
-    training: Sequence[tuple[Path, Path]],
-    validation: Sequence[tuple[Path, Path]],
+    training: Sequence[LabelledFolder],
+    validation: Sequence[LabelledFolder],
     out: Path,
     label_set: LabelSet,
     taxonomy: str = "cityscapes",
@@ -101,7 +102,7 @@ def train(
     resume: bool = False,
     progress: Progress = silent,
 ) -> TrainingReport:
-    """Train on folders of (images, label PNGs) to tell the classes of `label_set` and `other` apart.
+    """Train on folders of images with label PNGs to tell the classes of `label_set` and `other` apart.
 
     `taxonomy` and `ids` say what the ids in the PNGs mean; `initial` is a checkpoint to begin with, whose last layer is
     kept if it has the same class names. `out` gets NETWORK, STATE and LOG; with `resume`, a training that was

@@ -19,6 +19,27 @@ IGNORE = 255
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
+@dataclass(frozen=True)
+class LabelledFolder:
+    """A folder of images, and one of label PNGs with the same names."""
+
+    images: Path
+    labels: Path
+    every: int = 1
+    """Of the images in the order of their names, every so manieth is used: neighbours in a drive are much alike."""
+
+    @classmethod
+    def parse(cls, text: str) -> LabelledFolder:
+        """IMAGES,LABELS or IMAGES,LABELS,EVERY; raises ConfigError for anything else."""
+        parts = text.split(",")
+        every = parts[2] if len(parts) == 3 else "1"
+        if len(parts) not in (2, 3) or not all(parts) or not every.isdecimal() or int(every) < 1:
+            raise ConfigError(
+                f"found {text!r}, expected IMAGES,LABELS or IMAGES,LABELS,EVERY with EVERY from 1"
+            )
+        return cls(Path(parts[0]), Path(parts[1]), int(every))
+
+
 @dataclass(frozen=True, eq=False)
 class LabelledImages:
     """Pairs of image and label files, and how an id becomes a class."""
@@ -53,22 +74,24 @@ class LabelledImages:
 
 
 def labelled_images(
-    folders: Sequence[tuple[Path, Path]], label_set: LabelSet, taxonomy_name: str, ids: str | None = None
+    folders: Sequence[LabelledFolder], label_set: LabelSet, taxonomy_name: str, ids: str | None = None
 ) -> LabelledImages:
-    """Every image of the first folder of each pair with the PNG of the same name in the second.
+    """Every image of the folders, in their order, with the PNG of the same name.
 
     Raises DataError when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
     """
     pairs: list[tuple[Path, Path]] = []
-    for images, labels in folders:
-        found = sorted(p for p in images.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
-        without = [p.name for p in found if not (labels / f"{p.stem}.png").is_file()]
+    for folder in folders:
+        found = sorted(p for p in folder.images.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)[
+            :: folder.every
+        ]
+        without = [p.name for p in found if not (folder.labels / f"{p.stem}.png").is_file()]
         if not found or without:
             raise DataError(
-                f"{images}: found {len(found)} images, {len(without)} without a PNG of the same name in {labels}"
-                f" ({without[:3]}); expected one for each"
+                f"{folder.images}: found {len(found)} images, {len(without)} without a PNG of the same name in"
+                f" {folder.labels} ({without[:3]}); expected one for each"
             )
-        pairs.extend((p, labels / f"{p.stem}.png") for p in found)
+        pairs.extend((p, folder.labels / f"{p.stem}.png") for p in found)
     source = taxonomy(taxonomy_name)
     kind = ids or next(iter(source.ids))
     if kind not in source.ids:

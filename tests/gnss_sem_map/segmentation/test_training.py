@@ -18,7 +18,13 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.training import NETWORK, STATE, TrainingSettings, learning_rate, train
-from gnss_sem_map.segmentation.training_data import IGNORE, augmented, class_weights, labelled_images
+from gnss_sem_map.segmentation.training_data import (
+    IGNORE,
+    LabelledFolder,
+    augmented,
+    class_weights,
+    labelled_images,
+)
 from gnss_sem_map.sensor_log import Image
 
 URBAN = label_set("urban")
@@ -50,7 +56,7 @@ def street(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(pixels + dice.normal(0, 8, pixels.shape), 0, 255).astype(np.uint8), ids
 
 
-def write_streets(folder: Path, seeds: range) -> tuple[Path, Path]:
+def write_streets(folder: Path, seeds: range) -> LabelledFolder:
     images, labels = folder / "images", folder / "labels"
     for path in (images, labels):
         path.mkdir(parents=True)
@@ -58,11 +64,11 @@ def write_streets(folder: Path, seeds: range) -> tuple[Path, Path]:
         pixels, ids = street(seed)
         cv2.imwrite(str(images / f"{seed:06d}.png"), pixels[:, :, ::-1])
         cv2.imwrite(str(labels / f"{seed:06d}.png"), ids)
-    return images, labels
+    return LabelledFolder(images, labels)
 
 
 @pytest.fixture(scope="module")
-def streets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Path, Path]]]:
+def streets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[LabelledFolder]]:
     folder = tmp_path_factory.mktemp("streets")
     return {
         "training": [write_streets(folder / "a", range(6)), write_streets(folder / "b", range(10, 12))],
@@ -192,8 +198,23 @@ def test_rare_classes_weigh_more_and_the_mean_is_one(streets: Any) -> None:
     assert weights[URBAN.index("vehicle")] > weights[URBAN.index("road")]
 
 
-def broken(folder: Path, what: str) -> tuple[Path, Path]:
-    images, labels = write_streets(folder, range(2))
+def test_of_a_drive_every_so_manieth_image_is_used_in_the_order_of_the_names(tmp_path: Path) -> None:
+    folder = write_streets(tmp_path, range(7))
+    thinned = LabelledFolder.parse(f"{folder.images},{folder.labels},3")
+    data = labelled_images([folder, thinned], URBAN, "cityscapes")
+    assert [int(image.stem) for image, _ in data.pairs] == [*range(7), 0, 3, 6]
+    assert all(image.stem == label.stem for image, label in data.pairs)
+
+
+@pytest.mark.parametrize("text", ["", "images", "images,", "a,b,0", "a,b,-1", "a,b,c", "a,b,1,2"])
+def test_a_folder_that_is_not_well_said_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="IMAGES,LABELS"):
+        LabelledFolder.parse(text)
+
+
+def broken(folder: Path, what: str) -> LabelledFolder:
+    written = write_streets(folder, range(2))
+    images, labels = written.images, written.labels
     match what:
         case "no labels":
             (labels / "000001.png").unlink()
@@ -211,7 +232,7 @@ def broken(folder: Path, what: str) -> tuple[Path, Path]:
         case "empty":
             for file in images.iterdir():
                 file.unlink()
-    return images, labels
+    return written
 
 
 @pytest.mark.parametrize(

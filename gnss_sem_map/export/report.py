@@ -40,6 +40,14 @@ FILES = {
     "run.json": "what this page says of the run, for programs",
     "metrics.json": "what this page says of the evaluation, for programs",
 }
+WORDS = {
+    "SA": "static points kept (SA)",
+    "DA": "points on moving vehicles removed (DA)",
+    "AA": "both, geometric mean (AA)",
+    "SA_vehicle": "points on parked vehicles kept",
+    "ece": "expected calibration error (ECE)",
+    "ate_m": "absolute trajectory error (m)",
+}
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260
 
@@ -63,8 +71,8 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
             "Map", _picture(folder, "topview.png"), _classes(run.get("map", {}), metrics.get("semantics", {}))
         ),
         _section("Refinement", _refinement(run.get("map", {}).get("refinement", {}))),
-        _section("Moving vehicles", _pairs(metrics.get("dynamic", {}))),
-        _section("Confidence", _pairs(metrics.get("calibration", {}))),
+        _section("Moving vehicles", _pairs(_shares(metrics.get("dynamic", {})))),
+        _section("Confidence", _pairs(_shares(metrics.get("calibration", {})))),
         _section(
             "Trajectory",
             _picture(folder, "trajectory.png"),
@@ -143,12 +151,13 @@ def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
     if not columns:
         return ""
     rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
-    coverage = {
-        f"of the evaluated points the {stage} map labels": _percent(scores.get("coverage"))
-        for stage, scores in semantics.items()
-    }
+    remarks = {}
+    for stage, scores in semantics.items():
+        strict = scores.get("strict", {}).get("mean_iou")
+        remarks[f"evaluated points that the {stage} map labels"] = _percent(scores.get("coverage"))
+        remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = _percent(strict)
     known = {key: about_map[key] for key in ("voxels", "points") if key in about_map}
-    return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(coverage)
+    return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(remarks)
 
 
 def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage: str) -> list[str]:
@@ -230,6 +239,11 @@ def _percent(share: float | None) -> str | None:
     return None if share is None else f"{100 * share:.1f} %"
 
 
+def _shares(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with every fraction as a percentage."""
+    return {key: _percent(value) if isinstance(value, float) else value for key, value in values.items()}
+
+
 def _value(value: Any) -> str:
     match value:
         case None:
@@ -247,6 +261,8 @@ def _value(value: Any) -> str:
 
 
 def _words(key: str) -> str:
-    """`peak_memory_mb` -> `peak memory (MB)`."""
+    """`peak_memory_mb` -> `peak memory (MB)`, and some abbreviations spelt out."""
+    if key in WORDS:
+        return WORDS[key]
     *words, last = key.split("_")
     return " ".join([*words, f"({UNITS[last]})"] if words and last in UNITS else [*words, last])

@@ -170,7 +170,7 @@ def _plan(route: list[Node]) -> dict[tuple[tuple[Node, Node], bool], tuple[str, 
     """
     wanted = [
         [("tight", ["house", "wall garden", "house"]), ("sidewalk", ["house", "fence garden", "house"])],
-        [("kerb", ["wall garden", "house", "court"]), ("tight", ["house", "hedge garden", "house"])],
+        [("kerb", ["wall garden", "court", "house"]), ("tight", ["house", "hedge garden", "house"])],
         [("tight", ["court", "house", "wall garden"]), ("kerb", ["house", "park", "house"])],
     ]
     plan = {}
@@ -251,7 +251,7 @@ def _court(builder: _Builder, side: Side, along: float, width: float, depth: flo
     low, high = np.minimum(a, b), np.maximum(a, b)
     builder.patches.append((side.block, [low[0], high[0], low[1], high[1], float(Surface.PARKING)]))
     for at in np.arange(along + 1.6, along + width - 1.3, 2.45):
-        if rng.random() < 0.85:
+        if rng.random() < 0.92:
             turn = np.pi / 2 if rng.random() < 0.7 else -np.pi / 2
             builder.park(
                 side, float(at), depth + 3.2 + float(rng.normal(0, 0.15)), turn, int(rng.integers(0, 4))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -209,34 +210,25 @@ def _colour(rng: np.random.Generator) -> Colour:
 
 
 def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
-    """Traffic against the drive on every street of the route, some of it stop and go, and a cyclist."""
-    for number, (a, b) in enumerate(zip(town.route[1:-1], town.route[2:], strict=True)):
+    """Traffic against the drive on every street of the route, some of it stop and go; a cyclist on the first."""
+    for number, (a, b) in enumerate(pairwise(town.route[1:])):
         step = (b[0] - a[0], b[1] - a[1])
         nodes = _within(town, [(b[0] + k * step[0], b[1] + k * step[1]) for k in (2, 1, 0, -1, -2)])
-        path = _path(town, lane_path(town.streets, nodes))
-        reach, bicycle = (
-            path.way[-1],
-            np.diff(town.streets.position(nodes[-1]) - town.streets.position(nodes[0])),
-        )
+        lane = lane_path(town.streets, nodes)
+        if number == 0:
+            edge = _path(town, _shifted(lane, town.streets.half_width(a, b) - 2.6 - LANE_M))
+            for share in np.linspace(0.15, 0.75, 13):
+                motion = _drive(edge, seconds, start=float(share * edge.way[-1]), speed=4.0, limit=4.2)
+                if crowd.admit("cyclist", CYCLIST, _CLOTHES[1], motion):
+                    break
+        path = _path(town, lane)
         for k in range(8):
-            start = float(rng.uniform(0.05, 0.7) * reach)
+            start = float(rng.uniform(0.05, 0.7) * path.way[-1])
             halt = (start + float(rng.uniform(15, 40)), float(rng.uniform(6, 14)))
             stops = [halt, (halt[0] + 9.0, halt[1] + 5.0)] if k % 3 == 0 else []
             speed = float(rng.uniform(5.5, 8.5))
             motion = _drive(path, seconds, start=start, speed=speed, limit=speed + 1.0, stops=stops)
-            crowd.admit(
-                "stop and go" if stops else "oncoming",
-                int(rng.choice([0, 1, 2, 3, 4, 5])),
-                _colour(rng),
-                motion,
-            )
-        if number == 0 and bicycle.size:
-            kerb = town.streets.half_width(a, b) - 2.6
-            side = _path(town, _shifted(lane_path(town.streets, nodes), kerb - LANE_M))
-            for share in (0.35, 0.45, 0.25, 0.55):
-                motion = _drive(side, seconds, start=share * side.way[-1], speed=4.0, limit=4.2)
-                if crowd.admit("cyclist", CYCLIST, _CLOTHES[1], motion):
-                    break
+            crowd.admit("stop and go" if stops else "oncoming", int(rng.integers(0, 6)), _colour(rng), motion)
 
 
 def _shifted(uv: Floats, right: float) -> Floats:

@@ -60,6 +60,8 @@ class TrackedObject:
     motion: Motion
     probability: float
     """That it moved."""
+    displaced: bool
+    """It was seen to go elsewhere."""
     reason: str
     segments: tuple[int, ...]
     """Places in the list of all segments."""
@@ -117,9 +119,10 @@ def _verdict(
     moved = displacement_of([segments[n] for n in members])
     displaced = 0.0
     if moved and moved.speed_m_s > settings.least_speed_m_s and moved.shift_m > 0:
+        away = _away(members, segments, settings.least_shift_m)
         # on less than its length it covers its own places: they must be the more often empty
         least = settings.least_through_per_hit * max(1.0, LENGTH_M / moved.shift_m)
-        if through > least * hit:
+        if throughs[away].sum() > least * hits[away].sum():
             displaced = float(ndtr((moved.shift_m - settings.least_shift_m) / SHIFT_STDDEV_M))
     reason = f"seen through {through:.0f} times, hit {hit:.0f} times"
     if moved and displaced > 0.5:
@@ -130,7 +133,14 @@ def _verdict(
         motion = Motion.STOPPED_AND_LEFT if stood else Motion.MOVING
     else:
         motion = Motion.PARKED if hit > 0 else Motion.UNKNOWN
-    return _describe(members, segments, motion, max(vanished, displaced), reason)
+    return _describe(members, segments, motion, max(vanished, displaced), reason, displaced > 0.5)
+
+
+def _away(members: list[int], segments: list[Segment], reach_m: float) -> list[int]:
+    """The segments of a track that are not where it was most of the time: a mover may have stood there for long."""
+    centroids = np.array([segments[n].centroid for n in members])
+    distances = np.linalg.norm(centroids - np.median(centroids, axis=0), axis=1)
+    return [n for n, distance in zip(members, distances, strict=True) if distance > reach_m]
 
 
 def _nameless(
@@ -141,10 +151,11 @@ def _nameless(
     settings: MotionSettings,
 ) -> list[TrackedObject]:
     """A track that no image ever showed: it must have gone elsewhere, and its places been empty at other times."""
-    if throughs[members].sum() <= settings.through_per_hit * hits[members].sum():
+    away = _away(members, segments, settings.least_shift_m)
+    if throughs[away].sum() <= settings.through_per_hit * hits[away].sum():
         return []
     whole = _verdict(members, segments, hits, throughs, settings)
-    return [whole] if "both ends" in whole.reason else []
+    return [whole] if whole.displaced else []
 
 
 def _probability(through: float, hit: float) -> float:
@@ -161,12 +172,18 @@ def _probability(through: float, hit: float) -> float:
 
 
 def _describe(
-    members: list[int], segments: list[Segment], motion: Motion, probability: float, reason: str
+    members: list[int],
+    segments: list[Segment],
+    motion: Motion,
+    probability: float,
+    reason: str,
+    displaced: bool = False,
 ) -> TrackedObject:
     parts = [segments[n] for n in members]
     return TrackedObject(
         motion=motion,
         probability=probability,
+        displaced=displaced,
         reason=reason,
         segments=tuple(members),
         points=sum(part.points for part in parts),

@@ -161,7 +161,7 @@ def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int
         values = optimiser.optimize()
         if optimiser.iterations() < limit:
             return values, optimiser.iterations()
-        newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), np.inf
+        newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), optimiser.error()
         for iteration in range(limit, 2 * limit):
             newton.iterate()
             if (

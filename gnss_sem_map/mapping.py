@@ -1,11 +1,23 @@
-"""From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7)."""
+"""From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
+
+A drive is mapped in chunks of scans that know nothing of each other: in memory for a short one, else one after another
+or in several processes, each chunk put away on disk (`chunks`), so that memory does not grow with the drive and an
+interrupted run goes on where it was. Sums are integers: all of these give the same bytes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from itertools import islice
+import hashlib
+import multiprocessing
+import pickle
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +26,24 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import labels
 from gnss_sem_map.account import Account, Progress, silent
+from gnss_sem_map.chunks import ChunkStore, open_store
 from gnss_sem_map.config import Settings
-from gnss_sem_map.deskew import usable_points_in_map
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.labelling import ClassImage, class_image, exposure_stamp, pixels_seen
-from gnss_sem_map.segmentation import MissingLabels, Segmenter
-from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
-from gnss_sem_map.voxel_map import MappingSettings, SemanticMap, State, VoxelMap, VoxelTable, keys_of
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.seen_scans import Drive, look_at, map_points
+from gnss_sem_map.segmentation import Segmenter
+from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
 
-READ_AHEAD = 4
+SCANS_PER_CHUNK = 100
+STATIC, REMOVED = "static", "removed"
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """What stands, and what was seen moving: no point is in both."""
+
+    static: VoxelMap
+    removed: VoxelMap
 
 
 def build_map(
@@ -33,56 +54,99 @@ def build_map(
     account: Account,
     progress: Progress = silent,
 ) -> VoxelMap:
-    """Every point of every scan, at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7)."""
-    label_set = labels.label_set(settings.classes)
-    table = VoxelTable(settings.mapping.voxel_size_m, label_set, settings.labelling.probability_floor)
-    look = _Look(log, segmenter, settings, account)
-    for done, (scan, points, classes) in enumerate(_read_ahead(log.scans, look)):
-        if points is not None:
-            _fuse_scan(table, scan, points, classes, log, trajectory, settings, account)
-        progress("mapping", done + 1, len(log.scans))
-    if not account.counts["scans"]:
-        why = f"; first reason: {account.skips[0].where}: {account.skips[0].reason}" if account.skips else ""
-        raise DataError(f"{log.name}: none of {len(log.scans)} scans can be used{why}")
-    if not account.counts["points labelled"]:
-        account.warnings.append("no point got a label: the map shows geometry only")
-    return table.to_map()
+    """Every point of every scan in one map, in memory; see `build_maps`."""
+    return build_maps(Drive(log, trajectory, segmenter, settings), account, progress).static
 
 
-def _fuse_scan(
-    table: VoxelTable,
-    scan: Scan,
-    points: Points,
-    classes: tuple[Image, ClassImage] | None,
-    log: SensorLog,
-    trajectory: Trajectory,
-    settings: Settings,
+def build_maps(
+    drive: Drive,
     account: Account,
-) -> None:
-    try:
-        p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
-    except MeasurementError as error:
-        account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
-        return
-    pixels = None
-    if classes is not None:
-        image, class_pixels = classes
-        stamp = exposure_stamp(image, log.calibration, settings.labelling)
-        pixels = pixels_seen(p_map, stamp, trajectory, log.calibration, class_pixels, settings.labelling)
-        account.counts["points labelled"] += int(np.count_nonzero(pixels >= 0))
-    table.add(table.keys_of(p_map), pixels, classes[1].rows if classes is not None else None)
-    account.counts["scans"] += 1
-    account.counts["points"] += len(valid)
-    account.counts["points left out"] += len(valid) - len(p_map)
+    progress: Progress = silent,
+    *,
+    work: Path | None = None,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
+    scans_per_chunk: int = SCANS_PER_CHUNK,
+) -> Maps:
+    """Every point of every scan, at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
+
+    `work` is a folder for what is mapped so far; with `resume` what an interrupted run left there is used (of the same
+    drive, settings and `labels_from`, which says where the labels come from). The caller removes it. `workers`
+    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or belongs to
+    something else.
+    """
+    scans = drive.log.scans
+    _warn(drive, account)
+    if work is None and workers == 1:
+        static, removed = fuse_scans(drive, scans, account, progress)
+        maps = Maps(static.to_map(), removed.to_map())
+    else:
+        with _folder(work) as folder:
+            store = map_chunks(
+                drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from,
+                scans_per_chunk=scans_per_chunk,
+            )  # fmt: skip
+            maps = Maps(store.whole(STATIC), store.whole(REMOVED))
+    _check(drive, account)
+    return maps
 
 
-def map_points(
-    points: Points, scan: Scan, trajectory: Trajectory, log: SensorLog, settings: MappingSettings
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The points of a sweep that are finite and in range, in the map (m, 3) m, and which of all those are (n,)."""
-    return usable_points_in_map(
-        points, scan.stamp, trajectory, log.calibration.T_imu_lidar, settings.nearest_m, settings.farthest_m
+def map_chunks(
+    drive: Drive,
+    work: Path,
+    account: Account,
+    progress: Progress = silent,
+    *,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
+    scans_per_chunk: int = SCANS_PER_CHUNK,
+) -> ChunkStore:
+    """Map a drive into a folder of chunks, whose tiles can be read one by one; memory does not grow with the drive."""
+    scans = drive.log.scans
+    label_set = labels.label_set(drive.settings.classes)
+    store = open_store(
+        work,
+        fingerprint(drive, labels_from, scans_per_chunk),
+        resume,
+        drive.settings.mapping.voxel_size_m,
+        label_set,
     )
+    chunks = dict(enumerate(scans[i : i + scans_per_chunk] for i in range(0, len(scans), scans_per_chunk)))
+    done = sum(len(chunks[number]) for number in store.done())
+    pending = [number for number in chunks if number not in store.done()]
+    for number in _map_all(
+        drive, store, {n: chunks[n] for n in pending}, workers, _shifted(progress, done, len(scans))
+    ):
+        done += len(chunks[number])
+        progress("mapping", done, len(scans))
+    for record in store.records():
+        account.counts.update(record["counts"])
+        account.skips.extend(Skip(**skip) for skip in record["skips"])
+    return store
+
+
+def fuse_scans(
+    drive: Drive, scans: Sequence[Scan], account: Account, progress: Progress = silent
+) -> tuple[VoxelTable, VoxelTable]:
+    """Fuse some scans of a drive: what stands, and what belongs to something that moved."""
+    settings = drive.settings
+    label_set, floor = labels.label_set(settings.classes), settings.labelling.probability_floor
+    static, removed = (VoxelTable(settings.mapping.voxel_size_m, label_set, floor) for _ in range(2))
+    for done, seen in enumerate(look_at(drive, scans, account)):
+        if seen is not None:
+            keys = static.keys_of(seen.p_map)
+            moved = np.zeros(len(keys), np.bool_)
+            if drive.moving is not None:
+                moved[drive.moving.get(seen.scan.number, [])] = True
+            if moved.any():
+                removed.add(keys[moved], seen.pixels[moved], seen.classes)
+                static.add(keys[~moved], seen.pixels[~moved], seen.classes)
+            else:
+                static.add(keys, seen.pixels, seen.classes)
+        progress("mapping", done + 1, len(scans))
+    return static, removed
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,56 +191,120 @@ def _look_up(semantic_map: SemanticMap, keys: NDArray[np.int64], valid: NDArray[
     return found
 
 
-class _Look:
-    """What a scan's image shows: read, segmented, and counted when there is nothing to see."""
-
-    def __init__(
-        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account
-    ) -> None:
-        self._log, self._segmenter, self._account = log, segmenter, account
-        self._within_s = settings.labelling.image_within_s
-        self._label_set = labels.label_set(settings.classes)
-        if segmenter is None:
-            account.warnings.append("no segmenter: the map shows geometry only")
-        elif not log.images or not log.calibration.has_camera:
-            account.warnings.append(f"{log.name} has no images: the map shows geometry only")
-
-    def __call__(self, scan: Scan) -> tuple[Points | None, tuple[Image, ClassImage] | None]:
-        try:
-            points = scan.read()
-        except DataError as error:
-            self._account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
-            return None, None
-        size = self._log.calibration.image_size
-        if self._segmenter is None or size is None or not self._log.images:
-            return points, None
-        image = self._log.image_at(scan.stamp, self._within_s)
-        if image is None:
-            self._account.skips.append(Skip("labels", f"frame {scan.number}", "no image near its stamp"))
-            return points, None
-        try:
-            where = f"labels of image {image.number}"
-            seen = self._segmenter(image)
-            return points, (
-                image,
-                class_image(seen, self._segmenter.class_names, self._label_set, size, where),
-            )
-        except MissingLabels as error:
-            self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
-            return points, None
+def _warn(drive: Drive, account: Account) -> None:
+    if drive.segmenter is None:
+        account.warnings.append("no segmenter: the map shows geometry only")
+    elif not drive.log.images or not drive.log.calibration.has_camera:
+        account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _read_ahead(
-    scans: tuple[Scan, ...], look: _Look
-) -> Iterator[tuple[Scan, Points | None, tuple[Image, ClassImage] | None]]:
-    """Scans with what they and their images hold, in order; files are read and decoded a few ahead, in a thread."""
-    with ThreadPoolExecutor(max_workers=1) as thread:
-        waiting = iter(scans)
-        ahead: list[tuple[Scan, Future[tuple[Points | None, tuple[Image, ClassImage] | None]]]] = [
-            (scan, thread.submit(look, scan)) for scan in islice(waiting, READ_AHEAD)
-        ]
-        while ahead:
-            scan, reading = ahead.pop(0)
-            points, classes = reading.result()
-            ahead.extend((later, thread.submit(look, later)) for later in islice(waiting, 1))
-            yield scan, points, classes
+def _check(drive: Drive, account: Account) -> None:
+    if not account.counts["scans"]:
+        why = f"; first reason: {account.skips[0].where}: {account.skips[0].reason}" if account.skips else ""
+        raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
+    if not account.counts["points labelled"]:
+        account.warnings.append("no point got a label: the map shows geometry only")
+
+
+@contextmanager
+def _folder(work: Path | None) -> Iterator[Path]:
+    if work is not None:
+        yield work
+        return
+    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        yield Path(folder)
+
+
+def _shifted(progress: Progress, done: int, total: int) -> Progress:
+    return lambda stage, more, _: progress(stage, done + more, total)
+
+
+Chunks = Mapping[int, Sequence[Scan]]
+
+
+def _map_all(
+    drive: Drive, store: ChunkStore, chunks: Chunks, workers: int, progress: Progress
+) -> Iterator[int]:
+    """Map these chunks and put them away; yields the number of each that is done."""
+    if workers == 1 or len(chunks) < 2:
+        done = 0
+        for number, scans in chunks.items():
+            _map_chunk(drive, store, number, scans, _shifted(progress, done, 0))
+            done += len(scans)
+            yield number
+        return
+    _check_sendable(drive)
+    context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
+    try:
+        with ProcessPoolExecutor(min(workers, len(chunks)), context, _start, (drive, store)) as pool:
+            jobs = {pool.submit(_work, number, scans): number for number, scans in chunks.items()}
+            try:
+                for job in as_completed(jobs):
+                    job.result()
+                    yield jobs[job]
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    except BrokenProcessPool:
+        raise DataError(
+            f"{store.folder}: a worker process died, perhaps for lack of memory; take fewer --workers, and --resume"
+        ) from None
+
+
+def _map_chunk(
+    drive: Drive, store: ChunkStore, number: int, scans: Sequence[Scan], progress: Progress = silent
+) -> None:
+    account = Account()
+    static, removed = fuse_scans(drive, scans, account, progress)
+    record = {"counts": dict(account.counts), "skips": [asdict(skip) for skip in account.skips]}
+    store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)
+
+
+_OF_THIS_WORKER: list[tuple[Drive, ChunkStore]] = []
+
+
+def _start(drive: Drive, store: ChunkStore) -> None:
+    _OF_THIS_WORKER[:] = [(drive, store)]
+
+
+def _work(number: int, scans: Sequence[Scan]) -> None:
+    drive, store = _OF_THIS_WORKER[0]
+    _map_chunk(drive, store, number, scans)
+
+
+def _check_sendable(drive: Drive) -> None:
+    try:
+        pickle.dumps(drive.segmenter)
+    except Exception as error:  # noqa: BLE001 (an object may refuse in any way)
+        raise ConfigError(
+            f"this segmenter cannot work in several processes ({error}); write its probabilities with"
+            " `gnss-sem-map segment` first and use labels:FOLDER, or leave out --workers"
+        ) from None
+
+
+def fingerprint(drive: Drive, labels_from: str, scans_per_chunk: int) -> str:
+    """What two runs share when one may go on with what the other left: everything that decides the map."""
+    log, settings = drive.log, drive.settings
+    names = () if drive.segmenter is None else drive.segmenter.class_names
+    said = [
+        log.name, scans_per_chunk, labels_from, list(names), settings.classes,
+        settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
+        [(scan.name, scan.number, scan.stamp) for scan in log.scans],
+        [(image.number, image.stamp) for image in log.images],
+        log.calibration.image_size, log.calibration.camera_time_offset_s,
+    ]  # fmt: skip
+    digest = hashlib.sha256(repr(said).encode())
+    for array in _arrays(drive):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
+    calibration, trajectory = drive.log.calibration, drive.trajectory
+    yield from (trajectory.stamps, trajectory.T_map_imu, calibration.T_imu_lidar)
+    for array in (trajectory.velocities, calibration.T_camera_lidar, calibration.K):
+        if array is not None:
+            yield array
+    for number, places in sorted((drive.moving or {}).items()):
+        yield np.array([number])
+        yield places

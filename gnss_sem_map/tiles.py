@@ -2,152 +2,280 @@
 
 A tile `x_y.parquet` holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key
 (x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the decision for each voxel. Keys are sorted
-and delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them.
+and delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is there, whole, or not
+there; `map.json` knows the checksum of every tile.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from itertools import pairwise
+import os
+import re
+import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map import labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_OFFSET
 from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack, unpack
 
 TILE_BITS = 9
 Z_BITS = 14
 Z_OFFSET = 1 << (Z_BITS - 1)
-FORMAT = 1
+FORMAT = 2
+Tile = tuple[int, int]
+NAME = re.compile(r"(-?\d+)_(-?\d+)\.parquet")
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
     """Write a map into a new folder; raises DataError for voxels more than 2^13 above or below the origin."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    folder.mkdir(parents=True)
     voxels = semantic_map.voxels
-    tiles, local = _split(voxels.keys)
-    order = np.lexsort((local, tiles[:, 1], tiles[:, 0]))
-    tiles, local = tiles[order], local[order]
-    edges = [0, *(np.flatnonzero(np.diff(tiles, axis=0).any(axis=1)) + 1).tolist(), len(tiles)]
-    ranges = [(start, end) for start, end in pairwise(edges) if start < end]
-    columns = _columns(semantic_map)
-    for start, end in ranges:
-        rows = order[start:end]
-        table = pa.table(
-            {"key": local[start:end], **{name: values[rows] for name, values in columns.items()}}
-        )
-        whole = [name for name in table.column_names if name != "confidence"]
-        pq.write_table(
-            table, folder / f"{tiles[start, 0]}_{tiles[start, 1]}.parquet", compression="zstd", use_dictionary=False,
-            column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED") | {"confidence": "BYTE_STREAM_SPLIT"},
-        )  # fmt: skip
-    (folder / "map.json").write_text(json.dumps(_about(voxels, frame, len(ranges)), indent=1) + "\n", "utf-8")
+    pieces = ((tile, _piece(semantic_map, places)) for tile, places in _places_by_tile(voxels.keys))
+    write_tiles(pieces, folder, frame, voxels.voxel_size_m, voxels.label_set)
 
 
-def read(folder: Path, label_set: LabelSet) -> SemanticMap:
-    """Read a map that `write` wrote; raises DataError when it is damaged or of another class set."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+def write_tiles(
+    pieces: Iterable[tuple[Tile, SemanticMap]],
+    folder: Path,
+    frame: LocalFrame | None,
+    voxel_size_m: float,
+    label_set: LabelSet,
+) -> None:
+    """Write a map that comes tile by tile, each tile once, into a new folder: one tile at a time is in memory.
 
+    Raises DataError when the folder exists, the disk is full, or a voxel is more than 2^13 above or below the origin.
+    """
+    if folder.exists():
+        raise DataError(f"{folder}: exists; remove it or choose another folder")
+    beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    files: dict[str, dict[str, Any]] = {}
+    points = 0
+    try:
+        beside.mkdir(parents=True)
+        for (x, y), piece in pieces:
+            content = _encode(piece)
+            (beside / f"{x}_{y}.parquet").write_bytes(content)
+            checksum = hashlib.sha256(content).hexdigest()
+            files[f"{x}_{y}.parquet"] = {"voxels": len(piece), "sha256": checksum}
+            points += int(piece.voxels.hits.sum())
+        about = _about(voxel_size_m, label_set, frame, files, points)
+        (beside / "map.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+        beside.rename(folder)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot write the map ({error.strerror}); free the disk or choose another place"
+        ) from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def read(
+    folder: Path, label_set: LabelSet | None = None, box: tuple[ArrayLike, ArrayLike] | None = None
+) -> SemanticMap:
+    """Read a map, or only the voxels whose centres lie in a box (low, high), each (3,) m: only its tiles are opened.
+
+    Without `label_set` the class set that the map names. Raises DataError when the map is damaged, incomplete, or of
+    another class set.
+    """
     about = _read_about(folder / "map.json")
+    label_set = label_set or labels.label_set(str(about.get("class_set")))
     if tuple(about["classes"]) != label_set.names:
         raise DataError(f"{folder}: found classes {about['classes']}, expected {list(label_set.names)}")
-    names = ["key", *(f"log_{name}" for name in label_set.names), "hits", "label", "confidence", "state"]
-    parts: list[dict[str, NDArray[Any]]] = []
-    for path in sorted(folder.glob("*.parquet")):
-        try:
-            table = pq.read_table(path, columns=names)
-            x, y = (int(part) for part in path.stem.split("_"))
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise DataError(
-                f"{path}: damaged tile ({str(error).splitlines()[0]}); make the map again"
-            ) from None
-        parts.append({name: table[name].to_numpy() for name in names})
-        parts[-1]["key"] = _join(x, y, parts[-1]["key"])
-    if len(parts) != about["tiles"]:
-        raise DataError(f"{folder}: found {len(parts)} tiles, expected {about['tiles']}; make the map again")
-    all_of = {
-        name: np.concatenate([part[name] for part in parts]) if parts else np.empty(0) for name in names
-    }
-    order = np.argsort(all_of["key"])
-    evidence = np.stack([all_of[f"log_{name}"] for name in label_set.names], axis=1)[order]
-    voxels = VoxelMap(
-        voxel_size_m=float(about["voxel_size_m"]),
-        label_set=label_set,
-        keys=all_of["key"][order].astype(np.int64),
-        evidence=evidence.astype(np.int32),
-        hits=all_of["hits"][order].astype(np.uint32),
+    voxel_size_m = float(about["voxel_size_m"])
+    missing = [name for name in about["files"] if not (folder / name).is_file()]
+    if missing:
+        raise DataError(
+            f"{folder}: found {len(about['files']) - len(missing)} tiles, expected {len(about['files'])}, such as"
+            f" {missing[0]}; make the map again"
+        )
+    names = [name for name in about["files"] if _touches(_tile_of(name), box, voxel_size_m)]
+    parts = [_decode(folder / name, about["files"][name], label_set) for name in sorted(names)]
+    return _join(parts, voxel_size_m, label_set, box)
+
+
+def by_tile(voxels: VoxelMap) -> Iterator[tuple[Tile, VoxelMap]]:
+    """The voxels of each tile, tile by tile in order."""
+    for tile, places in _places_by_tile(voxels.keys):
+        yield tile, voxels[places]
+
+
+def _places_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
+    """Where in sorted keys the voxels of each tile are, sorted by key."""
+    x = keys >> (2 * AXIS_BITS + TILE_BITS)
+    y = (keys >> (AXIS_BITS + TILE_BITS)) & ((1 << (AXIS_BITS - TILE_BITS)) - 1)
+    found, numbers = np.unique(x << AXIS_BITS | y, return_inverse=True)
+    order = np.argsort(numbers.astype(np.uint16 if len(found) < 1 << 16 else np.int64), kind="stable")
+    edges = np.searchsorted(numbers[order], np.arange(len(found) + 1))
+    first = AXIS_OFFSET >> TILE_BITS
+    for i, tile in enumerate(found.tolist()):
+        xy = (tile >> AXIS_BITS) - first, (tile & ((1 << AXIS_BITS) - 1)) - first
+        yield xy, order[edges[i] : edges[i + 1]]
+
+
+def _piece(semantic_map: SemanticMap, places: NDArray[np.int64]) -> SemanticMap:
+    return SemanticMap(
+        semantic_map.voxels[places],
+        semantic_map.labels[places],
+        semantic_map.confidence[places],
+        semantic_map.states[places],
     )
+
+
+def _encode(piece: SemanticMap) -> bytes:
+    """One tile as a Parquet file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    voxels = piece.voxels
+    # Parquet's smallest integer is 32 bits; it packs small ones tightly
+    columns: dict[str, NDArray[Any]] = {"key": _local(voxels)}
+    columns |= {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
+    columns |= {"hits": voxels.hits, "label": piece.labels.astype(np.int32)}
+    columns |= {"state": piece.states.astype(np.int32), "confidence": piece.confidence}
+    whole = [name for name in columns if name != "confidence"]
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        pa.table(columns), sink, compression="zstd", use_dictionary=False, write_statistics=False,
+        column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED") | {"confidence": "BYTE_STREAM_SPLIT"},
+    )  # fmt: skip
+    return bytes(sink.getvalue())
+
+
+def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str, NDArray[Any]]:
+    """The columns of one tile, with whole keys; raises DataError, with its name, when it is not what was written."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = ["key", *(f"log_{name}" for name in label_set.names), "hits", "label", "confidence", "state"]
+    try:
+        content = path.read_bytes()
+        if hashlib.sha256(content).hexdigest() != about["sha256"]:
+            raise ValueError("its checksum is not that of map.json")
+        table = pq.read_table(pa.BufferReader(content), columns=names)
+        columns = {name: table[name].to_numpy() for name in names}
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        raise DataError(f"{path}: damaged tile ({str(error).splitlines()[0]}); make the map again") from None
+    return columns | {"key": _global(_tile_of(path.name), columns["key"])}
+
+
+def _join(
+    parts: list[dict[str, NDArray[Any]]],
+    voxel_size_m: float,
+    label_set: LabelSet,
+    box: tuple[ArrayLike, ArrayLike] | None,
+) -> SemanticMap:
+    if box is not None:
+        parts = [_inside(part, box, voxel_size_m) for part in parts]
+
+    def column(name: str, dtype: type[np.generic]) -> NDArray[Any]:
+        return np.concatenate([np.empty(0, dtype), *(part[name].astype(dtype, copy=False) for part in parts)])
+
+    keys = column("key", np.int64)
+    order = np.argsort(keys)
+    evidence = np.empty((len(keys), len(label_set.names)), np.int32)
+    for i, name in enumerate(label_set.names):
+        evidence[:, i] = column(f"log_{name}", np.int32)[order]
+    voxels = VoxelMap(voxel_size_m, label_set, keys[order], evidence, column("hits", np.uint32)[order])
     return SemanticMap(
         voxels=voxels,
-        labels=all_of["label"][order].astype(np.int8),
-        confidence=all_of["confidence"][order].astype(np.float32),
-        states=all_of["state"][order].astype(np.uint8),
+        labels=column("label", np.int8)[order],
+        confidence=column("confidence", np.float32)[order],
+        states=column("state", np.uint8)[order],
     )
 
 
-def _columns(semantic_map: SemanticMap) -> dict[str, NDArray[Any]]:
-    voxels = semantic_map.voxels
-    sums = {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
-    # Parquet's smallest integer is 32 bits; it packs small ones tightly
-    return sums | {
-        "hits": voxels.hits,
-        "label": semantic_map.labels.astype(np.int32),
-        "state": semantic_map.states.astype(np.int32),
-        "confidence": semantic_map.confidence,
-    }
+def _touches(tile: Tile, box: tuple[ArrayLike, ArrayLike] | None, voxel_size_m: float) -> bool:
+    if box is None:
+        return True
+    low = np.array(tile) * voxel_size_m * (1 << TILE_BITS)
+    high = low + voxel_size_m * (1 << TILE_BITS)
+    return bool((low <= np.asarray(box[1])[:2]).all() and (high >= np.asarray(box[0])[:2]).all())
 
 
-def _split(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
-    """Tile (v, 2) and local key (v,) of every voxel."""
-    indices = unpack(keys).astype(np.int64)
-    z = indices[:, 2] + Z_OFFSET
+def _inside(
+    part: dict[str, NDArray[Any]], box: tuple[ArrayLike, ArrayLike], voxel_size_m: float
+) -> dict[str, NDArray[Any]]:
+    centres = (unpack(part["key"]) + 0.5) * voxel_size_m
+    inside = ((centres >= np.asarray(box[0])) & (centres <= np.asarray(box[1]))).all(axis=1)
+    return {name: values[inside] for name, values in part.items()}
+
+
+def _local(voxels: VoxelMap) -> NDArray[np.uint32]:
+    """Keys of voxels inside their tile."""
+    x, y, height = voxels.indices.T.astype(np.int64)
+    z = height + Z_OFFSET
     if len(z) and (z.min() < 0 or z.max() >= 1 << Z_BITS):
         raise DataError(
-            f"voxel heights {indices[:, 2].min()} to {indices[:, 2].max()} do not fit a tile (-{Z_OFFSET} to"
+            f"voxel heights {height.min()} to {height.max()} do not fit a tile (-{Z_OFFSET} to"
             f" {Z_OFFSET - 1}); check the heights of the trajectory"
         )
-    inside = indices[:, :2] & ((1 << TILE_BITS) - 1)
-    local = inside[:, 0] << (TILE_BITS + Z_BITS) | inside[:, 1] << Z_BITS | z
-    return indices[:, :2] >> TILE_BITS, local.astype(np.uint32)
+    mask = (1 << TILE_BITS) - 1
+    local = (x & mask) << (TILE_BITS + Z_BITS) | (y & mask) << Z_BITS | z
+    return np.asarray(local, np.uint32)
 
 
-def _join(tile_x: int, tile_y: int, local: NDArray[np.uint32]) -> NDArray[np.int64]:
+def _global(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Keys of a tile's voxels."""
     wide = local.astype(np.int64)
     mask = (1 << TILE_BITS) - 1
-    x = (wide >> (TILE_BITS + Z_BITS)) + (tile_x << TILE_BITS)
-    y = (wide >> Z_BITS & mask) + (tile_y << TILE_BITS)
+    x = (wide >> (TILE_BITS + Z_BITS)) + (tile[0] << TILE_BITS)
+    y = (wide >> Z_BITS & mask) + (tile[1] << TILE_BITS)
     return pack(np.stack([x, y, (wide & ((1 << Z_BITS) - 1)) - Z_OFFSET], axis=1))
 
 
-def _about(voxels: VoxelMap, frame: LocalFrame | None, tiles: int) -> dict[str, Any]:
+def _tile_of(name: str) -> Tile:
+    match = NAME.fullmatch(name)
+    if match is None:
+        raise DataError(
+            f"map.json: found tile {name!r}, expected a name like 3_-4.parquet; make the map again"
+        )
+    return int(match[1]), int(match[2])
+
+
+def _about(
+    voxel_size_m: float,
+    label_set: LabelSet,
+    frame: LocalFrame | None,
+    files: dict[str, dict[str, Any]],
+    points: int,
+) -> dict[str, Any]:
+    origin = None
+    if frame is not None:
+        origin = {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m}
     return {
         "format": FORMAT,
-        "voxel_size_m": voxels.voxel_size_m,
-        "classes": list(voxels.label_set.names),
-        "class_set": voxels.label_set.name,
-        "origin": None
-        if frame is None
-        else {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m},
-        "axes": "east, north, up at the origin, m"
-        if frame is not None
-        else "x, y, z of the drive's own poses, m",
+        "voxel_size_m": voxel_size_m,
+        "classes": list(label_set.names),
+        "class_set": label_set.name,
+        "origin": origin,
+        "axes": "east, north, up at the origin, m" if frame else "x, y, z of the drive's own poses, m",
         "utm_epsg": None if frame is None else frame.utm_epsg,
-        "tiles": tiles,
-        "voxels": len(voxels),
-        "points": int(voxels.hits.sum()),
+        "tiles": len(files),
+        "voxels": sum(file["voxels"] for file in files.values()),
+        "points": points,
         "evidence_unit": "2^-10 nat",
         "key": "x 9 bits, y 9 bits (inside the tile), z 14 bits (+ 8192), in voxels",
+        "files": files,
     }
+
+
+def read_frame(folder: Path) -> LocalFrame | None:
+    """The local frame of a map; None for one in its drive's own poses. Raises DataError."""
+    origin = _read_about(folder / "map.json").get("origin")
+    try:
+        return None if origin is None else LocalFrame(**origin)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"{folder / 'map.json'}: found origin {origin}, expected lat_deg, lon_deg, alt_m ({error})"
+        ) from None
 
 
 def _read_about(path: Path) -> dict[str, Any]:
@@ -155,9 +283,14 @@ def _read_about(path: Path) -> dict[str, Any]:
         about = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: no map here ({error})") from None
-    missing = {"format", "voxel_size_m", "classes", "tiles"} - set(about)
-    if missing or about["format"] != FORMAT:
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(
-            f"{path}: found format {about.get('format')}, missing {sorted(missing)}; expected format {FORMAT}"
+            f"{path}: found format {about.get('format') if isinstance(about, dict) else about!r},"
+            f" expected {FORMAT}; make the map again"
         )
-    return dict(about)
+    missing = {"voxel_size_m", "classes", "files"} - set(about)
+    if missing or not isinstance(about["files"], dict):
+        raise DataError(f"{path}: damaged, missing {sorted(missing) or ['files']}; make the map again")
+    for name in about["files"]:
+        _tile_of(name)
+    return about

@@ -82,6 +82,31 @@ class VoxelMap:
     def __len__(self) -> int:
         return len(self.keys)
 
+    @classmethod
+    def of_rows(cls, rows: NDArray[np.int64], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+        """The map of table rows (v, words) in any order: key, sums and hits, as `voxel_kernels` lays them out."""
+        rows = rows[np.argsort(rows[:, 0])]
+        ints, end = rows.view(np.int32), FIRST_SUM + len(label_set.names)
+        return cls(
+            voxel_size_m,
+            label_set,
+            keys=rows[:, 0].copy(),
+            evidence=ints[:, FIRST_SUM:end].copy(),
+            hits=ints[:, end].astype(np.uint32),
+        )
+
+    def to_rows(self) -> NDArray[np.int64]:
+        """The same voxels as table rows (v, words): 32 bytes each for five classes."""
+        rows = np.zeros((len(self), self.words(self.label_set)), np.int64)
+        ints, end = rows.view(np.int32), FIRST_SUM + len(self.label_set.names)
+        rows[:, 0], ints[:, FIRST_SUM:end], ints[:, end] = self.keys, self.evidence, self.hits
+        return rows
+
+    @staticmethod
+    def words(label_set: LabelSet) -> int:
+        """Width of a row: the key, and the sums and hits two to a word."""
+        return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
+
     def __add__(self, other: VoxelMap) -> VoxelMap:
         """Both maps' evidence, voxel by voxel; raises DataError for another voxel size or class set."""
         if self.voxel_size_m != other.voxel_size_m or self.label_set.names != other.label_set.names:
@@ -99,8 +124,8 @@ class VoxelMap:
             raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
         return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
 
-    def __getitem__(self, selection: NDArray[np.bool_]) -> VoxelMap:
-        """The voxels where a boolean mask holds."""
+    def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
+        """The voxels where a boolean mask holds, or those at increasing places."""
         return replace(
             self, keys=self.keys[selection], evidence=self.evidence[selection], hits=self.hits[selection]
         )
@@ -187,7 +212,7 @@ class VoxelTable:
             raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
         self.voxel_size_m, self.label_set = voxel_size_m, label_set
         self._floor_percent = round(100 * probability_floor)
-        self._words = (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
+        self._words = VoxelMap.words(label_set)
         self._count = 0
         self._rows = np.zeros((SMALLEST_TABLE, self._words), np.int64)
         self._log_table = log_table(len(label_set.names), self._floor_percent)
@@ -242,17 +267,7 @@ class VoxelTable:
 
     def to_map(self) -> VoxelMap:
         """Everything collected so far, sorted by key."""
-        rows = self._rows[self._rows[:, 0] != 0]
-        rows = rows[np.argsort(rows[:, 0])]
-        ints = rows.view(np.int32)
-        c = len(self.label_set.names)
-        return VoxelMap(
-            voxel_size_m=self.voxel_size_m,
-            label_set=self.label_set,
-            keys=rows[:, 0].copy(),
-            evidence=ints[:, FIRST_SUM : FIRST_SUM + c].copy(),
-            hits=ints[:, FIRST_SUM + c].astype(np.uint32),
-        )
+        return VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
 
 
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:

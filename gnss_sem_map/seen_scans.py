@@ -1,0 +1,159 @@
+"""Scans with what their images show of them: every point in the map at its own stamp, and the pixel that saw it.
+
+Files are read and decoded a few scans ahead, in a thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import labels
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.deskew import usable_points_in_map
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labelling import ClassImage, class_image, exposure_stamp, pixels_seen
+from gnss_sem_map.segmentation import MissingLabels, Segmenter
+from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.voxel_map import MappingSettings
+
+READ_AHEAD = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Everything that mapping needs to know; any process can work on a part of it."""
+
+    log: SensorLog
+    trajectory: Trajectory
+    segmenter: Segmenter | None
+    settings: Settings
+    moving: Mapping[int, NDArray[np.int64]] | None = None
+    """Frame number -> places, among the points that `map_points` gives, that belong to something that moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenScan:
+    """The usable points of one scan (m of n), in the map, with what its image shows of them."""
+
+    scan: Scan
+    p_map: NDArray[np.float64]
+    """(m, 3) m."""
+    valid: NDArray[np.bool_]
+    """(n,) which of the scan's points those are."""
+    pixels: NDArray[np.int32]
+    """(m,) row of `classes` that each point saw, -1 for none."""
+    classes: NDArray[np.uint8]
+    """(p, c + 1) class probabilities, `other` last."""
+
+    @property
+    def labels(self) -> NDArray[np.int8]:
+        """(m,) class of the pixel that each point saw, c for `other`, -1 where it saw none."""
+        of_pixel = np.append(self.classes.argmax(axis=1), labels.UNLABELLED)  # -1 is the last
+        return np.asarray(of_pixel[self.pixels], np.int8)
+
+
+def seen_scans(drive: Drive, account: Account | None = None) -> Iterator[SeenScan]:
+    """Every usable scan in time order, with its points in the map and what its image shows of them."""
+    account = account or Account()
+    return (seen for seen in look_at(drive, drive.log.scans, account) if seen is not None)
+
+
+def look_at(drive: Drive, scans: Sequence[Scan], account: Account) -> Iterator[SeenScan | None]:
+    """Every scan, or None for one that cannot be used; why is in the account."""
+    look = _Look(drive.log, drive.segmenter, drive.settings, account)
+    for scan, points, classes in _read_ahead(scans, look):
+        yield None if points is None else _see(drive, scan, points, classes, account)
+
+
+def _see(
+    drive: Drive, scan: Scan, points: Points, image: tuple[Image, ClassImage] | None, account: Account
+) -> SeenScan | None:
+    log, settings = drive.log, drive.settings
+    try:
+        p_map, valid = map_points(points, scan, drive.trajectory, log, settings.mapping)
+    except MeasurementError as error:
+        account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+        return None
+    if len(p_map) == 0:
+        account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {len(valid)}"))
+        return None
+    pixels = np.full(len(p_map), -1, np.int32)
+    classes = np.empty((0, len(labels.label_set(settings.classes).names) + 1), np.uint8)
+    if image is not None:
+        stamp = exposure_stamp(image[0], log.calibration, settings.labelling)
+        pixels = pixels_seen(p_map, stamp, drive.trajectory, log.calibration, image[1], settings.labelling)
+        classes = image[1].seen(pixels)
+    account.counts["scans"] += 1
+    account.counts["points"] += len(valid)
+    account.counts["points left out"] += len(valid) - len(p_map)
+    account.counts["points labelled"] += len(classes)
+    return SeenScan(scan, p_map, valid, pixels, classes)
+
+
+def map_points(
+    points: Points, scan: Scan, trajectory: Trajectory, log: SensorLog, settings: MappingSettings
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The points of a sweep that are finite and in range, in the map (m, 3) m, and which of all those are (n,)."""
+    return usable_points_in_map(
+        points, scan.stamp, trajectory, log.calibration.T_imu_lidar, settings.nearest_m, settings.farthest_m
+    )
+
+
+class _Look:
+    """What a scan's image shows: read, segmented, and counted when there is nothing to see."""
+
+    def __init__(
+        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account
+    ) -> None:
+        self._log, self._segmenter, self._account = log, segmenter, account
+        self._within_s = settings.labelling.image_within_s
+        self._label_set = labels.label_set(settings.classes)
+
+    def __call__(self, scan: Scan) -> tuple[Points | None, tuple[Image, ClassImage] | None]:
+        try:
+            points = scan.read()
+        except DataError as error:
+            self._account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+            return None, None
+        size = self._log.calibration.image_size
+        if self._segmenter is None or size is None or not self._log.images:
+            return points, None
+        image = self._log.image_at(scan.stamp, self._within_s)
+        if image is None:
+            self._account.skips.append(Skip("labels", f"frame {scan.number}", "no image near its stamp"))
+            return points, None
+        try:
+            where = f"labels of image {image.number}"
+            seen = self._segmenter(image)
+            return points, (
+                image,
+                class_image(seen, self._segmenter.class_names, self._label_set, size, where),
+            )
+        except MissingLabels as error:
+            self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
+            return points, None
+
+
+def _read_ahead(
+    scans: Sequence[Scan], look: _Look
+) -> Iterator[tuple[Scan, Points | None, tuple[Image, ClassImage] | None]]:
+    """Scans with what they and their images hold, in order; files are read and decoded a few ahead, in a thread."""
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        waiting = iter(scans)
+        ahead: list[tuple[Scan, Future[tuple[Points | None, tuple[Image, ClassImage] | None]]]] = [
+            (scan, thread.submit(look, scan)) for scan in islice(waiting, READ_AHEAD)
+        ]
+        while ahead:
+            scan, reading = ahead.pop(0)
+            points, classes = reading.result()
+            ahead.extend((later, thread.submit(look, later)) for later in islice(waiting, 1))
+            yield scan, points, classes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +58,11 @@ class LabelledImages:
 
         image_file, label_file = self.pairs[index]
         content = np.frombuffer(image_file.read_bytes(), np.uint8)
-        bgr = cv2.imdecode(content, cv2.IMREAD_COLOR) if content.size else None
+        bgr: NDArray[Any] | None = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
         if bgr is None:
             raise DataError(f"{image_file}: damaged image; expected PNG or JPEG")
+        if bgr.dtype != np.uint8 or bgr.ndim != 3 or bgr.shape[2] != 3:
+            raise DataError(f"{image_file}: found {bgr.dtype} {bgr.shape}, expected 8-bit colour (h, w, 3)")
         ids = read_class_ids(label_file)
         if bgr.shape[:2] != ids.shape:
             raise DataError(

@@ -226,6 +226,10 @@ def broken(folder: Path, what: str) -> LabelledFolder:
             cv2.imwrite(str(labels / "000000.png"), np.full((48, 96), 77, np.uint8))
         case "image":
             (images / "000000.png").write_bytes(b"\x89PNG")
+        case "grey":
+            cv2.imwrite(str(images / "000000.png"), np.zeros((48, 96), np.uint8))
+        case "deep":
+            cv2.imwrite(str(images / "000000.png"), np.zeros((48, 96, 3), np.uint16))
         case "void":
             for file in labels.iterdir():
                 cv2.imwrite(str(file), np.full((48, 96), 255, np.uint8))
@@ -243,6 +247,8 @@ def broken(folder: Path, what: str) -> LabelledFolder:
         ("size", r"found \(48, 95\) pixels"),
         ("ids", r"000000\.png: found unknown ids \[77\]"),
         ("image", r"000000\.png: damaged image"),
+        ("grey", r"000000\.png: found uint8 \(48, 96\)"),
+        ("deep", "found uint16"),
         ("void", "found no pixel of any class"),
         ("empty", "found 0 images"),
     ],

@@ -1,0 +1,41 @@
+"""The same map and trajectory give the same bytes, whatever was written before."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.pictures import write_topview
+from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.raster import write_topview_geotiff
+from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.viewer import write_viewer
+from gnss_sem_map.voxel_map import SemanticMap
+
+Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
+
+WRITERS: dict[str, Writer] = {
+    "map.ply": lambda m, t, f, path: write_ply(m, path, f),
+    "map.laz": lambda m, t, f, path: write_laz(m, f, path),
+    "topview.png": lambda m, t, f, path: write_topview(m, path, t),
+    "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(m, f, path),
+    "viewer.html": lambda m, t, f, path: write_viewer(m, t, path),
+    "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
+    "trajectory_kitti.txt": lambda m, t, f, path: write_kitti(t, path),
+    "trajectory.geojson": lambda m, t, f, path: write_geojson(t, f, path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_writing_twice_gives_the_same_bytes_and_leaves_one_file(
+    name: str, street: SemanticMap, track: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"an earlier run")
+    WRITERS[name](street, track, karlsruhe, path)
+    first = path.read_bytes()
+    WRITERS[name](street, track, karlsruhe, path)
+    assert path.read_bytes() == first != b"an earlier run"
+    assert list(tmp_path.iterdir()) == [path]

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 UPPER = np.triu_indices(3)
 GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
 """A surface is ground when its normal is steeper than the first (its z), a wall when flatter than the second."""
+LENGTH_STEP_S = 1.0
 THINNEST_M = 1e-4
 """No LiDAR measures finer: keeps the logarithm of the entropy finite."""
 
@@ -136,7 +137,8 @@ def _in_range(points: Points, settings: SharpnessSettings) -> Points:
 def _length(trajectory: Trajectory, stamps: Array) -> float:
     if len(stamps) < 2:
         return 0.0
-    positions = trajectory.at(stamps, EXTRAPOLATE_S)[:, :3, 3]
+    every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))  # jitter is no way driven
+    positions = trajectory.at(np.append(stamps[:-1:every], stamps[-1]), EXTRAPOLATE_S)[:, :3, 3]
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 

@@ -43,7 +43,7 @@ def test_thickness_is_the_standard_deviation_across_the_surface(stddev: float) -
 
 def test_cubes_agree_with_numpy() -> None:
     rng = np.random.default_rng(1)
-    clouds = [rng.normal(0, 0.4, (3000, 3)) + [70.0, -30.0, 4.0] for _ in range(5)]
+    clouds = [rng.normal((70.0, -30.0, 4.0), 0.4, (3000, 3)) for _ in range(5)]
     found = sharpness.of_clouds(clouds, 10.0, FEW)
     thickness, entropies = [], []
     cubes = np.floor(np.concatenate(clouds) / 0.5).astype(int)
@@ -100,7 +100,7 @@ def test_a_wrong_trajectory_blurs_the_map() -> None:
     for wrong in (jittered, delayed):
         assert wrong.thickness_m > 1.2 * right.thickness_m
         assert wrong.mean_map_entropy > right.mean_map_entropy
-        assert wrong.voxels_per_m > right.voxels_per_m
+    assert jittered.voxels_per_m > 1.1 * right.voxels_per_m
     assert right.scans == 16
 
 

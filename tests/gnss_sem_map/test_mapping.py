@@ -1,0 +1,245 @@
+"""However a drive is mapped, at once, in chunks, in processes or after being killed, the map has the same bytes."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from street import Street
+
+from gnss_sem_map import labels, tiles
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.mapping import STATIC, Drive, Maps, build_maps, map_chunks
+from gnss_sem_map.seen_scans import seen_scans
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.voxel_map import SemanticMap, VoxelMap
+
+URBAN = labels.label_set()
+
+
+@pytest.fixture(scope="module")
+def drive(small_drive: Street) -> Drive:
+    log = open_drive(small_drive.drive)
+    segmenter = open_segmenter(
+        f"labels:{small_drive.labels}", URBAN, expected_size=log.calibration.image_size
+    )
+    assert log.reference is not None
+    return Drive(log, log.reference, segmenter, Settings())
+
+
+@pytest.fixture(scope="module")
+def at_once(drive: Drive) -> tuple[Maps, Account]:
+    account = Account()
+    return build_maps(drive, account), account
+
+
+def assert_same(a: VoxelMap, b: VoxelMap) -> None:
+    for name in ("keys", "evidence", "hits"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.mark.parametrize(("chunk", "workers"), [(1, 1), (5, 1), (100, 1), (5, 2)])
+def test_chunks_and_processes_give_the_same_map_and_account(
+    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, chunk: int, workers: int
+) -> None:
+    account = Account()
+    maps = build_maps(drive, account, work=tmp_path / "work", workers=workers, scans_per_chunk=chunk)
+    assert_same(maps.static, at_once[0].static)
+    assert len(maps.removed) == 0
+    assert account.counts == at_once[1].counts
+    assert account.skips == at_once[1].skips
+
+
+def test_tiles_come_from_the_chunks_one_by_one(
+    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+) -> None:
+    """The folder written tile by tile, never holding the map, has the bytes of the one written at once."""
+    store = map_chunks(drive, tmp_path / "work", Account(), scans_per_chunk=3)
+    pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
+    tiles.write_tiles(pieces, tmp_path / "a", drive.log.frame, store.voxel_size_m, URBAN)
+    tiles.write(SemanticMap.of(at_once[0].static), tmp_path / "b", drive.log.frame)
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "b").iterdir())
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+MAP_SLOWLY = """
+import sys
+from pathlib import Path
+from gnss_sem_map import labels, mapping
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.segmentation import open_segmenter
+
+if __name__ == "__main__":
+    drive, probabilities, work = map(Path, sys.argv[1:])
+    log = open_drive(drive)
+    segmenter = open_segmenter(f"labels:{probabilities}", labels.label_set(), expected_size=log.calibration.image_size)
+    job = mapping.Drive(log, log.reference, segmenter, Settings())
+    print("ready", flush=True)
+    mapping.map_chunks(job, work, Account(), resume=True, scans_per_chunk=1)
+"""
+
+
+def kill_at_random(small_drive: Street, work: Path, times: int, seed: int) -> list[int]:
+    """Start mapping, kill -9 at a random moment, start again ...; how many chunks were there after each kill."""
+    script, chance, done = work.with_suffix(".py"), random.Random(seed), []
+    script.write_text(MAP_SLOWLY)
+    for _ in range(times):
+        command = [sys.executable, str(script), str(small_drive.drive), str(small_drive.labels), str(work)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            time.sleep(chance.uniform(0.0, 0.15))
+            os.kill(process.pid, signal.SIGKILL)
+        done.append(sum(path.name.isdecimal() for path in work.iterdir()) if work.is_dir() else 0)
+    return done
+
+
+def resumed_after_kills(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], work: Path, times: int, seed: int
+) -> list[int]:
+    done = kill_at_random(small_drive, work, times, seed)
+    account = Account()
+    maps = build_maps(drive, account, work=work, resume=True, scans_per_chunk=1)
+    assert_same(maps.static, at_once[0].static)
+    assert account.counts == at_once[1].counts
+    assert not list(work.glob(".*.part"))
+    return done
+
+
+def test_a_killed_run_goes_on_to_the_same_map(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
+) -> None:
+    resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 3, 0)
+
+
+@pytest.mark.slow
+def test_a_run_killed_many_times_goes_on_to_the_same_map(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
+) -> None:
+    partly = 0
+    for seed in range(8):
+        done = resumed_after_kills(drive, small_drive, at_once, tmp_path / f"work{seed}", 4, seed)
+        partly += sum(0 < n < len(drive.log.scans) for n in done)
+    assert partly > 0, "no kill fell into the mapping: this test showed nothing"
+
+
+def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    build_maps(drive, Account(), work=work, scans_per_chunk=4)
+    other = Settings.model_validate({"mapping": {"voxel_size_m": 0.3}})
+    for changed in (
+        replace(drive, settings=other),
+        replace(drive, log=replace(drive.log, scans=drive.log.scans[2:])),
+        replace(drive, moving={3: np.array([5])}),
+    ):
+        with pytest.raises(DataError, match="another drive, trajectory, labels or settings"):
+            build_maps(changed, Account(), work=work, resume=True, scans_per_chunk=4)
+    with pytest.raises(DataError, match="another drive"):
+        build_maps(
+            drive, Account(), work=work, resume=True, scans_per_chunk=4, labels_from="labels:elsewhere"
+        )
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").write_text("important")
+    with pytest.raises(DataError, match="holds no interrupted run"):
+        build_maps(drive, Account(), work=tmp_path / "mine")
+    assert (tmp_path / "mine/thesis.txt").exists()
+
+
+def test_a_damaged_chunk_is_named(drive: Drive, tmp_path: Path) -> None:
+    build_maps(drive, Account(), work=tmp_path / "work", scans_per_chunk=4)
+    part = sorted((tmp_path / "work/1").glob("static/*.npy"))[0]
+    part.write_bytes(part.read_bytes()[:-100])
+    with pytest.raises(DataError, match=part.name):
+        build_maps(drive, Account(), work=tmp_path / "work", resume=True, scans_per_chunk=4)
+
+
+def test_what_moved_goes_into_a_map_of_its_own_and_nothing_is_lost(
+    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+) -> None:
+    """Everything that its image calls a vehicle is taken out: by chunks and at once alike."""
+    vehicle = URBAN.index("vehicle")
+    moving = {seen.scan.number: np.flatnonzero(seen.labels == vehicle) for seen in seen_scans(drive)}
+    taken = replace(drive, moving=moving)
+    maps = build_maps(taken, Account())
+    assert maps.removed.hits.sum() == sum(map(len, moving.values())) > 100
+    assert set(maps.removed.labels) == {vehicle}
+    assert not (maps.static.labels == vehicle).any()
+    assert_same(maps.static + maps.removed, at_once[0].static)
+    chunked = build_maps(taken, Account(), work=tmp_path / "work", scans_per_chunk=5)
+    assert_same(chunked.static, maps.static)
+    assert_same(chunked.removed, maps.removed)
+
+
+class Unsendable:
+    """A segmenter that holds something that no other process can have."""
+
+    class_names = ("road", "other")
+    lock = property(lambda self: None)
+
+    def __init__(self) -> None:
+        self.here = lambda: None
+
+    def __call__(self, image: object) -> np.ndarray:
+        return np.zeros((48, 150, 2), np.uint8)
+
+
+def test_a_segmenter_that_cannot_be_shared_is_refused_before_any_work(drive: Drive, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot work in several processes"):
+        build_maps(
+            replace(drive, segmenter=Unsendable()),
+            Account(),
+            work=tmp_path / "w",
+            workers=2,
+            scans_per_chunk=2,
+        )
+
+
+FILL = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from gnss_sem_map.errors import DataError
+from test_tiles import random_map, FRAME
+from gnss_sem_map import chunks, tiles
+from gnss_sem_map.labels import label_set
+
+folder, written = Path(sys.argv[2]), random_map(count=200_000)
+store = chunks.open_store(folder / "work", "x", False, 0.2, label_set())
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+for attempt in (
+    lambda: tiles.write(written, folder / "map", FRAME),
+    lambda: store.write(0, {"static": written.voxels}, {}),
+):
+    try:
+        attempt()
+    except DataError as error:
+        print(error)
+"""
+
+
+def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """No file may grow beyond 20 kB, as if the disk were full there."""
+    done = subprocess.run(
+        [sys.executable, "-c", FILL, str(Path(__file__).parent), str(tmp_path)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    first, second = done.stdout.splitlines()
+    assert "cannot write the map" in first
+    assert "cannot put voxels away" in second
+    assert [path.name for path in tmp_path.iterdir()] == ["work"]
+    assert [path.name for path in (tmp_path / "work").iterdir()] == ["chunks.json"]

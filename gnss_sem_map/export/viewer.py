@@ -126,7 +126,9 @@ def _meta(voxels: _Voxels, label_set: LabelSet, trajectory: Trajectory | None) -
     shown = voxels.states != State.REMOVED
     counts = np.bincount(voxels.labels[shown], minlength=len(label_set.names) + 1).tolist()
     low, high = np.percentile(voxels.indices[:, 2] - origin[2], [2, 98])
-    inner = np.percentile(voxels.indices[shown if shown.any() else slice(None)] - origin, [2, 50, 98], axis=0)
+    framed = shown & (voxels.labels < len(label_set.names))
+    framed = framed if framed.any() else np.ones_like(shown)
+    low_corner, high_corner = np.percentile(voxels.indices[framed] - origin, [2, 98], axis=0)
     return {
         "voxel_m": voxels.size_m,
         "count": len(voxels.indices),
@@ -135,8 +137,8 @@ def _meta(voxels: _Voxels, label_set: LabelSet, trajectory: Trajectory | None) -
         "origin": origin.tolist(),
         "heights": [float(low), float(max(high, low + 1))],
         "view": {
-            "target": ((inner[0] + inner[2]) / 2).tolist(),
-            "distance": float(max(40.0, 0.75 * np.ptp(inner[:, :2], axis=0).max())),
+            "target": ((low_corner + high_corner) / 2).tolist(),
+            "distance": float(max(40.0, 0.9 * (high_corner - low_corner)[:2].max())),
         },
         "track": track.tolist(),
         "classes": [

@@ -27,7 +27,7 @@ vec3 ramped(float t) {
 }
 void main() {
   vec4 entry = palette[about.x];
-  bool bead = int(about.x) == track;
+  bool bead = int(about.x) == track, unlabelled = int(about.x) == track - 1;
   centre = cell - eye;
   vec3 seen = centre * axes;
   extent = bead ? ${TRACK_HALF} : 0.5;
@@ -38,7 +38,7 @@ void main() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     return;
   }
-  colour = bead || mode == 0 ? entry.rgb
+  colour = bead || mode == 0 || (unlabelled && mode == 2) ? entry.rgb
          : mode == 1 ? ramped((cell.z - heights.x) / (heights.y - heights.x))
          : mode == 2 ? ramped(float(about.y) / 255.0) : origins[about.z];
   if (gone) colour = origins[${REMOVED}];

@@ -1,4 +1,4 @@
-"""The fixed order of a good fit: noise, calibration, rejection, constraints, each on what the one before left."""
+"""The fixed order of a good fit: noise, calibration, constraints, rejection, each on what the one before left."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,20 +27,29 @@ LONG_ENOUGH_S = 120.0
 CONSTRAINT_ROUNDS = 2
 
 
-def fit_noise(problem: Problem) -> Fit:
-    """Inflate the IMU noise, starting from the sensor's own, until chi2 per degree of freedom fits.
+def fit_noise(
+    problem: Problem, start: Fit | None = None, constraints: list[gtsam.NonlinearFactor] | None = None
+) -> Fit:
+    """Inflate the IMU noise, from the sensor's own or from `start`, until chi2 per degree of freedom fits.
 
     The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only.
     """
     loss = "huber" if problem.settings.robust else "quadratic"
-    fit = optimise(problem, motion_graph(problem, 1.0), first_values(problem), 1.0, loss)
+    inflation, motion, values = (
+        (1.0, motion_graph(problem, 1.0), first_values(problem))
+        if start is None
+        else (start.inflation, start.motion, start.values)
+    )
+    fit = optimise(problem, motion, values, inflation, loss, constraints or [])
     if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
         return fit
     stiff, loosest = fit, MAX_INFLATION
     for _ in range(INFLATION_ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
-        fit = optimise(problem, motion_graph(problem, inflation), fit.values, inflation, loss)
+        fit = optimise(
+            problem, motion_graph(problem, inflation), fit.values, inflation, loss, constraints or []
+        )
         if FITTING_CHI2[0] <= fit.chi2_per_dof <= INFLATED_CHI2:
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
@@ -77,20 +86,17 @@ def calibrate(
     return problem, fit, calibration
 
 
-def reject(problem: Problem, fit: Fit) -> Fit:
-    """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
-    if not problem.settings.robust or fit.chi2_per_dof > FITTING_CHI2[1]:
-        return fit
-    return optimise(problem, fit.motion, fit.values, fit.inflation, "truncated")
+def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFactor]]:
+    """Add what a road vehicle cannot do, linearised at the solution, and again at the one that follows.
 
-
-def constrain(problem: Problem, fit: Fit) -> Fit:
-    """Add what a road vehicle cannot do, linearised at the solution, and again at the one that follows."""
+    A vehicle that is known to stand shows more of the IMU's noise, so that is looked at again as well.
+    """
     settings = problem.settings
+    factors: list[gtsam.NonlinearFactor] = []
     axes = {1: settings.lateral_stddev_mps, 2: settings.vertical_stddev_mps}
     for _ in range(CONSTRAINT_ROUNDS):
         T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
-        factors: list[gtsam.NonlinearFactor] = []
+        factors = []
         if settings.standing_stddev_mps is not None:
             stands = standing(problem.intervals, velocities)
             factors += zero_velocity_factors(stands, settings.standing_stddev_mps)
@@ -99,5 +105,12 @@ def constrain(problem: Problem, fit: Fit) -> Fit:
                 factors += body_velocity_factors(T, velocities, axis, stddev)
         if not factors:
             break
-        fit = optimise(problem, fit.motion, fit.values, fit.inflation, fit.loss, factors)
-    return fit
+        fit = fit_noise(problem, fit, factors)
+    return fit, factors
+
+
+def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:
+    """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
+    if not problem.settings.robust or fit.chi2_per_dof > FITTING_CHI2[1]:
+        return fit
+    return optimise(problem, fit.motion, fit.values, fit.inflation, "truncated", constraints)

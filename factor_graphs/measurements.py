@@ -154,7 +154,9 @@ def _clean(sensor: str, stamps: ArrayLike, *vectors: ArrayLike) -> tuple[list[Ar
         raise MeasurementError(
             f"{sensor} rows have shapes {[c.shape for c in columns]}; expected (n,), (n, 3), (n, 3)"
         )
-    finite = np.logical_and.reduce([np.isfinite(c.reshape(n, c.size // max(n, 1))).all(axis=1) for c in columns])
+    finite = np.logical_and.reduce(
+        [np.isfinite(c.reshape(n, c.size // max(n, 1))).all(axis=1) for c in columns]
+    )
     columns = [c[finite] for c in columns]
     out_of_order = int(np.count_nonzero(np.diff(columns[0]) < 0))
     _, first = np.unique(columns[0], return_index=True)

@@ -77,7 +77,8 @@ def smooth(
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
-    fit = constrain(problem, reject(problem, fit))
+    fit, constraints = constrain(problem, fit)
+    fit = reject(problem, fit, constraints)
     return _solution(problem, fit, fixes, calibration)
 
 

@@ -1,0 +1,53 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.screening import decorrelate, inside, plausible
+
+
+def fixes_along(x: np.ndarray, stamps: np.ndarray | None = None) -> GnssFixes:
+    stamps = np.arange(len(x), dtype=float) if stamps is None else stamps
+    return GnssFixes(stamps, np.column_stack([x, 0 * x, 0 * x]), np.ones((len(x), 3)))
+
+
+@given(st.sets(st.integers(0, 29), max_size=10), st.floats(1e3, 1e6))
+def test_fixes_kilometres_away_are_not_plausible_and_all_others_are(wild, distance):
+    x = 10.0 * np.arange(30)
+    x[list(wild)] += distance
+    expected = ~np.isin(np.arange(30), list(wild))
+    np.testing.assert_array_equal(plausible(fixes_along(x), 70.0), expected)
+
+
+def test_a_jump_that_lasts_is_dropped_as_a_whole():
+    x = 10.0 * np.arange(60)
+    x[20:35] += 5000.0
+    keep = plausible(fixes_along(x), 70.0)
+    np.testing.assert_array_equal(np.flatnonzero(~keep), np.arange(20, 35))
+
+
+def test_a_long_outage_may_be_driven_through():
+    stamps = np.concatenate([np.arange(20.0), np.arange(300.0, 330.0)])
+    assert plausible(fixes_along(15 * stamps, stamps), 70.0).all()
+
+
+def test_no_fix_is_plausible_where_there_is_none():
+    assert plausible(fixes_along(np.empty(0)), 70.0).shape == (0,)
+
+
+def test_ten_fixes_a_second_weigh_as_one_and_one_a_second_keeps_its_weight():
+    slow = decorrelate(fixes_along(np.arange(50.0)), 1.0, 0.02)
+    np.testing.assert_array_equal(slow.stddevs, 1.0)
+    fast = decorrelate(fixes_along(np.arange(500.0), np.arange(500) * 0.1), 1.0, 0.02)
+    weight_per_second = np.sum(1 / fast.stddevs[100:400, 0] ** 2) / 30
+    assert np.isclose(weight_per_second, 1.0, rtol=0.15)
+
+
+def test_no_fix_is_trusted_beyond_the_least_stddev():
+    fixes = GnssFixes(np.arange(3.0), np.zeros((3, 3)), np.full((3, 3), 1e-9))
+    np.testing.assert_array_equal(decorrelate(fixes, 1.0, 0.02).stddevs, 0.02)
+
+
+def test_only_fixes_within_the_imu_can_be_used():
+    imu = ImuSamples(np.array([1.0, 2.0, 3.0]), np.zeros((3, 3)), np.zeros((3, 3)))
+    np.testing.assert_array_equal(inside(fixes_along(np.zeros(5)), imu), [False, True, True, True, False])

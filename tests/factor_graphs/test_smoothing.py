@@ -1,0 +1,212 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.accuracy import anees_band, errors, nees, state_error
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.errors import EstimationError, MeasurementError
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.settings import SmootherSettings
+from factor_graphs.simulation import simulate_gnss, simulate_imu
+from factor_graphs.smoothing import heading_stddevs, smooth
+
+FRAME = LocalFrame(49.0, 8.4, 115.0)
+LEVER = np.array([0.5, 0.3, 1.0])
+
+
+def error_of(solution, drive):
+    return errors(solution.trajectory, drive.motion.trajectory(solution.trajectory.stamps))
+
+
+def test_without_noise_the_truth_is_the_solution(simulate):
+    drive = simulate(0)
+    solution = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+    e = error_of(solution, drive)
+    assert e.ate_m < 2e-3
+    assert e.heading_rms_deg < 0.01
+    np.testing.assert_allclose(solution.fix_residuals, 0.0, atol=0.01)
+
+
+def test_the_estimate_is_several_times_better_than_the_fixes(mems, mems_solution):
+    e = error_of(mems_solution, mems)
+    assert e.horizontal_rms_m < 0.5
+    assert e.vertical_rms_m < 0.6
+    assert e.heading_rms_deg < 1.0
+    assert not mems_solution.rejected.any()
+    assert mems_solution.inflation == 1.0
+    assert 0.8 < mems_solution.chi2_per_dof < 1.3
+
+
+def test_the_trajectory_has_a_state_at_every_imu_stamp_and_no_step_at_a_keyframe(mems, mems_solution):
+    t = mems_solution.trajectory
+    nearest = np.min(
+        np.abs(
+            mems.imu.stamps[:, None] - t.stamps[np.searchsorted(t.stamps, mems.imu.stamps)[:, None] + [-1, 0]]
+        ),
+        axis=1,
+    )
+    assert nearest.max() < 1e-3
+    at_keyframes = t.at(mems_solution.keyframes.stamps)
+    np.testing.assert_allclose(at_keyframes, mems_solution.keyframes.T_map_imu, atol=1e-9)
+    steps = (
+        np.diff(t.positions, axis=0) - (t.velocities[1:] + t.velocities[:-1]) / 2 * np.diff(t.stamps)[:, None]
+    )
+    assert np.abs(steps).max() < 1e-3
+    assert np.isfinite(t.covariances).all()
+
+
+def test_the_errors_are_as_large_as_the_covariances_say(simulate):
+    """One epoch per run: epochs of one run are not independent."""
+    runs, values = 12, []
+    for seed in range(runs):
+        drive = simulate(100 + seed, seconds=60.0, noise=ImuNoise())
+        s = smooth(
+            drive.imu, drive.fixes, FRAME, SmootherSettings(robust=False, standing_stddev_mps=None), LEVER
+        )
+        k = 30
+        stamp = s.keyframes.stamps[k : k + 1]
+        truth = drive.motion.trajectory(stamp)
+        bias = np.array([np.interp(stamp[0], drive.imu.stamps, b) for b in drive.biases.T])
+        e = state_error(
+            s.keyframes.T_map_imu[k], s.keyframes.velocities[k], s.biases[k],
+            truth.T_map_imu[0], truth.velocities[0], bias,
+        )  # fmt: skip
+        values.append(nees(e, s.state_covariances[k]))
+    low, high = anees_band(15, runs)
+    assert low < np.mean(values) < high
+
+
+def test_moving_the_whole_log_moves_the_trajectory_with_it(mems, mems_solution):
+    yaw, shift = 2.0, np.array([1000.0, -500.0, 20.0])
+    turn = Rotation.from_euler("z", yaw).as_matrix()
+    flat = FRAME.__class__(90.0, 0.0, 115.0)  # at the pole the turn of the Earth has no direction either
+    fixes = GnssFixes(mems.fixes.stamps, mems.fixes.positions @ turn.T + shift, mems.fixes.stddevs)
+    before = smooth(mems.imu, mems.fixes, flat, None, LEVER).trajectory
+    after = smooth(mems.imu, fixes, flat, None, LEVER).trajectory
+    np.testing.assert_allclose(after.positions, before.positions @ turn.T + shift, atol=5e-3)
+    np.testing.assert_allclose(after.T_map_imu[:, :3, :3], turn @ before.T_map_imu[:, :3, :3], atol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_outliers_are_rejected_and_hardly_hurt(simulate, share):
+    drive = simulate(5, noise=ImuNoise(), outlier_share=share)
+    s = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+    clean = simulate_gnss(drive.motion, drive.fixes.stamps, 1.0, LEVER).positions
+    wild = np.linalg.norm((drive.fixes.positions - clean)[:, :2], axis=1) > 6.5
+    assert s.rejected[wild].all()
+    assert s.rejected.sum() < 1.3 * share * len(drive.fixes) + 3
+    assert np.all(s.fix_weights[s.rejected] == 0)
+    assert error_of(s, drive).horizontal_rms_m < 0.75
+
+
+def test_the_noise_of_a_bad_imu_is_found_even_among_outliers(simulate):
+    bad = ImuNoise().scaled(8.0)
+    for share in (0.0, 0.1):
+        drive = simulate(6, noise=bad, outlier_share=share)
+        stiff = smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(inflate_imu_noise=False), LEVER)
+        fitted = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+        assert 2.0 < fitted.inflation < 16.0
+        assert 0.8 < fitted.chi2_per_dof < 1.3 < stiff.chi2_per_dof
+        assert error_of(fitted, drive).horizontal_rms_m < error_of(stiff, drive).horizontal_rms_m
+        assert any("times the noise" in note for note in fitted.notes)
+
+
+def test_an_outage_costs_more_the_longer_it_is_and_its_stddev_says_so(simulate):
+    worst, stddevs = [], []
+    for length in (0.0, 20.0, 50.0):
+        drive = simulate(7, noise=ImuNoise(), outages=[(40.0, 40.0 + length)] if length else [])
+        s = smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(standing_stddev_mps=None), LEVER)
+        stddevs.append(s.trajectory.position_stddevs[:, :2].max())
+        worst.append(np.linalg.norm(error_of(s, drive).position[:, :2], axis=1).max())
+    assert stddevs[0] < stddevs[1] < stddevs[2]
+    assert worst[2] < 4 * stddevs[2]
+
+
+def test_a_silent_imu_is_bridged_and_reported(simulate):
+    drive = simulate(8, noise=ImuNoise())
+    keep = (drive.imu.stamps < 50.0) | (drive.imu.stamps > 52.0)
+    imu = ImuSamples(drive.imu.stamps[keep], drive.imu.specific_force[keep], drive.imu.angular_rate[keep])
+    s = smooth(imu, drive.fixes, FRAME, None, LEVER)
+    assert any("silent for 2.0" in note for note in s.notes)
+    e = error_of(s, drive)
+    assert e.horizontal_rms_m < 0.6
+    assert e.within([(50.0, 52.0)]).ate_m < 4 * s.trajectory.position_stddevs[:, :2].max()
+
+
+def test_fixes_kilometres_away_or_outside_the_imu_are_left_out_and_reported(simulate):
+    drive = simulate(9, noise=ImuNoise())
+    positions = drive.fixes.positions.copy()
+    positions[[20, 21, 70]] += 20_000.0
+    stamps = drive.fixes.stamps.copy()
+    stamps[-1] = 500.0
+    s = smooth(drive.imu, GnssFixes(stamps, positions, drive.fixes.stddevs), FRAME, None, LEVER)
+    assert set(np.flatnonzero(s.rejected)) >= {20, 21, 70, len(stamps) - 1}
+    assert np.isnan(s.fix_residuals[-1]).all()
+    assert any(f"3 of {len(stamps)} fixes need more than 70 m/s" in note for note in s.notes)
+    assert any(f"1 of {len(stamps)} fixes outside the IMU's span" in note for note in s.notes)
+    assert error_of(s, drive).horizontal_rms_m < 0.6
+
+
+@pytest.mark.parametrize("m", [0, 1, 2])
+def test_fewer_than_three_fixes_are_refused(simulate, m):
+    drive = simulate(10, seconds=20.0)
+    with pytest.raises(MeasurementError, match=f"{m} usable GNSS fixes of {m}.*expected at least 3"):
+        smooth(drive.imu, drive.fixes[:m], FRAME)
+
+
+def test_a_vehicle_that_never_moves_has_no_heading_and_the_solution_says_so():
+    rng = np.random.default_rng(0)
+    stamps = np.arange(0.0, 60.0, 0.01)
+    noise = ImuNoise()
+    force = np.tile([0.0, 0.0, FRAME.gravity], (len(stamps), 1)) + 0.02 * rng.standard_normal(
+        (len(stamps), 3)
+    )
+    rate = 1.7e-3 * rng.standard_normal((len(stamps), 3))
+    fixes = GnssFixes(np.arange(0.5, 59.0), rng.standard_normal((59, 3)), np.ones((59, 3)))
+    s = smooth(ImuSamples(stamps, force, rate), fixes, FRAME, SmootherSettings(imu_noise=noise))
+    assert any("heading is unobservable" in note for note in s.notes)
+    assert np.degrees(heading_stddevs(s.trajectory)).min() > 25
+    assert np.linalg.norm(s.trajectory.positions, axis=1).max() < 0.6
+    known = AttitudePrior(np.eye(3), np.array([0.01, 0.01, 0.02]))
+    told = smooth(ImuSamples(stamps, force, rate), fixes, FRAME, None, initial_attitude=known)
+    assert not any("unobservable" in note for note in told.notes)
+    assert np.degrees(heading_stddevs(told.trajectory)[0]) < 1.2
+
+
+def test_an_optimiser_stopped_at_its_limit_is_an_error(mems):
+    with pytest.raises(EstimationError, match="stopped at its limit of 1 iterations"):
+        smooth(mems.imu, mems.fixes, FRAME, SmootherSettings(max_iterations=1), LEVER)
+
+
+@pytest.mark.parametrize("seconds", [2.0, 6.0, 15.0])
+@pytest.mark.parametrize(("step", "stddev"), [(0.2, 0.02), (0.1, 1.0), (0.5, 0.3)])
+@pytest.mark.parametrize("imu_step", [0.01, 0.1])
+def test_short_drives_of_any_rate_are_solved(simulate, seconds, step, stddev, imu_step):
+    drive = simulate(11, seconds=60.0)
+    stamps = np.arange(20.0, 20.0 + seconds, imu_step)
+    imu = simulate_imu(drive.motion, stamps, FRAME)
+    fixes = simulate_gnss(drive.motion, np.arange(20.03, stamps[-1], step), stddev, LEVER)
+    s = smooth(imu, fixes, FRAME, None, LEVER)
+    e = error_of(s, drive)
+    assert np.all(
+        np.linalg.norm(e.position, axis=1) < 3 * np.linalg.norm(s.trajectory.position_stddevs, axis=1)
+    )
+
+
+def test_wrong_lever_arms_and_unknown_settings_are_refused(mems):
+    with pytest.raises(MeasurementError, match="p_imu_antenna is"):
+        smooth(mems.imu, mems.fixes, FRAME, None, (0.0, 1.0))
+    with pytest.raises(ValueError, match="Extra inputs are not permitted"):
+        SmootherSettings(keyframe_intervall_s=1.0)
+    with pytest.raises(MeasurementError, match="no rotation"):
+        AttitudePrior(np.eye(3) * 2, np.ones(3))
+
+
+def test_the_smoother_changes_none_of_its_input(mems):
+    before = [a.copy() for a in (mems.imu.stamps, mems.imu.specific_force, mems.fixes.positions)]
+    smooth(mems.imu, mems.fixes, FRAME, None, LEVER)
+    for kept, now in zip(
+        before, (mems.imu.stamps, mems.imu.specific_force, mems.fixes.positions), strict=True
+    ):
+        np.testing.assert_array_equal(kept, now)

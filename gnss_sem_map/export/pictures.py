@@ -56,9 +56,9 @@ def write_topview(
 ) -> None:
     """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the track.
 
-    North is up; the highest voxel wins; walls darken what stands beside them. Small maps get several pixels per
-    voxel, large ones several voxels per pixel. Raises DataError for an empty map or when the file cannot be
-    written.
+    North is up; of every column the highest labelled voxel is seen, light grey where no camera saw any; what is
+    high darkens what lies beside it. Small maps get several pixels per voxel, large ones several voxels per pixel.
+    Raises DataError for an empty map or when the file cannot be written.
     """
     view = top_view(semantic_map, LONGEST_SIDE_PX)
     label_set = semantic_map.voxels.label_set
@@ -83,9 +83,8 @@ def write_topview(
 
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     """(rows, columns, 3) RGB: the class colours, lighter with height, darker beside something higher."""
-    palette = (
-        np.vstack([label_set.colours, [[255, 255, 255]], [UNLABELLED_BY_DAY]]) / 255
-    )  # -2, -1 count from the end
+    # labels -2 (nothing) and -1 (unlabelled) count from the end
+    palette = np.vstack([label_set.colours, (255, 255, 255), UNLABELLED_BY_DAY]) / 255
     empty = view.labels == NOTHING
     low, high = np.nanpercentile(view.heights, [2, 98])
     lightness = np.clip((view.heights - low) / max(high - low, 1.0), 0, 1)
@@ -117,11 +116,12 @@ def _frame(view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int) ->
     figure = Figure(figsize=tuple(full / DPI), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((MARGIN_PX / full[0], strip_px / full[1], wide / full[0], tall / full[1]))
-    east, south = view.west + width * view.cell_m / zoom, view.north - height * view.cell_m / zoom
+    pixel_m = view.cell_m / zoom
+    east, south = view.west + width * pixel_m, view.north - height * pixel_m
     axes.imshow(image, extent=(view.west, east, south, view.north), interpolation="nearest")
-    beside, above = ((wide - width) / 2, (tall - height) / 2)
-    axes.set_xlim(view.west - beside * view.cell_m / zoom, east + beside * view.cell_m / zoom)
-    axes.set_ylim(south - above * view.cell_m / zoom, view.north + above * view.cell_m / zoom)
+    beside_m, above_m = (wide - width) / 2 * pixel_m, (tall - height) / 2 * pixel_m
+    axes.set_xlim(view.west - beside_m, east + beside_m)
+    axes.set_ylim(south - above_m, view.north + above_m)
     axes.set(xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color("#b0b0b0")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, relu, relu6
 
@@ -46,14 +47,26 @@ def LightWeightRefineNet(
     return ResNetRefineNet(num_classes, backbone, light_weight=True)
 
 
+class ChannelGains(nn.Module):
+    """One factor per channel: what a 1x1 convolution with as many groups is, and stores, without its cost."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(width, 1, 1, 1).uniform_(-1.0, 1.0))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(b, width, h, w) -> the same shape."""
+        return x * self.weight.reshape(1, -1, 1, 1)
+
+
 class ChainedPooling(nn.Module):
     """Pool, convolve, add, each time on the last result: context from ever wider windows (Lin et al., fig. 3d)."""
 
-    def __init__(self, width: int, kernel: int, groups: int = 1) -> None:
+    def __init__(self, width: int, kernel: int, channelwise: bool = False) -> None:
         super().__init__()
         self.convolutions = [f"{i}_outvar_dimred" for i in range(1, POOLINGS + 1)]
         for name in self.convolutions:
-            self.add_module(name, _convolution(width, width, kernel, groups))
+            self.add_module(name, ChannelGains(width) if channelwise else _convolution(width, width, kernel))
 
     def forward(self, x: Tensor) -> Tensor:
         """(b, width, h, w), already rectified -> the same shape."""
@@ -152,11 +165,11 @@ class MobileNetRefineNet(MobileNetV2):
         for stage in (4, 3, 2):
             self.add_module(f"crp{stage}", nn.Sequential(ChainedPooling(width, 1)))
             self.add_module(f"conv_adapt{stage}", _convolution(width, width, 1))
-        self.crp1 = nn.Sequential(ChainedPooling(width, 1, groups=1 if single_task else width))
+        self.crp1 = nn.Sequential(ChainedPooling(width, 1, channelwise=not single_task))
         heads = {"segm": num_classes, "depth": 1} if depth_head and not single_task else {"segm": num_classes}
         for head, channels in heads.items():
             if not single_task:
-                self.add_module(f"pre_{head}", _convolution(width, width, 1, groups=width))
+                self.add_module(f"pre_{head}", ChannelGains(width))
             self.add_module(head, nn.Conv2d(width, channels, 3, 1, 1))
 
     def forward(self, images: Tensor) -> Tensor:
@@ -188,8 +201,8 @@ class MobileNetRefineNet(MobileNetV2):
         return prediction
 
 
-def _convolution(channels: int, out: int, kernel: int, groups: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(channels, out, kernel, padding=kernel // 2, groups=groups, bias=False)
+def _convolution(channels: int, out: int, kernel: int) -> nn.Conv2d:
+    return nn.Conv2d(channels, out, kernel, padding=kernel // 2, bias=False)
 
 
 def _residual_units(width: int, units: int, light_weight: bool) -> nn.Module:

@@ -31,7 +31,7 @@ from gnss_sem_map.segmentation.checkpoints import (
     read_checkpoint,
     write_network,
 )
-from gnss_sem_map.segmentation.networks import find_device
+from gnss_sem_map.segmentation.networks import find_device, placed
 from gnss_sem_map.segmentation.pixels import scaled
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 from gnss_sem_map.segmentation.training_data import (
@@ -158,7 +158,7 @@ class _Run:
     ) -> None:  # fmt: skip
         self.settings, self.device, self._data, self._out = settings, device, data, out
         torch.manual_seed(settings.seed)
-        self.network = _first_network(settings, data.class_names, initial).to(device)
+        self.network = placed(_first_network(settings, data.class_names, initial), device)
         self._optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet, RefineNet
+from gnss_sem_map.segmentation.refinenet import ChannelGains, LightWeightRefineNet, RefineNet
 
 
 def shapes_of(build: Any, *args: Any, **layout: Any) -> dict[str, tuple[int, ...]]:
@@ -188,3 +188,10 @@ def test_an_unknown_backbone_is_answered_with_those_there_are() -> None:
         LightWeightRefineNet(19, "vgg16")
     with pytest.raises(ConfigError, match="width"):
         LightWeightRefineNet(19, "resnet50", width=64)
+
+
+def test_gains_per_channel_are_the_grouped_convolution_of_the_checkpoints() -> None:
+    gains, grouped = ChannelGains(7), torch.nn.Conv2d(7, 7, 1, groups=7, bias=False)
+    gains.load_state_dict(grouped.state_dict())
+    x = torch.randn(2, 7, 5, 3)
+    torch.testing.assert_close(gains(x), grouped(x))

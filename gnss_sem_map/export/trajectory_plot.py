@@ -53,12 +53,12 @@ def _track(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     axes.plot(*fixes.positions[~rejected, :2].T, ".", color="tab:blue", markersize=3, label="fixes")
     axes.plot(*fixes.positions[rejected, :2].T, "x", color="tab:red", markersize=5, label="rejected fixes")
     axes.plot(*positions[0, :2], "o", color="tab:green", label="start")
-    # a fix kilometres away must not shrink the drive to a dot
+    # a fix kilometres away must not shrink the drive to a dot, and a straight drive needs some width
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
-    margin = 30.0 + 0.05 * float(np.max(high - low))
-    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    middle, half = (low + high) / 2, 30.0 + 0.55 * float(np.max(high - low))
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
     axes.set(xlabel="east, m", ylabel="north, m")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.legend(loc="best", fontsize=8)
     axes.grid(alpha=0.3)
 

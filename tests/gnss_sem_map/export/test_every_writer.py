@@ -1,12 +1,15 @@
-"""The same map and trajectory give the same bytes, whatever was written before."""
+"""What holds for every file that is written: the same bytes each time, and one clear line when the disk is full."""
 
-from collections.abc import Callable
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
@@ -39,3 +42,25 @@ def test_writing_twice_gives_the_same_bytes_and_leaves_one_file(
     WRITERS[name](street, track, karlsruhe, path)
     assert path.read_bytes() == first != b"an earlier run"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """The operating system refuses to write more into any file, as a full disk does."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(
+    name: str, street: SemanticMap, track: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    with room_for(1000), pytest.raises(DataError) as caught:
+        WRITERS[name](street, track, karlsruhe, tmp_path / name)
+    assert f"{name}: no room to write it" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())

@@ -37,6 +37,14 @@ Format = Annotated[
 Frames = Annotated[
     str | None, typer.Option("--frames", help="Only frames A to B - 1, as A:B, by frame number.")
 ]
+Segmenter = Annotated[
+    str | None,
+    typer.Option(
+        help="Where class probabilities come from: labels:DIR, refinenet:FILE, hf:MODEL, onnx:FILE,"
+        " python:MODULE:CALLABLE; none: geometry only."
+    ),
+]
+Device = Annotated[str, typer.Option(help="Where a network runs: auto, cpu, cuda.")]
 Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 
 
@@ -44,10 +52,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 def run(
     drive: Drive,
     out: Out,
-    segmenter: Annotated[
-        str | None,
-        typer.Option(help="Where class probabilities come from: labels:DIR, refinenet:FILE, hf:MODEL, ..."),
-    ] = None,
+    segmenter: Segmenter = None,
+    device: Device = "auto",
     config: Config = None,
     set_: Set = None,
     frames: Frames = None,
@@ -58,17 +64,20 @@ def run(
     """Trajectory, semantic map, refined map and all exports of one drive."""
     from gnss_sem_map import labels, pipeline
     from gnss_sem_map.export import run_folder
-    from gnss_sem_map.segmentation import open_segmenter
+    from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
     run_folder.check_replaceable(out)
     settings = _settings(config, set_)
     log = _open(drive, drive_format, frames)
-    label_set = labels.label_set(settings.classes)
-    segment = None
-    if segmenter is not None:
-        segment = open_segmenter(segmenter, label_set, expected_size=log.calibration.image_size)
+    network = None
+    if segmenter is None and log.images:
+        typer.echo(no_segmenter_message(str(drive)), err=True)
+        raise typer.Exit(1)
+    if segmenter not in (None, "none"):
+        label_set = labels.label_set(settings.classes)
+        network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
     with _progress() as progress:
-        result = pipeline.run(log, segment, settings, progress)
+        result = pipeline.run(log, network, settings, progress)
         about = run_folder.write_run(out, drive, log, result, settings, write_labels)
     _warn(result.account.warnings)
     _report(about, out, as_json)
@@ -102,6 +111,87 @@ def trajectory(
         typer.echo(
             f"{log.name}: {len(estimate)} poses over {estimate.end - estimate.start:.1f} s; results in {out}"
         )
+
+
+@app.command()
+def segment(
+    drive: Drive,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder for the class probabilities; resumed if there.")
+    ],
+    segmenter: Annotated[str, typer.Option(help="The network: refinenet:FILE, hf:MODEL, onnx:FILE, ...")],
+    device: Device = "auto",
+    batch_size: Annotated[int, typer.Option(min=1, help="Images per step.")] = 4,
+    classes: Annotated[str, typer.Option(help="Class set: a shipped one, or a YAML file.")] = "urban",
+    drive_format: Format = None,
+) -> None:
+    """Class probabilities of all images, once; later runs read them with --segmenter labels:OUT."""
+    from gnss_sem_map import labels
+    from gnss_sem_map.segmentation import open_segmenter
+    from gnss_sem_map.segmentation.cache import write_cache
+
+    log = _open(drive, drive_format, None)
+    label_set = labels.label_set(classes)
+    network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
+    with _progress() as progress:
+        report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
+    _warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
+    typer.echo(
+        f"{report.written} images segmented, {report.kept} kept, {len(report.skips)} skipped;"
+        f" {report.bytes_per_frame / 1000:.0f} kB per image, {report.images_per_second:.1f} images/s;"
+        f" now use --segmenter labels:{out}"
+    )
+
+
+@app.command()
+def train(
+    data: Annotated[
+        list[str],
+        typer.Option(
+            help="Training data, as IMAGES,LABELS[,EVERY] (folders with the same names); repeatable."
+        ),
+    ],
+    validation: Annotated[list[str], typer.Option(help="Validation data, likewise.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the network, its state and the log.")],
+    initial: Annotated[Path | None, typer.Option(help="Checkpoint to begin with.")] = None,
+    taxonomy: Annotated[
+        str, typer.Option(help="What the ids in the labels mean: cityscapes, camvid, FILE.")
+    ] = "cityscapes",
+    ids: Annotated[
+        str | None, typer.Option(help="Kind of id, where the taxonomy has several: train_id, label_id.")
+    ] = None,
+    classes: Annotated[
+        str, typer.Option(help="Class set to learn: a shipped one, or a YAML file.")
+    ] = "urban",
+    set_: Set = None,
+    device: Device = "auto",
+    resume: Annotated[bool, typer.Option(help="Go on where an interrupted training stopped.")] = False,
+) -> None:
+    """Train or fine-tune a RefineNet on images with label PNGs (the paper: Cityscapes, then CamVid)."""
+    from gnss_sem_map import config, labels
+    from gnss_sem_map.segmentation.training import TrainingSettings
+    from gnss_sem_map.segmentation.training import train as train_network
+    from gnss_sem_map.segmentation.training_data import LabelledFolder
+
+    settings = config.parse(TrainingSettings, set_ or ())
+    learnt, checked = ([LabelledFolder.parse(text) for text in texts] for texts in (data, validation))
+    with _progress() as progress:
+        report = train_network(
+            learnt,
+            checked,
+            out,
+            labels.label_set(classes),
+            taxonomy,
+            ids,
+            settings,
+            initial,
+            device,
+            resume,
+            progress,
+        )
+    typer.echo(
+        f"{report.network}: validation mean IoU {report.best_mean_iou:.3f} at step {report.best_step} of {report.steps}"
+    )
 
 
 @app.command()

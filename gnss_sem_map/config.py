@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -15,6 +15,8 @@ from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
 from gnss_sem_map.refinement import RefinementSettings
 from gnss_sem_map.voxel_map import MappingSettings
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class Settings(BaseModel):
@@ -40,12 +42,20 @@ class Settings(BaseModel):
 def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
     """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one."""
     content = _read(file) if file is not None else {}
+    return parse(Settings, overrides, content, str(file) if file else "--set")
+
+
+def parse(
+    model: type[Model], overrides: Iterable[str], content: dict[str, Any] | None = None, where: str = "--set"
+) -> Model:
+    """Any settings from `a.b=c` overrides of what `content` already says; raises ConfigError."""
+    content = content if content is not None else {}
     for override in overrides:
         _apply(content, override)
     try:
-        return Settings.model_validate(content)
+        return model.model_validate(content)
     except ValidationError as error:
-        raise ConfigError(_explain(error, str(file) if file else "--set")) from None
+        raise ConfigError(_explain(error, model, where)) from None
 
 
 def _read(file: Path) -> dict[str, Any]:
@@ -79,20 +89,20 @@ def _apply(content: dict[str, Any], override: str) -> None:
         raise ConfigError(f"--set {override!r}: the value is not YAML") from None
 
 
-def _explain(error: ValidationError, where: str) -> str:
+def _explain(error: ValidationError, root: type[BaseModel], where: str) -> str:
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        known = _keys_beside(first["loc"])
+        known = _keys_beside(root, first["loc"])
         close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {known}"
         return f"{where}: unknown setting {place!r}; {hint}"
     return f"{where}: {place}: {first['msg']} (found {first['input']!r})"
 
 
-def _keys_beside(place: Sequence[int | str]) -> list[str]:
+def _keys_beside(root: type[BaseModel], place: Sequence[int | str]) -> list[str]:
     """The keys that stand beside an unknown one: those of the innermost section."""
-    model: Any = Settings
+    model: Any = root
     for part in place[:-1]:
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
             return []

@@ -190,7 +190,7 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
         (("run", "DRIVE", "-o", "out", "--format", "ros"), 2, "expected one of"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "magic"), 1, "unknown kind 'magic'"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "labels:nowhere"), 1, "nowhere"),
-        (("run", "DRIVE", "-o", "out", "--frames", "100:200"), 1, "none of 0 scans can be used"),
+        (("run", "DRIVE", "-o", "out", "--segmenter", "none", "--frames", "100:200"), 1, "none of 0 scans can be used"),
         (("run", "DRIVE", "-o", "DRIVE"), 1, "exists and is no run folder"),
     ],
 )  # fmt: skip
@@ -204,6 +204,16 @@ def test_a_mistake_is_answered_in_one_line(
     assert "Traceback" not in done.stderr
     if code == 1:
         assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_drive_with_images_and_no_segmenter_is_told_its_choices(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    done = gnss_sem_map("run", small_drive.drive, "-o", tmp_path / "out")
+    assert done.returncode == 1
+    assert done.stderr.count("--segmenter hf:") == 3
+    assert "licence" in done.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -16,9 +16,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.refinement import count_grid, vehicles
 from gnss_sem_map.refinement.count_grid import CountGridSettings
+from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
 from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.smoothing import SmoothingSettings, mean_field
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
-from gnss_sem_map.refinement.verdicts import MotionSettings
+from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
 from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, softmax
 
@@ -27,8 +29,7 @@ __all__ = ["RefinementReport", "RefinementSettings", "Step", "VehicleObject", "r
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""
 
-REJECTED_NAT = 1.0
-"""A voxel that is no vehicle after all gets this much less for it than for its least probable class."""
+SWITCHED_OFF, LACKING = "switched off", "the class set lacks one of them"
 
 
 class RefinementSettings(BaseModel):
@@ -50,8 +51,18 @@ class RefinementSettings(BaseModel):
         le=1,
         description="n looks at a voxel count as n to this power: they repeat each other's errors. 1 is eq. 6.",
     )
+    geometry: Literal["rules", "off"] = Field(
+        default="rules", description="Height over ground as evidence against classes."
+    )
+    smoothing: Literal["mean_field", "off"] = Field(
+        default="mean_field", description="Neighbouring voxels as evidence for each other."
+    )
+    heights: GeometrySettings = Field(default=GeometrySettings(), description="Numbers of the height rules.")
     columns: CountGridSettings = Field(default=CountGridSettings(), description="Numbers of the count grids.")
     support: VehicleSettings = Field(default=VehicleSettings(), description="Numbers of the vehicle rules.")
+    neighbours: SmoothingSettings = Field(
+        default=SmoothingSettings(), description="Numbers of the smoothing."
+    )
     motion: MotionSettings = Field(default=MotionSettings(), description="Numbers of the evidence of motion.")
 
 
@@ -77,24 +88,41 @@ class RefinementReport:
 
     steps: tuple[Step, ...]
     objects: tuple[VehicleObject, ...] = ()
+    tracked: tuple[TrackedObject, ...] = ()
+    """Objects through time, with the evidence of their motion."""
 
 
 def refine(
-    voxels: VoxelMap, settings: RefinementSettings | None = None, removed: VoxelMap | None = None
+    voxels: VoxelMap,
+    settings: RefinementSettings | None = None,
+    removed: VoxelMap | None = None,
+    tracked: tuple[TrackedObject, ...] = (),
 ) -> tuple[SemanticMap, RefinementReport]:
     """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled.
 
-    `removed` holds the points of moving vehicles that were kept out of `voxels`; they come back as a layer of
-    REMOVED voxels wherever nothing else stands.
+    `removed` holds the points of moving objects that were kept out of `voxels`; they come back as a layer of REMOVED
+    voxels wherever nothing else stands. `tracked` says why, for the report.
     """
     settings = settings or RefinementSettings()
     scores = _discounted(voxels, settings.count_exponent)
+    heights = height_over_ground(voxels.centres)
+    scores, geometry = _weigh_heights(voxels, scores, heights, settings)
     scores, columns = _correct_columns(voxels, scores, settings)
-    scores, moving, objects, judged = _judge_vehicles(voxels, scores, settings)
+    scores, moving, objects, judged = _judge_vehicles(voxels, scores, heights, settings)
+    scores, smoothed = _smooth(voxels, scores, settings)
     refined = _decide(voxels, scores, moving)
+    steps = [geometry, columns, judged, smoothed]
     if removed is not None:
-        refined = with_removed(refined, removed)
-    return refined, RefinementReport((columns, judged), objects)
+        refined, layered = _with_layer(refined, removed)
+        steps.append(layered)
+    return refined, RefinementReport(tuple(steps), objects, tracked)
+
+
+def _with_layer(static: SemanticMap, removed: VoxelMap) -> tuple[SemanticMap, Step]:
+    alone = removed[static.voxels.places(removed.keys) < 0]
+    gone = np.ones(len(alone), np.bool_)
+    changes = _changes(alone.label_set, alone.labels, alone.labels, gone)
+    return with_removed(static, removed), Step("moving objects", changes)
 
 
 def _discounted(voxels: VoxelMap, exponent: float) -> Scores:
@@ -107,12 +135,34 @@ def _labels(voxels: VoxelMap, scores: Scores) -> NDArray[np.int8]:
     return np.where(voxels.observed, scores.argmax(axis=1), UNLABELLED).astype(np.int8)
 
 
+def _weigh_heights(
+    voxels: VoxelMap, scores: Scores, heights: NDArray[np.float32], settings: RefinementSettings
+) -> tuple[Scores, Step]:
+    """Height over ground against classes that are not found there."""
+    if settings.geometry == "off":
+        return scores, Step("heights", {}, SWITCHED_OFF)
+    refined = scores + against_by_height(heights, voxels.label_set, settings.heights)
+    return refined, _step("heights", voxels, scores, refined)
+
+
+def _smooth(voxels: VoxelMap, scores: Scores, settings: RefinementSettings) -> tuple[Scores, Step]:
+    """Neighbours for each other."""
+    if settings.smoothing == "off":
+        return scores, Step("smoothing", {}, SWITCHED_OFF)
+    refined = mean_field(voxels.keys, scores, voxels.observed, settings.neighbours)
+    return refined, _step("smoothing", voxels, scores, refined)
+
+
+def _step(name: str, voxels: VoxelMap, before: Scores, after: Scores) -> Step:
+    return Step(name, _changes(voxels.label_set, _labels(voxels, before), _labels(voxels, after)))
+
+
 def _correct_columns(voxels: VoxelMap, scores: Scores, settings: RefinementSettings) -> tuple[Scores, Step]:
     """Building against vegetation, column by column (eq. 8 to 11)."""
     name, mode = "building and vegetation", settings.building_vegetation
     classes = _classes(voxels.label_set, "building", "vegetation")
     if mode == "off" or len(classes) < 2:
-        return scores, Step(name, {}, "switched off" if mode == "off" else "the class set lacks one of them")
+        return scores, Step(name, {}, SWITCHED_OFF if mode == "off" else LACKING)
     first, second = classes
     labels = _labels(voxels, scores)
     if mode == "paper":
@@ -123,11 +173,11 @@ def _correct_columns(voxels: VoxelMap, scores: Scores, settings: RefinementSetti
             voxels.keys, labels, own, (first, second), settings.columns, voxels.voxel_size_m
         )
     refined = count_grid.decide(scores, np.isin(labels, classes), (first, second), log_odds)
-    return refined, Step(name, _changes(voxels.label_set, labels, _labels(voxels, refined)))
+    return refined, _step(name, voxels, scores, refined)
 
 
 def _judge_vehicles(
-    voxels: VoxelMap, scores: Scores, settings: RefinementSettings
+    voxels: VoxelMap, scores: Scores, heights: NDArray[np.float32], settings: RefinementSettings
 ) -> tuple[Scores, NDArray[np.bool_], tuple[VehicleObject, ...], Step]:
     """Which voxels are vehicles, and, in mode `paper`, which of those moved."""
     name, mode, nothing = "vehicles", settings.vehicles, np.zeros(len(voxels), np.bool_)
@@ -137,7 +187,7 @@ def _judge_vehicles(
             scores,
             nothing,
             (),
-            Step(name, {}, "switched off" if mode == "off" else "the class set lacks one of them"),
+            Step(name, {}, SWITCHED_OFF if mode == "off" else LACKING),
         )
     labels = _labels(voxels, scores)
     if mode == "paper":
@@ -146,12 +196,11 @@ def _judge_vehicles(
         )
         gone = found.moving | found.rejected
         return scores, gone, found.objects, Step(name, _changes(voxels.label_set, labels, labels, gone))
-    heights = height_over_ground(voxels.centres)
     found = vehicles.supported(
         voxels.indices, labels, heights, classes[0], classes[1], settings.support, voxels.voxel_size_m
     )
     refined = scores.copy()
-    refined[found.rejected, classes[0]] = scores[found.rejected].min(axis=1) - REJECTED_NAT
+    refined[found.rejected, classes[0]] -= np.float32(settings.support.rejected_nat)
     return (
         refined,
         nothing,
@@ -198,8 +247,8 @@ def _changes(
     removed: NDArray[np.bool_] | None = None,
 ) -> dict[tuple[str, str], int]:
     """How many voxels went from which class to which; class names end with `removed`."""
-    names = [*label_set.names, "removed"]
-    targets = after if removed is None else np.where(removed, len(names) - 1, after)
+    names = [*label_set.names, "removed", "unlabelled"]  # -1, unlabelled, is the last
+    targets = after if removed is None else np.where(removed, len(label_set.names), after)
     differ = targets != before
     pairs, counts = np.unique(np.stack([before[differ], targets[differ]]), axis=1, return_counts=True)
     return {(names[a], names[b]): int(n) for (a, b), n in zip(pairs.T, counts, strict=True)}

@@ -32,7 +32,10 @@ class VehicleSettings(BaseModel):
     road_share: float = Field(
         default=0.3, ge=0, le=1, description="A vehicle stands with more than this share over road."
     )
-    lowest_m: float = Field(default=0.15, description="Lower than this over the ground is no vehicle, m.")
+    rejected_nat: float = Field(
+        default=6.0, ge=0, description="What the rules count against a voxel that they reject, nat."
+    )
+    lowest_m: float = Field(default=0.1, description="Lower than this over the ground is no vehicle, m.")
     highest_m: float = Field(default=3.5, description="Higher than this over the ground is no vehicle, m.")
     largest_parked_voxels: int = Field(
         default=1500, ge=1, description="Mode `paper`: a group of this many voxels moved (eta_D of eq. 13)."

@@ -19,6 +19,9 @@ IGNORE = 255
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+CITYSCAPES_IMAGE = "_leftImg8bit"
+CITYSCAPES_LABELS = {"train_id": "_gtFine_labelTrainIds", "label_id": "_gtFine_labelIds"}
+
 
 @dataclass(frozen=True)
 class LabelledFolder:
@@ -79,31 +82,40 @@ class LabelledImages:
 def labelled_images(
     folders: Sequence[LabelledFolder], label_set: LabelSet, taxonomy_name: str, ids: str | None = None
 ) -> LabelledImages:
-    """Every image of the folders, in their order, with the PNG of the same name.
+    """Every image of the folders and the folders in them, in order, with the PNG of the same name and place.
 
-    Raises DataError when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
+    Cityscapes' own names are understood: `_leftImg8bit` goes with the suffix of the chosen ids. Raises DataError
+    when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
     """
-    pairs: list[tuple[Path, Path]] = []
-    for folder in folders:
-        found = sorted(p for p in folder.images.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES)[
-            :: folder.every
-        ]
-        without = [p.name for p in found if not (folder.labels / f"{p.stem}.png").is_file()]
-        if not found or without:
-            raise DataError(
-                f"{folder.images}: found {len(found)} images, {len(without)} without a PNG of the same name in"
-                f" {folder.labels} ({without[:3]}); expected one for each"
-            )
-        pairs.extend((p, folder.labels / f"{p.stem}.png") for p in found)
     source = taxonomy(taxonomy_name)
     kind = ids or next(iter(source.ids))
     if kind not in source.ids:
         raise ConfigError(
             f"taxonomy {taxonomy_name!r} has no ids {kind!r}; expected one of {list(source.ids)}"
         )
+    pairs = tuple(pair for folder in folders for pair in _pairs(folder, kind))
     classes = source.lookup(label_set, kind)
     class_of_id = np.where(classes >= 0, classes, IGNORE).astype(np.uint8)
-    return LabelledImages(tuple(pairs), (*label_set.names, OTHER), class_of_id, classes >= UNLABELLED)
+    return LabelledImages(pairs, (*label_set.names, OTHER), class_of_id, classes >= UNLABELLED)
+
+
+def _pairs(folder: LabelledFolder, ids: str) -> list[tuple[Path, Path]]:
+    images = sorted(path for path in folder.images.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    pairs = [(image, _label_file(folder, image, ids)) for image in images[:: folder.every]]
+    without = [image.name for image, label in pairs if not label.is_file()]
+    if not pairs or without:
+        raise DataError(
+            f"{folder.images}: found {len(pairs)} images, {len(without)} without a PNG of the same name in"
+            f" {folder.labels} ({without[:3]}); expected one for each"
+        )
+    return pairs
+
+
+def _label_file(folder: LabelledFolder, image: Path, ids: str) -> Path:
+    place = folder.labels / image.relative_to(folder.images).parent
+    if image.stem.endswith(CITYSCAPES_IMAGE) and ids in CITYSCAPES_LABELS:
+        return place / f"{image.stem.removesuffix(CITYSCAPES_IMAGE)}{CITYSCAPES_LABELS[ids]}.png"
+    return place / f"{image.stem}.png"
 
 
 def class_weights(data: LabelledImages, samples: int = 64) -> NDArray[np.float32]:

@@ -206,6 +206,20 @@ def test_of_a_drive_every_so_manieth_image_is_used_in_the_order_of_the_names(tmp
     assert all(image.stem == label.stem for image, label in data.pairs)
 
 
+@pytest.mark.parametrize(("ids", "suffix"), [("train_id", "labelTrainIds"), ("label_id", "labelIds")])
+def test_the_layout_of_cityscapes_is_understood(tmp_path: Path, ids: str, suffix: str) -> None:
+    for city in ("aachen", "bonn"):
+        for path in (tmp_path / "leftImg8bit" / city, tmp_path / "gtFine" / city):
+            path.mkdir(parents=True)
+        pixels, truth = street(1)
+        cv2.imwrite(str(tmp_path / "leftImg8bit" / city / f"{city}_000000_000019_leftImg8bit.png"), pixels)
+        cv2.imwrite(str(tmp_path / "gtFine" / city / f"{city}_000000_000019_gtFine_{suffix}.png"), truth)
+    folder = LabelledFolder(tmp_path / "leftImg8bit", tmp_path / "gtFine")
+    data = labelled_images([folder], URBAN, "cityscapes", ids)
+    assert [label.parent.name for _, label in data.pairs] == ["aachen", "bonn"]
+    assert all(label.is_file() for _, label in data.pairs)
+
+
 @pytest.mark.parametrize("text", ["", "images", "images,", "a,b,0", "a,b,-1", "a,b,c", "a,b,1,2"])
 def test_a_folder_that_is_not_well_said_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="IMAGES,LABELS"):

@@ -154,8 +154,17 @@ function pick(event) {
   document.getElementById("picked").textContent = i < 0 ? "" : `${what}\n${place}`;
 }
 
+function zoom(factor) {
+  camera.distance = Math.min(FAR / 10, Math.max(5, camera.distance * factor));
+  redraw();
+}
+
 function listen() {
   const pointers = new Map();
+  const apart = () => {
+    const [a, b] = [...pointers.values()];
+    return b ? Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY) : 1;
+  };
   let moved = 0;
   canvas.addEventListener("contextmenu", event => event.preventDefault());
   canvas.addEventListener("pointerdown", event => {
@@ -167,7 +176,9 @@ function listen() {
     const before = pointers.get(event.pointerId);
     if (!before) return;
     const [dx, dy] = [event.clientX - before.clientX, event.clientY - before.clientY];
+    const apartBefore = apart();
     pointers.set(event.pointerId, event);
+    zoom(apartBefore / apart());
     moved += Math.abs(dx) + Math.abs(dy);
     if (event.buttons & 2 || event.shiftKey || pointers.size > 1) {
       const { right, forward } = axesOf(camera), step = camera.distance / (0.9 * innerHeight);
@@ -186,8 +197,7 @@ function listen() {
   });
   canvas.addEventListener("wheel", event => {
     event.preventDefault();
-    camera.distance = Math.min(FAR / 10, Math.max(5, camera.distance * Math.exp(0.001 * event.deltaY)));
-    redraw();
+    zoom(Math.exp(0.001 * event.deltaY));
   }, { passive: false });
   addEventListener("resize", redraw);
 }

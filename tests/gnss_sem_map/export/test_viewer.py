@@ -271,3 +271,37 @@ def test_a_click_tells_what_the_voxel_is(browser: Browser, street: SemanticMap, 
     assert said.startswith("road, seen, probability 0.")
     place = [float(number) for number in re.findall(r"(-?\d+\.\d) m", said)]
     assert place == pytest.approx([30, 1, 0.1], abs=0.3)
+
+
+def pointer(name: str, kind: str, *points: tuple[int, int]) -> dict[str, Any]:
+    """Press at the first point, move to the others, release."""
+    moves = [{"type": "pointerMove", "duration": 50, "x": x, "y": y} for x, y in points]
+    press, release = {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}
+    actions = [moves[0], press, *moves[1:], release]
+    return {"type": "pointer", "id": name, "parameters": {"pointerType": kind}, "actions": actions}
+
+
+def test_mouse_and_fingers_turn_and_zoom(browser: Browser, street: SemanticMap, tmp_path: Path) -> None:
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    state = "return [camera.azimuth, camera.elevation, camera.distance]"
+    azimuth, elevation, distance = browser.run(state)
+    browser.ask("/actions", actions=[pointer("mouse", "mouse", (500, 300), (600, 350))])
+    turned = browser.run(state)
+    assert turned == pytest.approx([azimuth + 0.6, elevation + 0.3, distance])
+    roll = {
+        "type": "scroll",
+        "x": 500,
+        "y": 300,
+        "deltaX": 0,
+        "deltaY": -200,
+        "duration": 0,
+        "origin": "viewport",
+    }
+    browser.ask("/actions", actions=[{"type": "wheel", "id": "wheel", "actions": [roll]}])
+    nearer = browser.run(state)
+    assert nearer[:2] == turned[:2]
+    assert nearer[2] < 0.9 * distance
+    fingers = [pointer("a", "touch", (500, 300), (450, 300)), pointer("b", "touch", (600, 300), (650, 300))]
+    browser.ask("/actions", actions=fingers)
+    assert browser.run(state) == pytest.approx([*turned[:2], nearer[2] / 2], rel=0.05)

@@ -162,9 +162,16 @@ class PointLabels:
 
 
 def label_points(
-    log: SensorLog, trajectory: Trajectory, maps: Sequence[SemanticMap], settings: Settings
+    log: SensorLog,
+    trajectory: Trajectory,
+    maps: Sequence[SemanticMap],
+    settings: Settings,
+    moving: Mapping[int, NDArray[np.int64]] | None = None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
-    """For every usable scan, what each of the maps says of its original points."""
+    """For every usable scan, what each of the maps says of its original points.
+
+    `moving` (see `Drive`) are points that the last map, the refined one, has removed: vehicles, whatever stands there.
+    """
     for scan in log.scans:
         try:
             points = scan.read()
@@ -172,7 +179,18 @@ def label_points(
         except (DataError, MeasurementError):
             continue  # counted when the map was built
         keys = keys_of(p_map, settings.mapping.voxel_size_m)
-        yield scan, [_look_up(semantic_map, keys, valid) for semantic_map in maps]
+        found = [_look_up(semantic_map, keys, valid) for semantic_map in maps]
+        if moving is not None and scan.number in moving:
+            _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
+        yield scan, found
+
+
+def _remove(found: PointLabels, places: NDArray[np.int64], semantic_map: SemanticMap) -> None:
+    names = semantic_map.voxels.label_set.names
+    if "vehicle" in names:
+        changed = places[found.labels[places] != names.index("vehicle")]
+        found.labels[changed], found.confidence[changed] = names.index("vehicle"), 0.5
+    found.removed[places] = True
 
 
 def _look_up(semantic_map: SemanticMap, keys: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import signal
 import subprocess
@@ -75,7 +74,7 @@ def test_tiles_come_from_the_chunks_one_by_one(
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-MAP_SLOWLY = """
+MAP = """
 import sys
 from pathlib import Path
 from gnss_sem_map import labels, mapping
@@ -89,22 +88,34 @@ if __name__ == "__main__":
     log = open_drive(drive)
     segmenter = open_segmenter(f"labels:{probabilities}", labels.label_set(), expected_size=log.calibration.image_size)
     job = mapping.Drive(log, log.reference, segmenter, Settings())
+    mapping.fuse_scans(job, log.scans[:1], Account())  # compiled code is loaded: the kills fall into the mapping
     print("ready", flush=True)
     mapping.map_chunks(job, work, Account(), resume=True, scans_per_chunk=1)
 """
 
 
+def start(small_drive: Street, work: Path) -> subprocess.Popen[bytes]:
+    """Map into a folder in a process of its own, which is about to begin."""
+    script = work.with_suffix(".py")
+    script.write_text(MAP)
+    command = [sys.executable, str(script), str(small_drive.drive), str(small_drive.labels), str(work)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
 def kill_at_random(small_drive: Street, work: Path, times: int, seed: int) -> list[int]:
     """Start mapping, kill -9 at a random moment, start again ...; how many chunks were there after each kill."""
-    script, chance, done = work.with_suffix(".py"), random.Random(seed), []
-    script.write_text(MAP_SLOWLY)
+    chance, done = random.Random(seed), []
+    with start(small_drive, work.with_name(f"whole{seed}")) as process:
+        begun = time.monotonic()
+        assert process.wait() == 0
+    whole_s = time.monotonic() - begun
     for _ in range(times):
-        command = [sys.executable, str(script), str(small_drive.drive), str(small_drive.labels), str(work)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline() == b"ready\n"
-            time.sleep(chance.uniform(0.0, 0.15))
-            os.kill(process.pid, signal.SIGKILL)
+        with start(small_drive, work) as process:
+            time.sleep(chance.uniform(0.0, whole_s))
+            process.send_signal(signal.SIGKILL)
         done.append(sum(path.name.isdecimal() for path in work.iterdir()) if work.is_dir() else 0)
     return done
 

@@ -1,24 +1,37 @@
 """The whole flow on one page: a drive in, a trajectory and a semantic map out (Fig. 1 of the paper).
 
     trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive)
+    motion              which points belong to something that moved
     for every scan      deskew into the map, label from its image, fuse into the voxels
-    refine              buildings against vegetation, moving vehicles
+    refine              height, columns, vehicles, neighbours
 
 Files are the business of `io` and `export`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import labels
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import build_map
+from gnss_sem_map.mapping import build_maps
+from gnss_sem_map.motion import find_moving
 from gnss_sem_map.refinement import RefinementReport, refine
+from gnss_sem_map.refinement.verdicts import TrackedObject
+from gnss_sem_map.remembering import RememberedSegmenter
+from gnss_sem_map.seen_scans import Drive
 from gnss_sem_map.segmentation import Segmenter
+from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxel_map import SemanticMap
 
@@ -34,6 +47,8 @@ class Result:
     refined: SemanticMap
     refinement: RefinementReport
     account: Account
+    moving: Mapping[int, NDArray[np.int64]] | None = None
+    """Frame number -> places of the points of moving objects among the scan's usable ones; None: not sought."""
 
 
 def run(
@@ -49,13 +64,36 @@ def run(
         progress("trajectory", 0, 1)
         trajectory, solution = estimate_trajectory(log, settings, account)
         progress("trajectory", 1, 1)
-    with account.stage("mapping"):
-        voxels = build_map(log, trajectory, segmenter, settings, account, progress)
+    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        drive, tracked = _without_moving(
+            Drive(log, trajectory, segmenter, settings), Path(folder), account, progress
+        )
+        with account.stage("mapping"):
+            maps = build_maps(drive, account, progress)
     with account.stage("refinement"):
         progress("refinement", 0, 1)
-        refined, refinement = refine(voxels, settings.refinement)
+        refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked)
         progress("refinement", 1, 1)
-    return Result(trajectory, solution, SemanticMap.of(voxels), refined, refinement, account)
+    raw = SemanticMap.of(maps.static + maps.removed)
+    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving)
+
+
+def _without_moving(
+    drive: Drive, folder: Path, account: Account, progress: Progress
+) -> tuple[Drive, tuple[TrackedObject, ...]]:
+    """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
+    log, settings = drive.log, drive.settings
+    if settings.refinement.vehicles != "evidence":
+        return drive, ()
+    is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
+    if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
+        label_set = labels.label_set(settings.classes)
+        remembered = RememberedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
+        drive = replace(drive, segmenter=remembered)
+    with account.stage("motion"):
+        moving = find_moving(drive, progress)
+    account.counts["points of moving objects"] += sum(map(len, moving.points.values()))
+    return replace(drive, moving=moving.points), moving.objects
 
 
 def estimate_trajectory(

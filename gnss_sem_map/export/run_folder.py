@@ -164,7 +164,7 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
         "<u4"
     )  # -1, unlabelled, is the last
     maps = (result.raw, result.refined)
-    for scan, (raw, refined) in label_points(log, result.trajectory, maps, settings):
+    for scan, (raw, refined) in label_points(log, result.trajectory, maps, settings, result.moving):
         ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
         ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
         refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{scan.name}.bin")
@@ -218,6 +218,18 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
             for step in report.steps
         ],
         "objects": [asdict(thing) | {"centre": thing.centre.round(3).tolist()} for thing in report.objects],
+        "tracked": [
+            {
+                "motion": thing.motion,
+                "probability": round(thing.probability, 4),
+                "reason": thing.reason,
+                "points": thing.points,
+                "first_stamp": thing.first_stamp,
+                "last_stamp": thing.last_stamp,
+                "path": thing.path.round(2).tolist(),
+            }
+            for thing in report.tracked
+        ],
     }
 
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 from transformers import (
     MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
-    MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING,
     AutoConfig,
     AutoModelForSemanticSegmentation,
     AutoModelForUniversalSegmentation,
@@ -31,6 +30,9 @@ from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import NetworkSegmenter, Probabilities, find_device, from_logits
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD
+
+MASK_NETWORKS = ("maskformer", "mask2former", "oneformer", "eomt", "eomt_dinov3")
+"""Those that answer with queries; any other that the library knows for semantic segmentation gives logits."""
 
 STRIDE = 32
 """Of the coarsest features; images are stretched to whole multiples of it."""
@@ -55,9 +57,8 @@ def open_huggingface(
     network.to(where).eval()
     own = [config.id2label[i] for i in range(config.num_labels)]
     names = named_classes(classes, config.num_labels, label_set, f"hf:{model}", own)
-    run = _stretched(
-        _logits(network, names) if _gives_logits(config) else _masks(network, config, names, model, where)
-    )
+    masks = config.model_type in MASK_NETWORKS
+    run = _stretched(_masks(network, config, names, model, where) if masks else _logits(network, names))
     mean, std = _normalisation(model)
     kept = [name for name in names if name != VOID]
     return NetworkSegmenter(run, kept, where, mean, std, as_scale, as_shrink)
@@ -87,7 +88,7 @@ def _load(model: str) -> tuple[Any, Any]:
 
 
 def _kind(config: Any, model: str) -> Any:
-    if not _gives_logits(config):
+    if config.model_type in MASK_NETWORKS:
         return AutoModelForUniversalSegmentation
     if type(config) in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING:
         return AutoModelForSemanticSegmentation
@@ -110,10 +111,6 @@ def _quiet() -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _gives_logits(config: Any) -> bool:
-    return type(config) not in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING
-
-
 def _logits(network: Any, names: tuple[str, ...]) -> Probabilities:
     return from_logits(lambda images: network(pixel_values=images).logits, names)
 
@@ -122,20 +119,18 @@ def _masks(
     network: Any, config: Any, names: tuple[str, ...], model: str, device: torch.device
 ) -> Probabilities:
     kept = [i for i, name in enumerate(names) if name != VOID]
-    extra = (
-        {"task_inputs": _task_tokens(model, config).to(device)} if config.model_type == "oneformer" else {}
-    )
+    extra: dict[str, Tensor] = {}
+    if config.model_type == "oneformer":
+        extra["task_inputs"] = _task_tokens(model, config).to(device)
 
     def masses(images: Tensor, size: tuple[int, int]) -> Tensor:
         task = {name: value.expand(len(images), -1) for name, value in extra.items()}
         answer = network(pixel_values=images, **task)
-        classes = answer.class_queries_logits.softmax(2)[
-            :, :, kept
-        ]  # the last one, "no object", is not among them
         masks = interpolate(
             answer.masks_queries_logits, size=size, mode="bilinear", align_corners=False
         ).sigmoid()
-        return torch.einsum("bqc,bqhw->bchw", classes, masks)
+        classes = answer.class_queries_logits.softmax(2)[:, :, kept]  # not the last one, which is "no object"
+        return torch.einsum("bqc, bqhw -> bchw", classes, masks)
 
     see = _in_windows(masses, config.image_size) if config.model_type.startswith("eomt") else masses
 
@@ -154,15 +149,17 @@ def _in_windows(masses: Probabilities, side: int) -> Probabilities:
         ratio = side / min(height, width)
         whole = interpolate(images, size=(max(side, round(height * ratio)), max(side, round(width * ratio))),
                             mode="bilinear", align_corners=False)  # fmt: skip
-        total, count = torch.zeros(1), torch.zeros(1)
-        for top in _starts(whole.shape[2], side):
-            for left in _starts(whole.shape[3], side):
-                seen = masses(whole[:, :, top : top + side, left : left + side], (side, side))
-                if total.ndim == 1:
-                    total = seen.new_zeros(len(images), seen.shape[1], *whole.shape[2:])
-                    count = seen.new_zeros(whole.shape[2:])
-                total[:, :, top : top + side, left : left + side] += seen
-                count[top : top + side, left : left + side] += 1
+        corners = [
+            (top, left) for top in _starts(whole.shape[2], side) for left in _starts(whole.shape[3], side)
+        ]
+        parts = [
+            masses(whole[:, :, top : top + side, left : left + side], (side, side)) for top, left in corners
+        ]
+        total = parts[0].new_zeros(*parts[0].shape[:2], *whole.shape[2:])
+        count = parts[0].new_zeros(whole.shape[2:])
+        for (top, left), part in zip(corners, parts, strict=True):
+            total[:, :, top : top + side, left : left + side] += part
+            count[top : top + side, left : left + side] += 1
         return interpolate(total / count, size=size, mode="bilinear", align_corners=False)
 
     return windowed
@@ -188,6 +185,12 @@ def _task_tokens(model: str, config: Any) -> Tensor:
         [TASK], padding="max_length", max_length=config.task_seq_len, truncation=True, return_tensors="pt"
     )
     masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
+    if len(masked.unique()) < len(
+        TASK.split()
+    ):  # without its vocabulary a tokenizer takes every word for the same
+        raise DataError(
+            f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json and merges.txt are missing"
+        )
     return masked
 
 

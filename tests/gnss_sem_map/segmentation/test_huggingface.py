@@ -201,6 +201,12 @@ def test_a_network_that_does_not_segment_is_refused(tmp_path: Path) -> None:
         open_segmenter(f"hf:{tmp_path}", URBAN)
 
 
+def test_a_network_that_needs_a_task_is_refused_without_its_tokenizer(tmp_path: Path) -> None:
+    oneformer().save_pretrained(tmp_path)
+    with pytest.raises(DataError, match="tokenizer does not know"):
+        open_segmenter(f"hf:{tmp_path}", URBAN)
+
+
 def test_weights_that_lack_tensors_are_refused(tmp_path: Path) -> None:
     from safetensors.torch import load_file, save_file
 

@@ -98,19 +98,24 @@ def _covariances(
     d² S u (1 - u) to a turn and d² S³ (u (1 - u))³ / 3 to a position.
     """
     assert keyframes.covariances is not None
-    turn = np.zeros((len(keyframes), 6, 6))
-    turn[:, :3, :3] = turn[:, 3:, 3:] = keyframes.T_map_imu[:, :3, :3]
-    in_map = turn @ keyframes.covariances @ np.swapaxes(turn, 1, 2)
-    share = u[:, None, None]
-    mixed = (1 - share) * in_map[which] + share * in_map[which + 1]
-    bridge, spans = u * (1 - u), np.diff(keyframes.stamps)
+    in_map = _turned(keyframes.covariances, keyframes.T_map_imu[:, :3, :3])
+    mixed = np.concatenate([in_map[which], in_map[-1:]])
+    mixed[:-1] += u[:, None, None] * np.diff(in_map, axis=0)[which]
+    spans, bridge = np.diff(keyframes.stamps), u * (1 - u)
     rotation = np.array([n.gyroscope_noise_density**2 for n in noise]) * spans
     position = np.array([n.accelerometer_noise_density**2 for n in noise]) * spans**3 / 3
-    diagonal = np.column_stack(
-        [np.tile(rotation[which] * bridge, (3, 1)).T, np.tile(position[which] * bridge**3, (3, 1)).T]
-    )
-    mixed[:, range(6), range(6)] += diagonal
-    back = np.zeros((len(T), 6, 6))
-    back[:, :3, :3] = back[:, 3:, 3:] = np.swapaxes(T[:, :3, :3], 1, 2)
-    covariances: Array = back @ np.concatenate([mixed, in_map[-1:]]) @ np.swapaxes(back, 1, 2)
-    return covariances
+    for axis in range(3):
+        mixed[:-1, axis, axis] += rotation[which] * bridge
+        mixed[:-1, 3 + axis, 3 + axis] += position[which] * bridge**3
+    return _turned(mixed, np.swapaxes(T[:, :3, :3], 1, 2))
+
+
+def _turned(covariances: Array, R: Array) -> Array:
+    """Covariances (n, 6, 6) of rotation and translation, both seen in axes turned by R (n, 3, 3)."""
+    turned, back = np.empty_like(covariances), np.swapaxes(R, 1, 2)
+    a, b = slice(0, 3), slice(3, 6)
+    turned[:, a, a] = R @ covariances[:, a, a] @ back
+    turned[:, b, b] = R @ covariances[:, b, b] @ back
+    turned[:, a, b] = R @ covariances[:, a, b] @ back
+    turned[:, b, a] = np.swapaxes(turned[:, a, b], 1, 2)
+    return turned

@@ -92,17 +92,19 @@ def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFact
     A vehicle that is known to stand shows more of the IMU's noise, so that is looked at again as well.
     """
     settings = problem.settings
+    axes = [(1, settings.lateral_stddev_mps), (2, settings.vertical_stddev_mps)]
     factors: list[gtsam.NonlinearFactor] = []
-    axes = {1: settings.lateral_stddev_mps, 2: settings.vertical_stddev_mps}
+    stood: NDArray[np.bool_] | None = None
     for _ in range(CONSTRAINT_ROUNDS):
         T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
-        factors = []
-        if settings.standing_stddev_mps is not None:
-            stands = standing(problem.intervals, velocities)
-            factors += zero_velocity_factors(stands, settings.standing_stddev_mps)
-        for axis, stddev in axes.items():
-            if stddev is not None:
-                factors += body_velocity_factors(T, velocities, axis, stddev)
+        stands = standing(problem.intervals, velocities) & (settings.standing_stddev_mps is not None)
+        rows = [
+            row for axis, s in axes if s is not None for row in body_velocity_factors(T, velocities, axis, s)
+        ]
+        if not rows and stood is not None and np.array_equal(stands, stood):
+            break
+        stood = stands
+        factors = [*rows, *zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)

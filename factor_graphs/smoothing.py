@@ -96,7 +96,7 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         biases=biases,
         state_covariances=covariances,
         fix_weights=weights,
-        fix_residuals=_residuals(trajectory, fixes, calibration),
+        fix_residuals=_residuals(keyframes, fixes, calibration),
         rejected=rejected,
         chi2_per_dof=fit.chi2_per_dof,
         inflation=fit.inflation,
@@ -107,10 +107,10 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
     )
 
 
-def _residuals(trajectory: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:
+def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:
     stamps = fixes.stamps + calibration.time_offset_s
-    inside = (stamps >= trajectory.start) & (stamps <= trajectory.end)
-    T = trajectory.at(stamps[inside])
+    inside = (stamps >= keyframes.start) & (stamps <= keyframes.end)
+    T = keyframes.at(stamps[inside])
     off = np.full((len(fixes), 3), np.nan)
     off[inside] = fixes.positions[inside] - T[:, :3, 3] - T[:, :3, :3] @ calibration.p_imu_antenna
     return off

@@ -16,6 +16,12 @@ $(READY): pyproject.toml constraints.txt
 test: $(READY)
 	$(BIN)/pytest -m 'not slow'
 
+notebooks: $(READY)
+	$(BIN)/pytest --nbmake --nbmake-timeout=600 examples
+
+demo: $(READY)
+	$(BIN)/gnss-sem-map demo
+
 test-slow: $(READY)
 	$(BIN)/pytest -m slow
 

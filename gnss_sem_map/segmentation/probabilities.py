@@ -33,7 +33,7 @@ def checked_probabilities(
         raise DataError(f"{where}: found probabilities {probabilities.shape}, expected (h, w, {count})")
     one, slack = 1.0, 0.02
     if probabilities.dtype == np.uint8:
-        one, slack = 255.0, float(count)
+        one, slack = 255.0, 2.0 * count  # of rounding
     elif probabilities.dtype.kind == "f":
         probabilities = probabilities.astype(np.float32)
         if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):

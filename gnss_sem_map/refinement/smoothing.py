@@ -30,7 +30,7 @@ class SmoothingSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     temper: float = Field(
-        default=0.3,
+        default=0.5,
         gt=0,
         le=1,
         description="A voxel's own evidence is multiplied by this, or neighbours have no say.",

@@ -1,0 +1,56 @@
+"""The ground under a map, and what heights say against classes."""
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.labels import label_set
+from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
+from gnss_sem_map.refinement.ground import height_over_ground
+
+URBAN = label_set("urban")
+
+
+def plane(slope=0.0, side=40.0, step=0.2):
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0, side, step), np.arange(0, side, step)))
+    return np.stack([x, y, slope * x - 3.0], axis=1)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.05, 0.1])
+def test_ground_has_no_height_and_what_stands_on_it_has_its_own(slope):
+    ground = plane(slope)
+    pole = np.array([[20.0, 20.0, slope * 20.0 - 3.0 + h] for h in (1.0, 2.0, 5.0)])
+    heights = height_over_ground(np.concatenate([ground, pole]))
+    inner = ((ground[:, :2] > 3) & (ground[:, :2] < 37)).all(axis=1)
+    assert abs(heights[: len(ground)][inner]).max() < 0.1
+    np.testing.assert_allclose(heights[len(ground) :], [1.0, 2.0, 5.0], atol=0.1)
+
+
+def test_a_car_that_hides_the_ground_is_not_the_ground():
+    ground = plane()
+    under = ((ground[:, :2] > (15, 15)) & (ground[:, :2] < (19.5, 17))).all(axis=1)
+    roof = ground[under] + (0, 0, 1.5)
+    heights = height_over_ground(np.concatenate([ground[~under], roof]))
+    assert heights[(~under).sum() :].min() > 1.0
+
+
+def test_returns_from_below_the_road_do_not_lower_the_ground():
+    ground = plane()
+    ghosts = ground[::97] - (0, 0, 1.5)
+    heights = height_over_ground(np.concatenate([ground, ghosts]))
+    assert abs(np.median(heights[: len(ground)])) < 0.1
+
+
+def test_no_voxels_have_no_heights():
+    assert height_over_ground(np.empty((0, 3))).shape == (0,)
+
+
+def test_each_rule_counts_against_its_class_alone():
+    settings = GeometrySettings(against_nat=2.0)
+    road, sidewalk, vehicle, building, vegetation = range(5)
+    against = against_by_height(np.array([0.0, 0.4, 1.0, 4.0], np.float32), URBAN, settings)
+    expected = np.zeros((4, 5))
+    expected[0, [building, vegetation]] = -2.0, -1.0
+    expected[1, road] = -2.0
+    expected[2, [road, sidewalk]] = -2.0
+    expected[3, [road, sidewalk, vehicle]] = -2.0, -2.0, -4.0
+    np.testing.assert_array_equal(against, expected)

@@ -62,3 +62,6 @@ class RelativePoses:
 
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> RelativePoses:
         return RelativePoses(self.stamps[rows], self.T_imu_imu[rows], self.covariances[rows])
+
+
+NO_RELATIVE_POSES = RelativePoses(np.empty((0, 2)), np.empty((0, 4, 4)), np.empty((0, 6, 6)))

@@ -13,9 +13,11 @@ from gnss_sem_map.simulation.noise import gaussian, value_noise
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray
 from gnss_sem_map.simulation.surfaces import TRAIN_IDS
 from gnss_sem_map.simulation.textures import ground_colour, thing_colour
+from gnss_sem_map.simulation.view import pixel_ray, see
 from gnss_sem_map.simulation.world import World
 
-_REACH_M = 260.0
+_NEAR_M = 12.0
+_TALLEST_M = 22.0  # no shadow is longer than this height's
 _SUN = (1.75, 1.62, 1.42)
 _SKY = (0.50, 0.58, 0.72)
 _TONES = np.linspace(0.0, 1.0, 4096) ** (1.0 / 2.2)
@@ -66,7 +68,10 @@ def _openness(
     x, y, z = x + 0.02 * nx, y + 0.02 * ny, z + 0.02 * nz
     open_sky = thing >= 0 or cast_ray(scene, 1.3, True, 0.5, x, y, z, 0.0, 0.0, 1.0)[0] >= FAR
     facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
-    sunny = facing > 0.0 and cast_ray(scene, 70.0, True, 0.5, x, y, z, sun[0], sun[1], sun[2])[0] >= FAR
+    sunny = (
+        facing > 0.0
+        and cast_ray(scene, _TALLEST_M / sun[2], True, 0.5, x, y, z, sun[0], sun[1], sun[2])[0] >= FAR
+    )
     return (1 if sunny else 0) + (2 if open_sky else 0)
 
 
@@ -90,27 +95,23 @@ def _expose(
     T: Floats,
     lens: Triple,
     sun: Triple,
+    distance: Floats,
+    things: Integers,
+    shapes: Integers,
     linear: Singles,
     kinds: Bytes,
     depth: Singles,
-    things: Integers,
-    shapes: Integers,
     light: npt.NDArray[np.int8],
 ) -> None:
-    """Trace one ray per pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it.
+    """Colour what every pixel shows. `lens`: focal length and centre in pixels; `sun`: direction towards it.
 
-    Shadows are traced once for two neighbouring pixels where these show the same shape.
+    Shadows are traced once for two neighbouring pixels where these show the same shape, near the camera for four.
     """
-    focal, cu, cv = lens
     ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
     for v in range(linear.shape[0]):
         for u in range(linear.shape[1]):
-            x, y = (u - cu) / focal, (v - cv) / focal
-            norm = 1.0 / np.sqrt(x * x + y * y + 1.0)
-            dx = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * norm
-            dy = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * norm
-            dz = (T[2, 0] * x + T[2, 1] * y + T[2, 2]) * norm
-            t, thing, shape = cast_ray(scene, _REACH_M, False, 0.5, ox, oy, oz, dx, dy, dz)
+            dx, dy, dz, cosine = pixel_ray(T, lens, u, v)
+            t, thing, shape = distance[v, u], things[v, u], shapes[v, u]
             if t >= FAR:
                 r, g, b = _sky(dx, dy, dz, sun[0], sun[1], sun[2])
                 linear[v, u, 0], linear[v, u, 1], linear[v, u, 2] = r, g, b
@@ -128,10 +129,10 @@ def _expose(
                     scene.shapes, shape, thing, scene.colours[thing, 0], scene.colours[thing, 1],
                     scene.colours[thing, 2], p[0], p[1], p[2], local_x, local_y, n[2], clump, near,
                 )  # fmt: skip
-            things[v, u], shapes[v, u] = thing, shape
-            c = u - u % 2
-            if u > c and things[v, c] == thing and shapes[v, c] == shape and light[v, c] >= 0:
-                light[v, u] = light[v, c]
+            row, column = (v - v % 2 if t < _NEAR_M else v), u - u % 2
+            same = things[row, column] == thing and shapes[row, column] == shape
+            if same and light[row, column] >= 0:
+                light[v, u] = light[row, column]
             else:
                 x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
                 light[v, u] = _openness(scene, thing, x, y, z, n[0], n[1], n[2], sun)
@@ -147,7 +148,7 @@ def _expose(
             linear[v, u, 0] = r + haze * (0.78 - r)
             linear[v, u, 1] = g + haze * (0.83 - g)
             linear[v, u, 2] = b + haze * (0.90 - b)
-            kinds[v, u], depth[v, u] = kind, t * norm
+            kinds[v, u], depth[v, u] = kind, t * cosine
 
 
 @kernel
@@ -194,20 +195,11 @@ def render_image(
     size = (camera.height, camera.width)
     linear, kinds = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
     depth, light = np.zeros(size, np.float32), np.full(size, -1, np.int8)
-    things, shapes = np.full(size, GROUND, np.int32), np.full(size, -1, np.int32)
+    distance, things, shapes = np.zeros(size), np.zeros(size, np.int32), np.zeros(size, np.int32)
     lens = (camera.focal_px, camera.centre_u_px, camera.centre_v_px)
-    _expose(
-        world.scene(stamp, stamp),
-        T_map_camera,
-        lens,
-        sun_direction(seed),
-        linear,
-        kinds,
-        depth,
-        things,
-        shapes,
-        light,
-    )
+    scene, sun = world.scene(stamp, stamp), sun_direction(seed)
+    see(scene, T_map_camera, lens, distance, things, shapes)
+    _expose(scene, T_map_camera, lens, sun, distance, things, shapes, linear, kinds, depth, light)
     # the meter looks at the lower half and follows slowly changing light and its own hunting
     brightness = max(float(linear[size[0] // 3 :: 4, ::4].mean()), 0.05)
     gain = 0.62 * (0.42 / brightness) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))

@@ -36,7 +36,7 @@ def _model(name: str, rows: list[Row]) -> Model:
     half = table[:, 3:6]
     radius = np.linalg.norm(half, axis=1)
     radius[table[:, 11] == Form.ELLIPSOID] = half.max(axis=1)[table[:, 11] == Form.ELLIPSOID]
-    return Model(name, np.column_stack([table, radius**2]))
+    return Model(name, np.column_stack([table, radius]))
 
 
 def _block(
@@ -135,7 +135,7 @@ def van() -> Model:
 
 def truck() -> Model:
     """A box truck."""
-    kind, y = Kind.TRUCK, 1.2
+    kind, y = Kind.TRUCK, 1.1
     return _model(
         "truck",
         [

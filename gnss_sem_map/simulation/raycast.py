@@ -99,11 +99,15 @@ def hit_thing(
     if t0 > t1:
         return best, which
     inverse = 1.0 / (dx * dx + dy * dy + dz * dz)
+    scale = np.sqrt(inverse)
     for row in range(int(things[k, 20]), int(things[k, 21])):
         px, py, pz = shapes[row, 0] - ox, shapes[row, 1] - oy, shapes[row, 2] - oz
         ahead = px * dx + py * dy + pz * dz
-        if px * px + py * py + pz * pz - ahead * ahead * inverse > shapes[row, 14]:
+        radius = shapes[row, 14]
+        if px * px + py * py + pz * pz - ahead * ahead * inverse > radius * radius:
             continue  # the ray passes beside the sphere around it
+        if ahead * inverse - radius * scale > best:
+            continue  # the sphere is farther than what was hit
         t = hit_shape(shapes, row, k, best, ox, oy, oz, dx, dy, dz)
         if t < best:
             best, which = t, row

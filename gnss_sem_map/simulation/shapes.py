@@ -16,7 +16,7 @@ from gnss_sem_map.simulation.noise import hash_bits
 from gnss_sem_map.simulation.surfaces import Surface
 
 # 0 centre, 3 half sizes, 6 tapers at the top (front, rear, each side), 9 share of leaf cells that hold leaves,
-# 10 cell size, 11 form, 12 surface, 13 kind, 14 square of the radius of the sphere around it
+# 10 cell size, 11 form, 12 surface, 13 kind, 14 radius of the sphere around it
 SHAPE_COLUMNS: Final = 15
 
 

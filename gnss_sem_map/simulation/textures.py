@@ -53,9 +53,9 @@ def ground_colour(surface: int, u: float, v: float, near: float) -> Triple:
     """Colour of the ground at town coordinates; `near` in [0, 1] fades what is too fine to be seen."""
     broad = value_noise(1, u * 0.25, v * 0.25)
     if surface in (_ASPHALT, _MARKING):
-        speckle = (value_noise(2, u * 18.0, v * 18.0) - 0.5) * near
+        speckle = (value_noise(2, u * 18.0, v * 18.0) - 0.5) * near if near > 0.05 else 0.0
         patch = 0.86 if value_noise(3, u * 0.11 + 7.0, v * 0.11) > 0.66 else 1.0
-        crack = abs(value_noise(4, u * 0.55, v * 0.55) - 0.5)
+        crack = abs(value_noise(4, u * 0.55, v * 0.55) - 0.5) if near > 0.05 else 1.0
         grey = (0.155 + 0.05 * broad + 0.07 * speckle) * patch * (0.6 if crack < 0.010 * near else 1.0)
         if surface == _MARKING:
             worn = value_noise(5, u * 3.0, v * 3.0)

@@ -121,13 +121,14 @@ def build_town(seed: int, crossings: int = 3) -> Town:
     builder = _Builder(rng, [*models.cars(), models.lamp_post(), models.traffic_light(), models.sign()], [])
     builder.models += [models.bollard(), models.person(), models.cyclist()]
     for k in range(7):
-        height, reach = rng.uniform(5.5, 9.5), rng.uniform(1.9, 2.9)
+        height, reach = rng.uniform(5.5, 9.5), rng.uniform(2.2, 3.1)
         builder.trees.append(builder.model(models.tree(f"tree {k}", rng, height, reach)))
     plan = _plan(route)
     for side in sides(streets, bare):
         parking, lots = plan.get((side.street, bool(side.along.sum() > 0)), ("", []))
         _line_with_lots(builder, side, bare, list(lots))
-        _furnish(builder, side, parking or str(rng.choice(_PARKING, p=[0.42, 0.2, 0.18, 0.2])))
+        chosen = parking or str(rng.choice(_PARKING, p=[0.42, 0.2, 0.18, 0.2]))
+        _furnish(builder, side, chosen, bool(parking) or rng.random() < 0.6)
     _signals(builder, streets)
     start, rows = _patch_table(streets, builder.patches)
     ground = bare._replace(patch_start=start, patches=rows)
@@ -262,34 +263,39 @@ def _court(builder: _Builder, side: Side, along: float, width: float, depth: flo
         builder.tree(side, float(at), depth + 7.6)
 
 
-def _furnish(builder: _Builder, side: Side, parking: str) -> None:
+def _furnish(builder: _Builder, side: Side, parking: str, trees: bool) -> None:
     """What stands along one kerb: parked cars, trees, lamps, signs, bollards."""
     rng = builder.rng
-    lengths = [model.bounds[3] - model.bounds[0] for model in builder.models[:6]]
-    along, depth = (
-        10.0 + float(rng.uniform(0, 2)),
-        {"kerb": -1.08, "tight": -1.08, "sidewalk": 1.05}.get(parking),
-    )
-    tight = parking == "tight"
-    while depth is not None and along < side.length - 15.0:
-        if rng.random() < (0.94 if tight else 0.72):
-            model = int(rng.choice(6, p=[0.32, 0.22, 0.2, 0.13, 0.1, 0.03 if depth < 0 else 0.0]
-                                   if depth < 0 else [0.35, 0.22, 0.2, 0.13, 0.1, 0.0]))  # fmt: skip
-            with_traffic = np.pi if rng.random() < 0.85 else 0.0
-            builder.park(side, along + lengths[model] / 2, depth, with_traffic, model)
-            along += lengths[model] + float(rng.uniform(0.28, 0.42) if tight else rng.uniform(0.7, 2.2))
-        else:
-            along += float(rng.uniform(3.0, 6.5))
-    if parking != "sidewalk" and rng.random() < 0.6:
+    if parking != "none":
+        _park_row(builder, side, on_sidewalk=parking == "sidewalk", tight=parking == "tight")
+    if parking != "sidewalk" and trees:
         for at in np.arange(9.0 + rng.uniform(0, 3), side.length - 8.0, rng.uniform(9.0, 13.0)):
             builder.tree(side, float(at), 0.85)
+    depth = 2.85 if parking == "sidewalk" else 0.45  # where the cars leave room for posts
     for at in np.arange(12.5, side.length - 6.0, 27.0):
-        builder.put(side, LAMP_POST, float(at), 0.45, _GREY)
-    for at in rng.uniform(9.0, side.length - 9.0, 1):
-        builder.put(side, SIGN, float(at), 0.55, _GREY, np.pi)
+        builder.put(side, LAMP_POST, float(at), depth, _GREY)
+    builder.put(side, SIGN, float(rng.uniform(9.0, side.length - 9.0)), depth, _GREY, np.pi)
     if parking == "none":
         for at in np.arange(14.0, min(26.0, side.length - 12.0), 1.8):
             builder.put(side, BOLLARD, float(at), 0.35, _GREY)
+
+
+def _park_row(builder: _Builder, side: Side, on_sidewalk: bool, tight: bool) -> None:
+    """Cars along the kerb, most of them in the direction of the lane; `tight`: bumper to bumper."""
+    rng = builder.rng
+    shares = [0.35, 0.22, 0.2, 0.13, 0.1, 0.0] if on_sidewalk else [0.32, 0.22, 0.2, 0.13, 0.1, 0.03]
+    along = 10.0 + float(rng.uniform(0, 2))
+    while along < side.length - 15.0:
+        if rng.random() < (0.94 if tight else 0.72):
+            model = int(rng.choice(6, p=shares))
+            bounds = builder.models[model].bounds
+            depth = 1.05 if on_sidewalk else -float(bounds[4]) - 0.06
+            builder.park(side, along - float(bounds[0]), depth, np.pi if rng.random() < 0.85 else 0.0, model)
+            along += float(bounds[3] - bounds[0]) + float(
+                rng.uniform(0.28, 0.42) if tight else rng.uniform(0.7, 2.2)
+            )
+        else:
+            along += float(rng.uniform(3.0, 6.5))
 
 
 def _signals(builder: _Builder, streets: Streets) -> None:

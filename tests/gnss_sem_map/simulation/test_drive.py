@@ -166,11 +166,14 @@ def test_tracklets_are_the_boxes_of_what_the_camera_sees(town_drive: Path, simul
         assert first >= 0
         assert first + len(poses) <= FRAMES
         assert item.findtext("objectType") in {"Car", "Van", "Truck", "Pedestrian", "Cyclist"}
-    leader = next(item for item in items if item.findtext("objectType") == "Van")
-    x, y, z = (float(leader.findtext(f"./poses/item/t{axis}", "nan")) for axis in "xyz")
-    assert 5 < x < 25
-    assert abs(y) < 2
-    assert z == pytest.approx(-1.73, abs=0.5)
+    leader = simulation.world.movers[0]
+    assert leader.name == "leader"
+    stamp = simulation.stamps[0]
+    T = T_LIDAR_IMU @ np.linalg.inv(simulation.world.ego.poses([stamp])[0])
+    expected = (T @ leader.motion.poses([stamp])[0])[:3, 3]
+    places = [[float(item.findtext(f"./poses/item/t{axis}", "nan")) for axis in "xyz"] for item in items]
+    assert np.linalg.norm(np.array(places) - expected, axis=1).min() < 1e-3
+    assert 5 < expected[0] < 25
 
 
 def test_threads_and_repeats_do_not_change_a_byte(

@@ -86,7 +86,7 @@ def some_shape(form: Form, surface: Surface = Surface.STONE) -> Floats:
         [0.8, 0.8, 1.0] if form == Form.UPRIGHT else [0.8, 1.0, 0.8] if form == Form.AXLE else [2.0, 1.0, 0.8]
     )
     row = [0.3, -0.2, 0.1, *half, *tapers, 0.5, 0.3, form, surface, Kind.BUILDING]
-    return np.array([[*row, float(np.square(half).sum())]])
+    return np.array([[*row, float(np.linalg.norm(half))]])
 
 
 @pytest.fixture(scope="module")

@@ -97,14 +97,15 @@ class MovingObjectDetector:
         range_images.draw(p_map, T_lidar_map, image)
         heights = height_over_ground(p_map)
         above = np.flatnonzero((heights > FOOT_M) & _within(p_map, T_map_lidar, settings.farthest_held_m))
-        body = heights[above] > BODY_M
-        known = np.ones(len(above), np.bool_) if is_known is None else is_known[above]
+        points, named = p_map[above], is_object[above]
+        body = np.flatnonzero(heights[above] > BODY_M)
+        # nobody testifies on what is farther away, so that only a name makes it an object
+        known = ~_within(points[body], T_map_lidar, settings.farthest_m)
+        known |= is_known[above[body]] if is_known is not None else True
         segments = np.full(len(above), -1, np.int32)
-        segments[body], cut = find_segments(
-            p_map[above[body]], is_object[above[body]], known[body], settings.segment_eps_m
-        )
-        cut |= range_images.hidden_sides(p_map[above], segments, T_lidar_map, image, len(cut), HIDING_M)
-        keep = near(p_map[above], segments >= 0, settings.grow_m)
+        segments[body], cut = find_segments(points[body], named[body], known, settings.segment_eps_m)
+        cut |= range_images.hidden_sides(points, segments, T_lidar_map, image, len(cut), HIDING_M)
+        keep = near(points, segments >= 0, settings.grow_m)
         places = above[keep]
         seen = _Observation(
             number=number,
@@ -112,9 +113,9 @@ class MovingObjectDetector:
             T_lidar_map=T_lidar_map,
             image=image,
             places=places,
-            p_map=p_map[places],
-            is_object=is_object[places],
-            is_body=body[keep],
+            p_map=points[keep],
+            is_object=named[keep],
+            is_body=heights[places] > BODY_M,
             segments=segments[keep],
             cut=cut,
         )
@@ -183,8 +184,8 @@ def _sums(numbers: NDArray[np.int64], values: NDArray[np.int32], count: int) -> 
 def _within(
     p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64], reach_m: float
 ) -> NDArray[np.bool_]:
-    offset = p_map[:, :2] - T_map_lidar[:2, 3]
-    return np.asarray(np.einsum("ij,ij->i", offset, offset) <= reach_m**2)
+    east, north = p_map[:, 0] - T_map_lidar[0, 3], p_map[:, 1] - T_map_lidar[1, 3]
+    return np.asarray(east * east + north * north <= reach_m**2)
 
 
 def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list[NDArray[np.int64]]]:

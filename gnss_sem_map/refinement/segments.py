@@ -35,18 +35,15 @@ def _boxes(points, clusters, count):  # type: ignore[no-untyped-def]
 def _whole(low, high):  # type: ignore[no-untyped-def]
     """The cluster that each one is part of: its own, or the first of vehicle size whose box (s, 2) holds its box."""
     owners = np.arange(len(low))
-    for i in range(len(low)):
-        for j in range(len(low)):
-            if (
-                np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) <= LONGEST_M
-                and i != j
-                and owners[j] == j
-                and (low[i] >= low[j] - PART_M).all()
-                and (high[i] <= high[j] + PART_M).all()
-            ):
-                owners[i] = j
-                break
-    for i in range(len(low)):  # a holder may have found its own holder later
+    for j in range(len(low)):
+        if np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) > LONGEST_M or owners[j] != j:
+            continue
+        west, south = low[j, 0] - PART_M, low[j, 1] - PART_M
+        east, north = high[j, 0] + PART_M, high[j, 1] + PART_M
+        for i in range(len(low)):
+            if west <= low[i, 0] and south <= low[i, 1] and high[i, 0] <= east and high[i, 1] <= north:
+                owners[i] = j if owners[i] == i else owners[i]
+    for i in range(len(low)):  # an owner may itself have been found to be a part
         while owners[owners[i]] != owners[i]:
             owners[i] = owners[owners[i]]
     return np.searchsorted(np.unique(owners), owners)

@@ -58,10 +58,14 @@ def run(
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
+    resume: Annotated[bool, typer.Option(help="Go on with what an interrupted run of this mapped.")] = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
     as_json: Json = False,
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
+    import shutil
+
     from gnss_sem_map import labels, pipeline
     from gnss_sem_map.export import run_folder
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
@@ -76,11 +80,41 @@ def run(
     if segmenter not in (None, "none"):
         label_set = labels.label_set(settings.classes)
         network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
+    work = out.with_name(f".{out.name}.work")
     with _progress() as progress:
-        result = pipeline.run(log, network, settings, progress)
+        result = pipeline.run(
+            log,
+            network,
+            settings,
+            progress,
+            work=work,
+            resume=resume,
+            workers=workers,
+            labels_from=str(segmenter),
+        )
         about = run_folder.write_run(out, drive, log, result, settings, write_labels)
+    shutil.rmtree(work, ignore_errors=True)
     _warn(result.account.warnings)
     _report(about, out, as_json)
+
+
+@app.command()
+def merge(
+    first: Annotated[Path, typer.Argument(help="Folder of a run; the merged map has its frame.")],
+    second: Annotated[Path, typer.Argument(help="Folder of another run, of the same place.")],
+    out: Out,
+    as_json: Json = False,
+) -> None:
+    """One map of two runs of the same place, refined again."""
+    from gnss_sem_map.export import run_folder
+    from gnss_sem_map.export.merged_run import merge_run_folders
+
+    run_folder.check_replaceable(out)
+    about = merge_run_folders(first, second, out)
+    if as_json:
+        typer.echo(json.dumps(about))
+    else:
+        typer.echo(f"{about['name']}: {about['map']['voxels']} voxels\nresults in {out}")
 
 
 @app.command()

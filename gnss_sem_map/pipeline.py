@@ -52,12 +52,21 @@ class Result:
 
 
 def run(
-    log: SensorLog, segmenter: Segmenter | None, settings: Settings, progress: Progress = silent
+    log: SensorLog,
+    segmenter: Segmenter | None,
+    settings: Settings,
+    progress: Progress = silent,
+    *,
+    work: Path | None = None,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
 ) -> Result:
     """Trajectory, raw map and refined map of one drive.
 
-    Without a segmenter, or without images, the map has no labels. Raises DataError when not one scan can be used,
-    MeasurementError and EstimationError from the smoother.
+    Without a segmenter, or without images, the map has no labels. What is mapped is kept in the folder `work` until
+    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. Raises DataError when not
+    one scan can be used, MeasurementError and EstimationError from the smoother.
     """
     account = Account(skips=list(log.skips))
     with account.stage("trajectory"):
@@ -69,7 +78,9 @@ def run(
             Drive(log, trajectory, segmenter, settings), Path(folder), account, progress
         )
         with account.stage("mapping"):
-            maps = build_maps(drive, account, progress)
+            maps = build_maps(
+                drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
+            )
     with account.stage("refinement"):
         progress("refinement", 0, 1)
         refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -17,6 +18,18 @@ from gnss_sem_map.refinement import RefinementSettings
 from gnss_sem_map.voxel_map import MappingSettings
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+class _Yaml(yaml.SafeLoader):
+    """YAML in which only true and false are truth values: `vehicles: off` is a word, as it looks."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+_Yaml.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("^(true|false)$"), list("tf"))
 
 
 class Settings(BaseModel):
@@ -60,7 +73,7 @@ def parse(
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content = yaml.safe_load(file.read_text("utf-8"))
+        content = yaml.load(file.read_text("utf-8"), _Yaml)  # noqa: S506 (a SafeLoader)
     except OSError as error:
         raise ConfigError(f"{file}: cannot read the settings ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -84,7 +97,7 @@ def _apply(content: dict[str, Any], override: str) -> None:
         if not isinstance(content, dict):
             raise ConfigError(f"--set {override!r}: {section!r} is a value, not a section")
     try:
-        content[name] = yaml.safe_load(value)
+        content[name] = yaml.load(value, _Yaml)  # noqa: S506 (a SafeLoader)
     except yaml.YAMLError:
         raise ConfigError(f"--set {override!r}: the value is not YAML") from None
 

@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -23,12 +23,11 @@ Model = TypeVar("Model", bound=BaseModel)
 class _Yaml(yaml.SafeLoader):
     """YAML in which only true and false are truth values: `vehicles: off` is a word, as it looks."""
 
-    yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool"]
-        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
 
-
+_Yaml.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 _Yaml.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("^(true|false)$"), list("tf"))
 
 
@@ -73,7 +72,7 @@ def parse(
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        content = yaml.load(file.read_text("utf-8"), _Yaml)  # noqa: S506 (a SafeLoader)
+        content = yaml.load(file.read_text("utf-8"), _Yaml)
     except OSError as error:
         raise ConfigError(f"{file}: cannot read the settings ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -97,7 +96,7 @@ def _apply(content: dict[str, Any], override: str) -> None:
         if not isinstance(content, dict):
             raise ConfigError(f"--set {override!r}: {section!r} is a value, not a section")
     try:
-        content[name] = yaml.load(value, _Yaml)  # noqa: S506 (a SafeLoader)
+        content[name] = yaml.load(value, _Yaml)
     except yaml.YAMLError:
         raise ConfigError(f"--set {override!r}: the value is not YAML") from None
 

@@ -173,14 +173,17 @@ class SemanticMap:
     """(v,) probability of the label; 0 where unlabelled."""
     states: NDArray[np.uint8]
     """(v,) of `State`."""
+    entropy: NDArray[np.float32] | None = None
+    """(v,) nat, of the class distribution behind `confidence`; None where a map was read from disk."""
 
     def __post_init__(self) -> None:
         for name, values in (
             ("labels", self.labels),
             ("confidence", self.confidence),
             ("states", self.states),
+            ("entropy", self.entropy),
         ):
-            if values.shape != (len(self.voxels),):
+            if values is not None and values.shape != (len(self.voxels),):
                 raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
 
     @classmethod
@@ -192,6 +195,7 @@ class SemanticMap:
             labels=voxels.labels,
             confidence=np.where(voxels.observed, probability, 0).astype(np.float32),
             states=np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8),
+            entropy=entropy_of(voxels.probabilities),
         )
 
     def __len__(self) -> int:
@@ -300,6 +304,11 @@ def log_table(number_of_classes: int, floor_percent: int) -> NDArray[np.int32]:
     numbers = np.arange(largest + 1, dtype=np.float64)
     numbers[0] = 1.0
     return np.asarray(np.rint(UNITS_PER_NAT * np.log(numbers)), np.int32)
+
+
+def entropy_of(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Entropy (v,) nat of class distributions (v, c): 0 where one class is certain, ln c where nothing is known."""
+    return np.asarray(-(probabilities * np.log(np.maximum(probabilities, 1e-30))).sum(axis=1), np.float32)
 
 
 def softmax(log_scores: NDArray[np.float32]) -> NDArray[np.float32]:

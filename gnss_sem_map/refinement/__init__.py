@@ -18,11 +18,11 @@ from gnss_sem_map.refinement import count_grid, vehicles
 from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
 from gnss_sem_map.refinement.ground import height_over_ground
-from gnss_sem_map.refinement.smoothing import SmoothingSettings, mean_field
+from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
 from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
 from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, softmax
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, entropy_of, softmax
 
 __all__ = ["RefinementReport", "RefinementSettings", "Step", "VehicleObject", "refine", "with_removed"]
 
@@ -46,6 +46,17 @@ class RefinementSettings(BaseModel):
     vehicles: Literal["evidence", "paper", "off"] = Field(
         default="evidence",
         description="Vehicles (section 3.3.2): support by object and motion by evidence, or eq. 12 and 13.",
+    )
+    confidence_temperature: float = Field(
+        default=2.4,
+        gt=0,
+        le=100,
+        description="Log scores are divided by this before confidence is read off them: networks err alike in all"
+        " views. 2.4 fits five labelled streets (research); a calibration file brings its own.",
+    )
+    infer_unobserved: bool = Field(
+        default=False,
+        description="Label voxels that no camera saw from their neighbours; they are marked as inferred.",
     )
     count_exponent: float = Field(
         default=0.5,
@@ -112,8 +123,9 @@ def refine(
     scores, columns = _correct_columns(voxels, scores, settings)
     scores, moving, objects, judged = _judge_vehicles(voxels, scores, heights, settings)
     scores, smoothed = _smooth(voxels, scores, settings)
-    refined = _decide(voxels, scores, moving)
-    steps = [geometry, columns, judged, smoothed]
+    scores, inferred, spread = _infer(voxels, scores, settings)
+    refined = _decide(voxels, scores, moving, inferred, settings.confidence_temperature)
+    steps = [geometry, columns, judged, smoothed, spread]
     if removed is not None:
         refined, layered = _with_layer(refined, removed)
         steps.append(layered)
@@ -217,13 +229,37 @@ def _judge_vehicles(
     )
 
 
-def _decide(voxels: VoxelMap, scores: Scores, moving: NDArray[np.bool_]) -> SemanticMap:
+def _infer(
+    voxels: VoxelMap, scores: Scores, settings: RefinementSettings
+) -> tuple[Scores, NDArray[np.bool_], Step]:
+    """Voxels that no camera saw, from their neighbours."""
+    name, nothing = "inferred", np.zeros(len(voxels), np.bool_)
+    if not settings.infer_unobserved:
+        return scores, nothing, Step(name, {}, SWITCHED_OFF)
+    spread, inferred = infer(voxels.keys, scores, voxels.observed, settings.neighbours)
     labels = _labels(voxels, scores)
+    after = np.where(inferred, spread.argmax(axis=1), labels).astype(np.int8)
+    return spread, inferred, Step(name, _changes(voxels.label_set, labels, after))
+
+
+def _decide(
+    voxels: VoxelMap,
+    scores: Scores,
+    moving: NDArray[np.bool_],
+    inferred: NDArray[np.bool_],
+    temperature: float,
+) -> SemanticMap:
+    """The most probable class of every voxel, and how probable it is: softmax of the scores over the temperature."""
+    known = voxels.observed | inferred
+    labels = np.where(known, scores.argmax(axis=1), UNLABELLED).astype(np.int8)
     states = np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8)
     states[labels != voxels.labels] = State.REFINED
+    states[inferred] = State.INFERRED
     states[moving] = State.REMOVED
-    confidence = np.where(voxels.observed, softmax(scores).max(axis=1, initial=0.0), 0).astype(np.float32)
-    return SemanticMap(voxels, labels, confidence, states)
+    probabilities = softmax(scores / np.float32(temperature))
+    confidence = np.where(known, probabilities.max(axis=1, initial=0.0), 0).astype(np.float32)
+    entropy = np.where(known, entropy_of(probabilities), np.log(scores.shape[1])).astype(np.float32)
+    return SemanticMap(voxels, labels, confidence, states, entropy)
 
 
 def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
@@ -240,7 +276,11 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     labels[kept], confidence[kept], states[kept] = static.labels, static.confidence, static.states
     labels[added] = vehicle[0] if vehicle else UNLABELLED
     confidence[added] = alone.probabilities[:, vehicle[0]] if vehicle else 0.0
-    return SemanticMap(voxels, labels, confidence, states)
+    entropy = None
+    if static.entropy is not None:
+        entropy = np.empty(len(voxels), np.float32)
+        entropy[kept], entropy[added] = static.entropy, entropy_of(alone.probabilities)
+    return SemanticMap(voxels, labels, confidence, states, entropy)
 
 
 def _classes(label_set: LabelSet, *names: str) -> tuple[int, ...]:

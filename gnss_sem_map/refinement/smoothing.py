@@ -67,6 +67,29 @@ def mean_field(
     return result
 
 
+def infer(
+    keys: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    observed: NDArray[np.bool_],
+    settings: SmoothingSettings,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Log scores (v, c) in which voxels without an observation repeat what their 26 neighbours say, and which (v,) do.
+
+    Each of the `iterations` reaches one voxel farther; a voxel hears observed ones first and only then inferred ones.
+    """
+    scores, known = scores.copy(), observed.copy()
+    for _ in range(settings.iterations):
+        q = np.where(known[:, None], softmax(scores), np.float32(0))
+        heard = np.zeros_like(q)
+        _hear(keys, q, HALF_STENCIL, heard)
+        reached = ~known & heard.any(axis=1)
+        if not reached.any():
+            break
+        scores[reached] = np.float32(settings.coupling_nat) * heard[reached]
+        known |= reached
+    return scores, known & ~observed
+
+
 @njit(cache=True, nogil=True)
 def _hear(keys, q, stencil, heard):  # type: ignore[no-untyped-def]
     """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""

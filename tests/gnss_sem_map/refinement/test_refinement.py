@@ -76,13 +76,19 @@ def test_nothing_is_deleted_and_what_no_camera_saw_stays_unlabelled(mode):
 def test_refinement_with_everything_off_is_the_map_as_fusion_left_it():
     voxels, _ = street(np.random.default_rng(2))
     off = RefinementSettings(
-        geometry="off", building_vegetation="off", vehicles="off", smoothing="off", count_exponent=1.0
+        geometry="off",
+        building_vegetation="off",
+        vehicles="off",
+        smoothing="off",
+        count_exponent=1.0,
+        confidence_temperature=1.0,
     )
     refined, report = refine(voxels, off)
     plain = SemanticMap.of(voxels)
     np.testing.assert_array_equal(refined.labels, plain.labels)
     np.testing.assert_array_equal(refined.states, plain.states)
     np.testing.assert_allclose(refined.confidence, plain.confidence, rtol=1e-5)
+    np.testing.assert_allclose(refined.entropy, plain.entropy, rtol=1e-4, atol=1e-6)
     assert all(step.changed == 0 for step in report.steps)
 
 

@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import C, X
 from numpy.typing import NDArray
 
 from factor_graphs.covariances import eliminate
-from factor_graphs.graph import from_values
-from factor_graphs.problem import Fit, Problem
+from factor_graphs.graph import from_values, relative_pose_factors
+from factor_graphs.problem import RELATIVE_LOSSES, Fit, Problem
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,8 @@ def correct(
     stddevs = np.array([CLOCK_STDDEV if with_time else HELD, *[ANTENNA_STDDEV if with_lever else HELD] * 3])
     moved = np.array([now.time_offset_s, *(now.p_imu_antenna - given)])
     linear = fit.motion.linearize(fit.values)
+    for factor in relative_pose_factors(problem.relative, problem.relative_at, RELATIVE_LOSSES[fit.loss]):
+        linear.push_back(factor.linearize(fit.values))
     for row in _fix_rows(problem, fit):
         linear.push_back(row)
     linear.push_back(

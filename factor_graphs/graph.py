@@ -11,6 +11,7 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes, ImuNoise
+from factor_graphs.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
 
@@ -61,6 +62,21 @@ def gnss_factors(
         if loss is not None:
             model = gtsam.noiseModel.Robust.Create(loss, model)
         yield gtsam.GPSFactorArm(X(keyframe), position, p_imu_antenna, model)
+
+
+def relative_pose_factors(
+    relative: RelativePoses,
+    keyframes: NDArray[np.intp],
+    loss: gtsam.noiseModel.mEstimator.Base | None,
+) -> Iterator[gtsam.BetweenFactorPose3]:
+    """Every relative pose binds two keyframes, `keyframes` (k, 2)."""
+    for (i, j), T, covariance in zip(
+        keyframes.tolist(), relative.T_imu_imu, relative.covariances, strict=True
+    ):
+        model: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        if loss is not None:
+            model = gtsam.noiseModel.Robust.Create(loss, model)
+        yield gtsam.BetweenFactorPose3(X(i), X(j), gtsam.Pose3(T), model)
 
 
 def prior_factors(

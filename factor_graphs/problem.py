@@ -11,17 +11,28 @@ from scipy.stats import chi2
 from factor_graphs.alignment import AttitudePrior, first_guess
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.graph import from_values, gnss_factors, imu_factors, prior_factors, to_values
+from factor_graphs.graph import (
+    from_values,
+    gnss_factors,
+    imu_factors,
+    prior_factors,
+    relative_pose_factors,
+    to_values,
+)
 from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.screening import decorrelate, inside, plausible
+from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
+from factor_graphs.screening import correlation_time, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
 
-# 99 % of good fixes have a squared whitened residual below the first, 99.9 % below the second.
+# 99 % of good measurements have a squared whitened residual below the first, 99.9 % below the second: fixes ...
 GATE, REJECTION = float(chi2.ppf(0.99, 3)), float(chi2.ppf(0.999, 3))
 GOOD_MEAN = float(3 * chi2.cdf(GATE, 5) / chi2.cdf(GATE, 3))
+# ... and relative poses.
+RELATIVE_GATE, RELATIVE_REJECTION = float(chi2.ppf(0.99, 6)), float(chi2.ppf(0.999, 6))
+RELATIVE_GOOD_MEAN = float(6 * chi2.cdf(RELATIVE_GATE, 8) / chi2.cdf(RELATIVE_GATE, 6))
 # Prior of the first keyframe's position m and speed m/s: finite, and no information.
 START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
 
@@ -33,11 +44,21 @@ LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
     "huber": gtsam.noiseModel.mEstimator.Huber.Create(1.345),
     "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(REJECTION**0.5),
 }
+# A norm of six residuals is larger than one of three: Huber's loss begins where it leaves the usual.
+RELATIVE_LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
+    "quadratic": None,
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(float(chi2.ppf(0.8, 6)) ** 0.5),
+    "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(RELATIVE_REJECTION**0.5),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Measurements ready for the graph, keyframes, first guess. `used` (m,) says which fixes take part."""
+    """Measurements ready for the graph, keyframes, first guess.
+
+    `used` (m,) and `relative_used` (r,) say which of the fixes and relative poses given take part; `at` and
+    `relative_at` (k, 2) are the keyframes of those that do.
+    """
 
     settings: SmootherSettings
     frame: LocalFrame
@@ -47,6 +68,9 @@ class Problem:
     used: NDArray[np.bool_]
     fixes: GnssFixes
     at: NDArray[np.intp]
+    relative_used: NDArray[np.bool_]
+    relative: RelativePoses
+    relative_at: NDArray[np.intp]
     attitude: AttitudePrior
     guess: tuple[Array, Array]
     notes: tuple[str, ...]
@@ -54,7 +78,11 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """One optimised graph; `squares` (m,) are the squared whitened residuals of the fixes, chi2 of 3 dof."""
+    """One optimised graph.
+
+    `squares` (m,) are the squared whitened residuals of the fixes, chi2 of 3 dof, `relative_squares` those of the
+    relative poses, 6 dof.
+    """
 
     inflation: float
     loss: str
@@ -64,6 +92,8 @@ class Fit:
     iterations: int
     squares: Array
     weights: Array
+    relative_squares: Array
+    relative_weights: Array
     chi2_per_dof: float
 
 
@@ -74,6 +104,7 @@ def pose_problem(
     settings: SmootherSettings,
     p_imu_antenna: Array,
     attitude: AttitudePrior | None,
+    relative: RelativePoses = NO_RELATIVE_POSES,
 ) -> Problem:
     """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
     within = inside(fixes, imu)
@@ -93,8 +124,12 @@ def pose_problem(
             f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."
             f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
         )
-    kept = decorrelate(fixes[used], settings.fix_correlation_time_s, settings.min_fix_stddev_m)
-    intervals = split(imu, kept.stamps, settings.keyframe_interval_s)
+    relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
+    relative = relative[relative_used]
+    correlation_time_s = correlation_time(fixes[used], settings, steady=len(relative) > 0)
+    kept = decorrelate(fixes[used], correlation_time_s, settings.min_fix_stddev_m)
+    marks = np.concatenate([kept.stamps, relative.stamps.ravel()])
+    intervals = split(imu, marks, settings.keyframe_interval_s)
     if intervals.blind.any():
         silent = np.diff(intervals.keyframes)[intervals.blind].sum()
         notes.append(f"the IMU is silent for {silent:.2f} s: bridged as an unseen vehicle")
@@ -104,9 +139,21 @@ def pose_problem(
     guess = first_guess(intervals, kept, p_imu_antenna, attitude)
     unknown = np.array([*[settings.start_tilt_stddev_rad] * 2, settings.start_heading_stddev_rad])
     attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown)
-    at = intervals.keyframe_of(kept.stamps)
     return Problem(
-        settings, frame, p_imu_antenna, intervals, noise, used, kept, at, attitude, guess, tuple(notes)
+        settings=settings,
+        frame=frame,
+        p_imu_antenna=p_imu_antenna,
+        intervals=intervals,
+        noise=noise,
+        used=used,
+        fixes=kept,
+        at=intervals.keyframe_of(kept.stamps),
+        relative_used=relative_used,
+        relative=relative,
+        relative_at=intervals.keyframe_of(relative.stamps),
+        attitude=attitude,
+        guess=guess,
+        notes=tuple(notes),
     )
 
 
@@ -137,14 +184,38 @@ def optimise(
     graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
     for factor in gnss_factors(problem.fixes, problem.at, problem.p_imu_antenna, kernel):
         graph.push_back(factor)
+    relative_kernel = RELATIVE_LOSSES[loss]
+    for between in relative_pose_factors(problem.relative, problem.relative_at, relative_kernel):
+        graph.push_back(between)
     for constraint in constraints:
         graph.push_back(constraint)
     values, iterations = _minimise(graph, start, problem.settings.max_iterations)
     squares = _squares(problem, values)
-    good = squares < GATE
-    chi2_per_dof = (2 * motion.error(values) + squares[good].sum()) / (GOOD_MEAN * max(good.sum(), 1))
-    weights = np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
-    return Fit(inflation, loss, motion, graph, values, iterations, squares, weights, float(chi2_per_dof))
+    relative_squares = _relative_squares(problem, values)
+    return Fit(
+        inflation=inflation,
+        loss=loss,
+        motion=motion,
+        graph=graph,
+        values=values,
+        iterations=iterations,
+        squares=squares,
+        weights=_weights(kernel, squares),
+        relative_squares=relative_squares,
+        relative_weights=_weights(relative_kernel, relative_squares),
+        chi2_per_dof=_chi2_per_dof(2 * motion.error(values), squares, relative_squares),
+    )
+
+
+def _weights(kernel: gtsam.noiseModel.mEstimator.Base | None, squares: Array) -> Array:
+    return np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
+
+
+def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> float:
+    """About 1 when all standard deviations are honest; measurements that do not fit are left out."""
+    good, relative_good = squares < GATE, relative_squares < RELATIVE_GATE
+    total = motion + squares[good].sum() + relative_squares[relative_good].sum()
+    return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
 
 
 def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int) -> tuple[gtsam.Values, int]:
@@ -185,6 +256,11 @@ def _squares(problem: Problem, values: gtsam.Values) -> Array:
     off = problem.fixes.positions - p - R @ problem.p_imu_antenna
     squares: Array = np.sum((off / problem.fixes.stddevs) ** 2, axis=1)
     return squares
+
+
+def _relative_squares(problem: Problem, values: gtsam.Values) -> Array:
+    factors = relative_pose_factors(problem.relative, problem.relative_at, None)
+    return np.array([2 * factor.error(values) for factor in factors])
 
 
 def first_values(problem: Problem) -> gtsam.Values:

@@ -4,11 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.settings import SmootherSettings
 
 Mask = NDArray[np.bool_]
 
 # However slow the vehicle, two good fixes may differ by this much, m.
 ALLOWANCE_M = 50.0
+# Who reports positions more often than this, s, reports what a filter makes of them.
+DRIFTING_BELOW_S = 0.5
 
 
 def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
@@ -39,6 +42,16 @@ def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
                 keep[run] = True
                 edge = run[-1 - facing]
     return keep
+
+
+def correlation_time(fixes: GnssFixes, settings: SmootherSettings, steady: bool) -> float:
+    """How long the error of a fix lasts, s.
+
+    An inertial unit's positions, ten a second, drift together for a minute. Where something else holds the shape
+    of the track (`steady`), they must not turn it: over a short way their drift looks like another heading.
+    """
+    drifting = steady and len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
+    return max(settings.fix_correlation_time_s, settings.drift_correlation_time_s if drifting else 0.0)
 
 
 def decorrelate(fixes: GnssFixes, correlation_time_s: float, min_stddev_m: float) -> GnssFixes:

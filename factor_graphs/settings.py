@@ -19,6 +19,11 @@ class SmootherSettings(BaseModel):
     fix_correlation_time_s: float = Field(
         1.0, ge=0, description="Fixes closer than this are not independent: together they weigh as one."
     )
+    drift_correlation_time_s: float = Field(
+        10.0,
+        ge=0,
+        description="Likewise for an inertial unit's positions, where relative poses hold the track's shape.",
+    )
     min_fix_stddev_m: float = Field(0.02, gt=0, description="No fix is trusted more than this.")
     max_speed_mps: float = Field(70.0, gt=0, description="A fix that would need more speed is dropped.")
     estimate_time_offset: bool | None = Field(

@@ -15,7 +15,8 @@ from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise,
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.problem import REJECTION, Fit, Problem, pose_problem
+from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
+from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
 
@@ -32,7 +33,8 @@ class Solution:
     `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6),
     accelerometer m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases).
     For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
-    outside the IMU's span; `rejected`: does not fit or could not be used. `chi2_per_dof` is about 1 when the
+    outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
+    `relative_weights`, likewise. `chi2_per_dof` is about 1 when the
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
     `calibration` the time offset and lever arm used; `notes` says in words what was repaired or is in doubt.
     """
@@ -44,6 +46,7 @@ class Solution:
     fix_weights: Array
     fix_residuals: Array
     rejected: NDArray[np.bool_]
+    relative_weights: Array
     chi2_per_dof: float
     inflation: float
     imu_noise: ImuNoise
@@ -59,21 +62,26 @@ def smooth(
     settings: SmootherSettings | None = None,
     p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
     initial_attitude: AttitudePrior | None = None,
+    relative_poses: RelativePoses | None = None,
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
     `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
-    IMU stamp; nothing need be given. Raises MeasurementError with fewer than three usable fixes, and
-    EstimationError when the optimiser stops at its limit.
+    IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like); neither need
+    be given. Raises MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser
+    stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)
     if given.shape != (3,) or not np.isfinite(given).all():
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
 
+    relative = relative_poses or NO_RELATIVE_POSES
+
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
-        problem = pose_problem(imu, shifted, frame, settings, calibration.p_imu_antenna, initial_attitude)
+        lever = calibration.p_imu_antenna
+        problem = pose_problem(imu, shifted, frame, settings, lever, initial_attitude, relative)
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
@@ -90,6 +98,8 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
     weights, rejected = np.zeros(len(fixes)), ~problem.used
     weights[problem.used], rejected[problem.used] = fit.weights, fit.squares > REJECTION
+    relative_weights = np.zeros(len(problem.relative_used))
+    relative_weights[problem.relative_used] = fit.relative_weights
     return Solution(
         trajectory=trajectory,
         keyframes=keyframes,
@@ -98,6 +108,7 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         fix_weights=weights,
         fix_residuals=_residuals(keyframes, fixes, calibration),
         rejected=rejected,
+        relative_weights=relative_weights,
         chi2_per_dof=fit.chi2_per_dof,
         inflation=fit.inflation,
         imu_noise=noise,
@@ -128,6 +139,9 @@ def _doubts(
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
     if rejected.any():
         yield f"{rejected.sum()} of {len(rejected)} fixes rejected"
+    unfit = fit.relative_squares > RELATIVE_REJECTION
+    if unfit.any():
+        yield f"{unfit.sum()} of {len(unfit)} relative poses rejected"
     heading = heading_stddevs(keyframes)
     if heading.min() > UNKNOWN_HEADING:
         yield f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): did the vehicle move?"

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.graph import gnss_factors, imu_factors
-from factor_graphs.intervals import ImuIntervals, split
+from factor_graphs.graph import gnss_factors, imu_factors, relative_pose_factors
+from factor_graphs.intervals import SAME_STAMP_S, ImuIntervals, split
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.problem import LOSSES
+from factor_graphs.problem import LOSSES, RELATIVE_LOSSES
+from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.smoothing import Solution
 
 Array = NDArray[np.float64]
@@ -40,7 +41,8 @@ class StreamingSmoother:
     """Follows a vehicle online, from where a batch solution of its first seconds ends.
 
     `start` gives the first state, its covariance and the IMU noise; `p_imu_antenna` (3,) m is the lever arm.
-    `state` is the newest one and `restarts` counts how often the solver had to start again.
+    `state` is the newest one, `restarts` counts how often the solver had to start again, and `unbound` the
+    relative poses left out because their earlier moment is no keyframe within the lag.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class StreamingSmoother:
         p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
         lag_s: float = 10.0,
     ) -> None:
-        self.restarts = 0
+        self.restarts = self.unbound = 0
         self._frame, self._lag_s = frame, lag_s
         self._lever = np.asarray(p_imu_antenna, dtype=np.float64)
         self._noise, self._keyframe = start.imu_noise, 0
@@ -60,24 +62,37 @@ class StreamingSmoother:
         self._stddevs = np.sqrt(np.diag(start.state_covariances[-1]))
         self._begin()
 
-    def add(self, imu: ImuSamples, fix: GnssFixes) -> StreamedState:
+    def add(
+        self, imu: ImuSamples, fix: GnssFixes, relative_poses: RelativePoses = NO_RELATIVE_POSES
+    ) -> StreamedState:
         """The state at one new fix, given the IMU from the last state's stamp (or before) to the fix.
 
-        Raises MeasurementError when it is not one fix, is not newer, or the IMU does not span the time between.
+        `relative_poses` end after the last state and not after the fix; they begin there too, or where one of an
+        earlier call ended. Raises MeasurementError when it is not one fix, is not newer, the IMU does not span
+        the time between, or a relative pose ends outside it.
         """
         if len(fix) != 1 or not imu.stamps[0] <= self.state.stamp < fix.stamps[0] <= imu.stamps[-1]:
             raise MeasurementError(
                 f"{len(fix)} fixes at {fix.stamps.tolist()} s, IMU {imu.stamps[0]:.3f}..{imu.stamps[-1]:.3f} s; "
                 f"expected one fix after {self.state.stamp:.3f} s, and the IMU from there to the fix"
             )
-        intervals = split(_between(imu, self.state.stamp, float(fix.stamps[0])), fix.stamps)
+        ends = relative_poses.stamps[:, 1]
+        if np.any((ends <= self.state.stamp) | (ends > fix.stamps[0])):
+            raise MeasurementError(
+                f"relative poses end at {ends.min():.3f}..{ends.max():.3f} s; expected after {self.state.stamp:.3f} s"
+                f" and not after the fix at {fix.stamps[0]:.3f} s: add them with the fix that follows them"
+            )
+        within = relative_poses.stamps[relative_poses.stamps > self.state.stamp]
+        intervals = split(
+            _between(imu, self.state.stamp, float(fix.stamps[0])), np.concatenate([fix.stamps, within])
+        )
         try:
-            self._extend(intervals, fix)
+            self._extend(intervals, fix, relative_poses)
         except RuntimeError:
             # iSAM2 lost its footing: keep the last state, forget how it came about
             self.restarts += 1
             self._begin()
-            self._extend(intervals, fix)
+            self._extend(intervals, fix, relative_poses)
         return self.state
 
     def pose_covariance(self) -> Array:
@@ -104,8 +119,9 @@ class StreamingSmoother:
         values.insert(V(i), state.velocity)
         values.insert(B(i), bias)
         self._smoother.update(graph, values, dict.fromkeys((X(i), V(i), B(i)), state.stamp))
+        self._keyframe_stamps = {i: state.stamp}
 
-    def _extend(self, intervals: ImuIntervals, fix: GnssFixes) -> None:
+    def _extend(self, intervals: ImuIntervals, fix: GnssFixes, relative: RelativePoses) -> None:
         graph, values, stamps = (
             gtsam.NonlinearFactorGraph(),
             gtsam.Values(),
@@ -124,9 +140,19 @@ class StreamingSmoother:
             values.insert(V(i), ahead.velocity())
             values.insert(B(i), bias)
             stamps |= {key: float(intervals.keyframes[i - first]) for key in (X(i), V(i), B(i))}
+        known = self._keyframe_stamps | dict(enumerate(intervals.keyframes.tolist(), first))
+        at = np.array([_keyframe_at(known, stamp) for stamp in relative.stamps.ravel()], dtype=int).reshape(
+            -1, 2
+        )
+        bound = at.min(axis=1, initial=0) >= 0
+        for between in relative_pose_factors(relative[bound], at[bound], RELATIVE_LOSSES["huber"]):
+            graph.push_back(between)
         for gnss in gnss_factors(fix, np.array([last]), self._lever, LOSSES["huber"]):
             graph.push_back(gnss)
         self._smoother.update(graph, values, stamps)
+        self.unbound += int(np.count_nonzero(~bound))
+        oldest = float(fix.stamps[0]) - self._lag_s
+        self._keyframe_stamps = {i: stamp for i, stamp in known.items() if stamp > oldest}
         self._keyframe, self.state = last, self._newest(last, float(fix.stamps[0]))
 
     def _newest(self, i: int, stamp: float) -> StreamedState:
@@ -137,6 +163,12 @@ class StreamingSmoother:
             smoother.calculateEstimateVector(V(i)),
             smoother.calculateEstimateConstantBias(B(i)).vector(),
         )
+
+
+def _keyframe_at(stamps: dict[int, float], stamp: float) -> int:
+    """Number of the keyframe at a stamp, or -1."""
+    nearest = min(stamps, key=lambda i: abs(stamps[i] - stamp))
+    return nearest if abs(stamps[nearest] - stamp) <= SAME_STAMP_S else -1
 
 
 def _between(imu: ImuSamples, first: float, last: float) -> ImuSamples:

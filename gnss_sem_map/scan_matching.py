@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.relative_poses import RelativePoses
+from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.deskew import EXTRAPOLATE_S, points_in_map
@@ -61,6 +62,15 @@ class ScanMatchingSettings(BaseModel):
         0.003, gt=0, lt=1, description="A direction that less than this share of the points hold is open."
     )
     degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in an open direction.")
+
+
+class TrajectorySettings(SmootherSettings):
+    """How the trajectory is estimated: GNSS, IMU, and where there are sweeps LiDAR odometry."""
+
+    lidar_odometry: bool = Field(
+        True, description="Bind the trajectory by scan matching: sharp surfaces, and outages bridged."
+    )
+    scan_matching: ScanMatchingSettings = Field(ScanMatchingSettings(), description="Sweep to local map.")
 
 
 @dataclass(frozen=True, eq=False)

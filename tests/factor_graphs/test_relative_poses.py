@@ -162,7 +162,7 @@ def test_a_stream_refuses_relative_poses_that_end_elsewhere(simulate):
     relative = measured(drive.motion, 0.5, 39.0, np.random.default_rng(0))
     begin = smooth(upto(drive.imu, 30.0), drive.fixes[:29], FRAME, None, LEVER)
     online = StreamingSmoother(begin, FRAME, LEVER)
-    with pytest.raises(MeasurementError, match="relative poses end at 0.700"):
+    with pytest.raises(MeasurementError, match=r"relative poses end at 0\.700"):
         online.add(drive.imu, drive.fixes[32:33], relative[:1])
 
 

@@ -1,0 +1,276 @@
+"""What refinement does, on real and simulated drives, and how fast its kernels are beside what others use.
+
+    python benchmarks/refinement.py [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large]
+
+prints the figures and writes benchmarks/results/refinement.json. Removal: share of moving vehicle points removed (DA),
+of static vehicle points kept (SA_vehicle) and of all static points kept (SA), AA = sqrt(SA DA); the paper's rule
+beside ours. Semantics: strict IoU on the points that their own image labels, before and after. Times are CPU time of
+this process; what counts is their ratio.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import numpy as np
+import tracklets
+from numpy.typing import NDArray
+
+from factor_graphs.smoothing import smooth
+from gnss_sem_map import labels
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.evaluation import Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.mapping import build_maps
+from gnss_sem_map.motion import find_moving
+from gnss_sem_map.refinement import RefinementSettings, refine
+from gnss_sem_map.refinement.count_grid import count_grid
+from gnss_sem_map.refinement.dbscan import dbscan
+from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.voxel_map import SemanticMap, State, keys_of, pack
+
+URBAN = labels.label_set()
+TABLES = Tables.of(URBAN)
+RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
+Figures = dict[str, Any]
+Points = Mapping[int, NDArray[np.int64]]
+PAPER = RefinementSettings(
+    vehicles="paper", building_vegetation="paper", geometry="off", smoothing="off", count_exponent=1.0
+)
+
+
+def main() -> None:
+    """Measure what was asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
+    parser.add_argument(
+        "--simulated", type=Path, nargs="*", default=[], help="drives that are already simulated"
+    )
+    parser.add_argument("--seeds", type=int, default=0, help="drives to simulate here")
+    parser.add_argument("--seconds", type=float, default=12.0, help="length of each")
+    parser.add_argument(
+        "--large", action="store_true", help="a million voxels for DBSCAN, fifty for the count grid"
+    )
+    options = parser.parse_args()
+    figures: Figures = {
+        "dbscan": dbscan_beside_sklearn(options.large),
+        "count_grid": count_grid_beside_bincount(options.large),
+    }
+    if (options.data / RAW_0005).is_dir():
+        figures["removal, raw drive 0005, excerpt"] = on_raw_drive(options.data)
+        figures["semantics, SemanticKITTI 00 and 08"] = on_semantic_kitti(options.data)
+    with tempfile.TemporaryDirectory() as folder:
+        drives = [*options.simulated, *simulated(Path(folder), options.seeds, options.seconds)]
+        for drive in drives:
+            figures[f"simulated, {drive.parent.parent.name}/{drive.name}"] = on_simulated_drive(drive)
+    print(json.dumps(figures, indent=1))
+    results = Path(__file__).parent / "results" / "refinement.json"
+    results.parent.mkdir(exist_ok=True)
+    results.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+
+
+def cpu(work: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
+    """Least CPU time of several runs, s, and the result."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        result = work()
+        times.append(time.process_time() - start)
+    return min(times), result
+
+
+def dbscan_beside_sklearn(large: bool) -> Figures:
+    """The same clusters, on voxels of walls and parked cars."""
+    from sklearn.cluster import DBSCAN
+
+    rng = np.random.default_rng(0)
+    dbscan(np.array([(0, 0, 0)]), 2.5, 10)
+    figures = {}
+    for count in (100_000, 1_000_000)[: 2 if large else 1]:
+        side = int((count / 3) ** 0.5)
+        voxels = np.unique(rng.integers((0, 0, 0), (side, side, 12), (2 * count, 3)), axis=0)
+        voxels = voxels[np.sort(rng.permutation(len(voxels))[:count])]
+        voxels = voxels[(voxels[:, 0] // 30 + voxels[:, 1] // 30) % 2 == 0]
+        ours, clusters = cpu(lambda v=voxels: dbscan(v, 2.5, 10))
+        theirs, expected = cpu(lambda v=voxels: DBSCAN(eps=2.5, min_samples=10).fit(v).labels_, repeats=1)
+        same = bool((clusters == expected).all())
+        figures[str(len(voxels))] = {
+            "ratio": theirs / ours,
+            "ours_s": ours,
+            "sklearn_s": theirs,
+            "same": same,
+        }
+    return figures
+
+
+def count_grid_beside_bincount(large: bool) -> Figures:
+    """Building and vegetation voxels of every column (eq. 8), on voxels sorted by key as in a map."""
+    rng = np.random.default_rng(0)
+    side = 1600 if large else 500
+    x, y, z = np.indices((side, side, 20), np.int32)
+    keys = pack(np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1))
+    kinds = rng.integers(-1, 5, len(keys)).astype(np.int8)
+    count_grid(keys[:100], kinds[:100], (3, 4), 1)
+
+    def bincount() -> list[NDArray[np.int64]]:
+        column = (x.ravel() * side + y.ravel()).astype(np.int64)
+        return [np.bincount(column, kinds == c, side * side).astype(np.int32)[column] for c in (3, 4)]
+
+    ours, counts = cpu(lambda: count_grid(keys, kinds, (3, 4), 1), repeats=2)
+    theirs, expected = cpu(bincount, repeats=1)
+    same = bool((counts == np.stack(expected, axis=1)).all())
+    return {"voxels": len(keys), "ratio": theirs / ours, "ns_per_voxel": 1e9 * ours / len(keys), "same": same}
+
+
+def by_the_paper(drive: Drive) -> Points:
+    """Points in voxels that eq. 12 and 13 remove."""
+    maps = build_maps(drive, Account())
+    refined, _ = refine(maps.static + maps.removed, PAPER)
+    gone = refined.states == State.REMOVED
+    points = {}
+    for seen in seen_scans(drive):
+        places = refined.voxels.places(keys_of(seen.p_map, refined.voxels.voxel_size_m))
+        points[seen.scan.number] = np.flatnonzero((places >= 0) & gone[places])
+    return points
+
+
+def timed_find_moving(drive: Drive) -> tuple[Points, float]:
+    """The moving points, and what finding them costs beside reading and labelling, ms of CPU per scan."""
+    find_moving(drive)
+    reading = cpu(lambda: [None for _ in seen_scans(drive)], repeats=1)[0]
+    finding, moving = cpu(lambda: find_moving(drive), repeats=1)
+    return moving.points, 1e3 * (finding - reading) / len(drive.log.scans)
+
+
+def on_raw_drive(data: Path) -> Figures:
+    """A van ahead, a car that pulls out, nine parked vehicles; boxes as truth."""
+    log = open_drive(data / RAW_0005)
+    segmenter = open_segmenter(f"labels:{data / 'labels/kitti_raw_0005/probabilities'}", URBAN)
+    assert (
+        log.imu is not None and log.gnss is not None and log.frame is not None and log.reference is not None
+    )
+    smoothed = smooth(log.imu, log.gnss, log.frame).trajectory
+    figures: Figures = {}
+    for name, trajectory in (
+        ("oxts poses", log.reference),
+        ("GNSS/IMU smoothed, no LiDAR factors", smoothed),
+    ):
+        drive = Drive(log, trajectory, segmenter, Settings())
+        points, ms = timed_find_moving(drive)
+        figures[name] = tracklets.removal(drive, points, data / RAW_0005) | {"ms_per_scan": ms}
+        figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
+    return figures
+
+
+def simulated(folder: Path, seeds: int, seconds: float) -> list[Path]:
+    """Drives of other seeds than the demo's, simulated here."""
+    from gnss_sem_map.simulation import simulate
+
+    return [simulate(folder / f"seed_{seed}", seconds, seed) for seed in range(101, 101 + seeds)]
+
+
+def on_simulated_drive(folder: Path) -> Figures:
+    """Removal all around, case by case, with perfect class images and the drive's own poses."""
+    log = open_drive(folder)
+    segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
+    drive = Drive(log, log.given or log.reference, segmenter, Settings())
+    points, ms = timed_find_moving(drive)
+    figures: Figures = {}
+    for name, chosen in (("evidence", points), ("paper's rule", by_the_paper(drive))):
+        counts, cases = np.zeros((3, 2), np.int64), {}
+        for seen in seen_scans(drive):
+            truth = np.fromfile(folder / "truth" / "labels" / f"{seen.scan.name}.label", "<u4")[seen.valid]
+            removed = np.zeros(len(truth), np.uint32)
+            removed[chosen.get(seen.scan.number, [])] = 1
+            counts += dynamic_counts(removed, truth, TABLES, seen.scan.name)
+            moving = np.isin(truth & 0xFFFF, (252, 256, 257, 258, 259))
+            for instance in np.unique(truth[moving] >> 16):
+                of_it = moving & (truth >> 16 == instance)
+                seen_points, gone = cases.get(int(instance), (0, 0))
+                cases[int(instance)] = (seen_points + int(of_it.sum()), gone + int(removed[of_it].sum()))
+        figures[name] = dynamic(counts) | {
+            "movers": {str(i): {"points": n, "removed": k / n} for i, (n, k) in sorted(cases.items())}
+        }
+    figures["evidence"]["ms_per_scan"] = ms
+    figures["semantics"] = before_and_after(
+        drive, points, folder / "truth" / "labels", folder / "truth" / "single_frame"
+    )
+    return figures
+
+
+def on_semantic_kitti(data: Path) -> Figures:
+    """Ten scans of two streets each, pooled."""
+    total: dict[str, NDArray[np.int64]] = {}
+    for sequence in ("00", "08"):
+        folder = data / "semantic_kitti" / "sequences" / sequence
+        log = open_drive(folder)
+        segmenter = open_segmenter(
+            f"labels:{data / 'labels/semantic_kitti' / sequence / 'probabilities'}", URBAN
+        )
+        drive = Drive(log, log.given, segmenter, Settings())
+        counts = strict_counts(
+            drive, find_moving(drive).points, folder / "labels", data / "single_frame" / sequence
+        )
+        total = {name: total.get(name, 0) + part for name, part in counts.items()}
+    return {name: compact(part) for name, part in total.items()}
+
+
+def before_and_after(drive: Drive, points: Points, truth: Path, single_frame: Path) -> Figures:
+    """Strict figures of every stage."""
+    return {name: compact(part) for name, part in strict_counts(drive, points, truth, single_frame).items()}
+
+
+def strict_counts(
+    drive: Drive, points: Points, truth: Path, single_frame: Path
+) -> dict[str, NDArray[np.int64]]:
+    """Confusion of single image, fused map, refined map and the paper's refinement, on the points of the first."""
+    drive = Drive(drive.log, drive.trajectory, drive.segmenter, drive.settings, points)
+    maps = build_maps(drive, Account())
+    raw = maps.static + maps.removed
+    stages = {
+        "fused (eq. 6)": SemanticMap.of(raw),
+        "refined": refine(maps.static, removed=maps.removed)[0],
+        "paper": refine(raw, PAPER)[0],
+    }
+    counts = {
+        name: np.zeros((len(URBAN.names), len(URBAN.names) + 1), np.int64)
+        for name in ("single image", *stages)
+    }
+    ids = np.append(URBAN.semantic_kitti_ids, 0).astype("<u4")
+    for seen in seen_scans(drive):
+        true = np.fromfile(truth / f"{seen.scan.name}.label", "<u4")[seen.valid]
+        alone = np.fromfile(single_frame / f"{seen.scan.name}.label", "<u4")[seen.valid]
+        of_image = alone & 0xFFFF != 0
+        counts["single image"] += confusion(alone[of_image], true[of_image], TABLES, seen.scan.name)
+        keys = keys_of(seen.p_map[of_image], raw.voxel_size_m)
+        for name, stage in stages.items():
+            places = stage.voxels.places(keys)
+            shown = np.where((places >= 0) & (stage.labels[places] >= 0), stage.labels[places], -1)
+            if name == "paper":
+                shown[stage.states[places] == State.REMOVED] = -1
+            counts[name] += confusion(ids[shown], true[of_image], TABLES, seen.scan.name)
+    return counts
+
+
+def compact(counts: NDArray[np.int64]) -> Figures:
+    """Strict mean IoU and accuracy, and IoU per class."""
+    figures = semantics(counts, URBAN)
+    classes = {name: None if c is None else round(c["iou"], 4) for name, c in figures["classes"].items()}
+    return {name: round(figures["strict"][name], 4) for name in ("mean_iou", "mean_accuracy")} | {
+        "iou": classes
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -136,8 +136,8 @@ def real_log() -> dict[str, Figures]:
     gps = np.loadtxt(folder / "KittiGps_converted.txt", skiprows=1, delimiter=",")
     epoch = rows[0, 0]
     imu, repairs = clean_imu(rows[:, 0] - epoch, rows[:, 2:5], rows[:, 5:8])
-    # the stddev of the fixes is the one of the example that ships with this log, the IMU's its data sheet
-    fixes = GnssFixes(gps[:, 0] - epoch, gps[:, 1:], np.full((len(gps), 3), 0.07))
+    # the example that ships with this log gives the fixes a variance of 0.07 m²; the IMU's noise is its data sheet's
+    fixes = GnssFixes(gps[:, 0] - epoch, gps[:, 1:], np.full((len(gps), 3), 0.07**0.5))
     noise = ImuNoise(
         accelerometer_noise_density=0.01, gyroscope_noise_density=1.75e-4,
         accelerometer_bias_walk=1.67e-4, gyroscope_bias_walk=2.91e-6,

@@ -10,12 +10,14 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[np.float64]
 
+# A key of GTSAM holds its letter above so many bits of its index.
+INDEX_BITS = 56
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe.
-PLACES = {"x": slice(0, 6), "v": slice(6, 9), "b": slice(9, 15)}
+PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15)}
 
 
 def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = ()) -> gtsam.GaussianBayesNet:
@@ -35,11 +37,11 @@ def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     joint: dict[tuple[int, int], Array] = {}
     for i in reversed(range(k)):
         R, later, S = _conditional(net, i)
-        own = solve_triangular(R, np.eye(15))
+        own, _ = dtrtri(R)
         covariance = own @ own.T
         if later:
             W = own @ S
-            cross = -W @ np.block([[joint[a, b] for b in later] for a in later])
+            cross = -W @ _joined(joint, later)
             covariance = covariance - cross @ W.T
             for n, j in enumerate(later):
                 joint[i, j] = cross[:, 15 * n : 15 * n + 15]
@@ -48,18 +50,24 @@ def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     return np.array([joint[i, i] for i in range(k)])
 
 
+def _joined(joint: dict[tuple[int, int], Array], keyframes: list[int]) -> Array:
+    if len(keyframes) == 1:
+        return joint[keyframes[0], keyframes[0]]
+    return np.block([[joint[a, b] for b in keyframes] for a in keyframes])
+
+
 def _conditional(net: gtsam.GaussianBayesNet, i: int) -> tuple[Array, list[int], Array]:
     """Keyframe i given later ones: R (15, 15) upper triangular, those keyframes, and S (15, 15 each)."""
     parts = [net.at(3 * i + n) for n in range(3)]
-    symbols = [[gtsam.Symbol(key) for key in part.keys()] for part in parts]  # noqa: SIM118
-    later = sorted({s.index() for row in symbols for s in row} - {i})
+    keys = [[(key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1) for key in part.keys()] for part in parts]  # noqa: SIM118
+    later = sorted({index for row in keys for _, index in row} - {i})
+    start = {index: 15 * (1 + n) for n, index in enumerate(later)} | {i: 0}
     columns = np.zeros((15, 15 * (1 + len(later))))
-    for place, part, row in zip(PLACES.values(), parts, symbols, strict=True):
-        matrix, start = np.hstack([part.R(), part.S()]), 0
-        for symbol in row:
-            there = PLACES[chr(symbol.chr())]
-            width = there.stop - there.start
-            offset = 0 if symbol.index() == i else 15 * (1 + later.index(symbol.index()))
-            columns[place, offset + there.start : offset + there.stop] = matrix[:, start : start + width]
-            start += width
+    for rows, part, row in zip(PLACES.values(), parts, keys, strict=True):
+        matrix, column = np.hstack([part.R(), part.S()]), 0
+        for letter, index in row:
+            place, first = PLACES[letter], start[index]
+            width = place.stop - place.start
+            columns[rows, first + place.start : first + place.stop] = matrix[:, column : column + width]
+            column += width
     return columns[:, :15], later, columns[:, 15:]

@@ -43,7 +43,10 @@ def densify(
     T[:-1, :3, 3] = p + u**2 * (square + u * cube)
     v = v + u * (2 * square + 3 * u * cube) / spans[which]
     velocities = np.concatenate([v, keyframes.velocities[-1:]])
-    return Trajectory(intervals.nodes, T, velocities, _covariances(keyframes, T, noise, which, u[:, 0]))
+    covariances = _covariances(keyframes, T, noise, which, u[:, 0])
+    for array in (T, velocities, covariances):
+        array.setflags(write=False)
+    return Trajectory(intervals.nodes, T, velocities, covariances)
 
 
 def _turn(intervals: ImuIntervals, R_keyframes: Array, rate: Array, frame: LocalFrame) -> tuple[Array, Array]:
@@ -99,8 +102,9 @@ def _covariances(
     """
     assert keyframes.covariances is not None
     in_map = _turned(keyframes.covariances, keyframes.T_map_imu[:, :3, :3])
-    mixed = np.concatenate([in_map[which], in_map[-1:]])
-    mixed[:-1] += u[:, None, None] * np.diff(in_map, axis=0)[which]
+    mixed, change = in_map[np.append(which, -1)], np.diff(in_map, axis=0)[which]
+    change *= u[:, None, None]
+    mixed[:-1] += change
     spans, bridge = np.diff(keyframes.stamps), u * (1 - u)
     rotation = np.array([n.gyroscope_noise_density**2 for n in noise]) * spans
     position = np.array([n.accelerometer_noise_density**2 for n in noise]) * spans**3 / 3

@@ -27,7 +27,7 @@ class _Segments(NamedTuple):
     """Position as a cubic and rotation as a turn about a fixed axis, from each knot to the next."""
 
     cubic: Array  # (k, 4, 3): coefficients of u⁰ to u³, u from 0 to 1 over the segment
-    rotation: Array  # (k, 3, 3, 3): R = [0] + sin(u a) [1] + (1 - cos(u a)) [2] (Rodrigues)
+    rotation: Array  # (k, 3, 9): R, row by row, is [0] + sin(u a) [1] + (1 - cos(u a)) [2] (Rodrigues)
     angle: Array  # (k,) rad
     duration: Array  # (k,) s
 
@@ -55,8 +55,10 @@ class Trajectory:
             given = getattr(self, name)
             if given is None:
                 continue
-            array = np.array(given, dtype=np.float64)
-            array.setflags(write=False)
+            array = np.asarray(given, dtype=np.float64)
+            if array.flags.writeable:  # what nobody can change need not be copied
+                array = array.copy()
+                array.setflags(write=False)
             if k == 0 or array.shape != shape or not np.isfinite(array).all():
                 raise MeasurementError(
                     f"Trajectory.{name} has shape {array.shape}; expected {shape}, not empty, all finite"
@@ -107,12 +109,11 @@ class Trajectory:
         i = np.clip(np.searchsorted(self.stamps, t, side="right") - 1, 0, len(self) - 1)
         u = (t - self.stamps[i]) / segments.duration[i]
         turn = u * segments.angle[i]
-        c, r = segments.cubic[i], segments.rotation[i]
-        u = np.clip(u, 0.0, None)[:, None]
+        powers = np.clip(u, 0.0, None)[:, None, None] ** [0, 1, 2, 3]
+        turns = np.stack([np.ones_like(turn), np.sin(turn), 1 - np.cos(turn)], axis=-1)[:, None]
         T = np.zeros((len(t), 4, 4))
-        T[:, :3, :3] = r[:, 0] + np.sin(turn)[:, None, None] * r[:, 1]
-        T[:, :3, :3] += (1 - np.cos(turn))[:, None, None] * r[:, 2]
-        T[:, :3, 3] = c[:, 0] + u * (c[:, 1] + u * (c[:, 2] + u * c[:, 3]))
+        T[:, :3, :3] = (turns @ segments.rotation[i]).reshape(-1, 3, 3)
+        T[:, :3, 3] = (powers @ segments.cubic[i])[:, 0]
         before = np.minimum(t - self.start, 0.0)[:, None]
         T[:, :3, 3] += before * segments.cubic[0, 1] / segments.duration[0]
         T[:, 3, 3] = 1.0
@@ -150,7 +151,7 @@ class Trajectory:
         x, y, z = (turn / np.maximum(angle, 1e-300)[:, None]).T
         zero = np.zeros(k)
         K = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-        return _Segments(cubic, np.stack([R, R @ K, R @ K @ K], axis=1), angle, h)
+        return _Segments(cubic, np.stack([R, R @ K, R @ K @ K], axis=1).reshape(k, 3, 9), angle, h)
 
     def save(self, path: Path | str) -> None:
         """Write the trajectory as a Parquet table, units and frame in its schema metadata."""

@@ -21,7 +21,7 @@ def test_a_tenth_of_the_fixes_predicts_the_others_to_a_metre():
     gps = np.loadtxt(folder / "KittiGps_converted.txt", skiprows=1, delimiter=",")
     imu, repairs = clean_imu(rows[:, 0] - rows[0, 0], rows[:, 2:5], rows[:, 5:8])
     assert repairs.gaps[0, 1] - repairs.gaps[0, 0] == pytest.approx(1.92, abs=0.01)
-    fixes = GnssFixes(gps[:, 0] - rows[0, 0], gps[:, 1:], np.full((len(gps), 3), 0.07))
+    fixes = GnssFixes(gps[:, 0] - rows[0, 0], gps[:, 1:], np.full((len(gps), 3), 0.07**0.5))
     used = np.arange(len(fixes)) % 10 == 0
     sheet = ImuNoise(
         accelerometer_noise_density=0.01, gyroscope_noise_density=1.75e-4,

@@ -33,7 +33,9 @@ def test_an_exact_imu_between_true_keyframes_gives_the_truth_everywhere(simulate
     _, _, dense = dense_of(drive)
     truth = drive.motion.trajectory(dense.stamps)
     assert np.abs(dense.positions - truth.positions).max() < 1e-4
-    assert np.abs(dense.velocities - truth.velocities).max() < 5e-4
+    assert (
+        np.abs(dense.velocities - truth.velocities).max() < 1e-3
+    )  # the steps of the IMU are 1e-2 s, its jerk some m/s³
     assert np.abs(dense.T_map_imu[:, :3, :3] - truth.T_map_imu[:, :3, :3]).max() < 1e-5
 
 
@@ -50,7 +52,7 @@ def test_it_passes_through_every_keyframe_with_its_velocity_and_covariance_and_w
 
 def test_covariances_between_keyframes_are_covariances_and_no_smaller_than_the_mixture_of_both_ends(simulate):
     drive = simulate(2, seconds=20.0)
-    cut, keyframes, dense = dense_of(drive)
+    _, keyframes, dense = dense_of(drive)
     assert np.linalg.eigvalsh(dense.covariances).min() > 0
     variance = dense.position_stddevs**2
     ends = keyframes.position_stddevs**2

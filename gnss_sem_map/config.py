@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
 from gnss_sem_map.refinement import RefinementSettings
+from gnss_sem_map.scan_matching import TrajectorySettings
 from gnss_sem_map.voxel_map import MappingSettings
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -37,8 +37,8 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     classes: str = Field("urban", description="Class set of the map: a shipped one, or a YAML file.")
-    trajectory: SmootherSettings = Field(
-        default_factory=SmootherSettings, description="GNSS and IMU smoothing."
+    trajectory: TrajectorySettings = Field(
+        default_factory=TrajectorySettings, description="GNSS and IMU smoothing, LiDAR odometry."
     )
     mapping: MappingSettings = Field(MappingSettings(), description="Points to voxels.")
     labelling: LabellingSettings = Field(LabellingSettings(), description="Pixels to points.")

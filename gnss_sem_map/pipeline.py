@@ -1,6 +1,7 @@
 """The whole flow on one page: a drive in, a trajectory and a semantic map out (Fig. 1 of the paper).
 
-    trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive)
+    trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive); sweeps matched by it
+                        bind it in turn
     motion              which points belong to something that moved
     for every scan      deskew into the map, label from its image, fuse into the voxels
     refine              height, columns, vehicles, neighbours
@@ -11,7 +12,7 @@ Files are the business of `io` and `export`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,10 +30,12 @@ from gnss_sem_map.motion import find_moving
 from gnss_sem_map.refinement import RefinementReport, refine
 from gnss_sem_map.refinement.verdicts import TrackedObject
 from gnss_sem_map.remembering import RememberedSegmenter
+from gnss_sem_map.scan_matching import match_scans
 from gnss_sem_map.seen_scans import Drive
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sharpness import Sharpness, of_drive
 from gnss_sem_map.voxel_map import SemanticMap
 
 
@@ -49,6 +52,8 @@ class Result:
     account: Account
     moving: Mapping[int, NDArray[np.int64]] | None = None
     """Frame number -> places of the points of moving objects among the scan's usable ones; None: not sought."""
+    sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
+    """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
 
 
 def run(
@@ -71,8 +76,12 @@ def run(
     account = Account(skips=list(log.skips))
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
-        trajectory, solution = estimate_trajectory(log, settings, account)
+        solutions = solve(log, settings, account, progress)
+        trajectory, solution = _final(log, solutions)
         progress("trajectory", 1, 1)
+    with account.stage("sharpness"):
+        figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
+        sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
     with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
         drive, tracked = _without_moving(
             Drive(log, trajectory, segmenter, settings), Path(folder), account, progress
@@ -86,7 +95,7 @@ def run(
         refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked)
         progress("refinement", 1, 1)
     raw = SemanticMap.of(maps.static + maps.removed)
-    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving)
+    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness)
 
 
 def _without_moving(
@@ -108,18 +117,38 @@ def _without_moving(
 
 
 def estimate_trajectory(
-    log: SensorLog, settings: Settings, account: Account
+    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
 ) -> tuple[Trajectory, Solution | None]:
-    """The poses that came with the drive, or GNSS and IMU smoothed."""
-    if log.given is not None:
+    """The poses that came with the drive, or GNSS and IMU smoothed, bound by LiDAR odometry where there are scans."""
+    return _final(log, solve(log, settings, account, progress))
+
+
+def _final(log: SensorLog, solutions: tuple[Solution, ...]) -> tuple[Trajectory, Solution | None]:
+    if not solutions:
+        assert log.given is not None
         return log.given, None
-    if log.imu is None or log.gnss is None or log.frame is None:
+    return solutions[-1].trajectory, solutions[-1]
+
+
+def solve(
+    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
+) -> tuple[Solution, ...]:
+    """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given."""
+    if log.given is not None:
+        return ()
+    imu, gnss, frame = log.imu, log.gnss, log.frame
+    if imu is None or gnss is None or frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")
     smoother = settings.trajectory
     if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
         smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
-    solution = smooth(
-        log.imu, log.gnss, log.frame, smoother, log.calibration.p_imu_antenna, log.initial_attitude
-    )
-    account.warnings.extend(solution.notes)
-    return solution.trajectory, solution
+    lever, attitude = log.calibration.p_imu_antenna, log.initial_attitude
+    solutions = [smooth(imu, gnss, frame, smoother, lever, attitude)]
+    if smoother.lidar_odometry and log.scans:
+        matches = match_scans(log, solutions[0].trajectory, smoother.scan_matching, progress)
+        account.counts.update(matches.counts)
+        account.skips.extend(matches.skips)
+        if len(matches.relative_poses):
+            solutions.append(smooth(imu, gnss, frame, smoother, lever, attitude, matches.relative_poses))
+    account.warnings.extend(solutions[-1].notes)
+    return tuple(solutions)

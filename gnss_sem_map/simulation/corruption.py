@@ -5,8 +5,9 @@ sidewalk, vehicle and what is behind it), and every pixel keeps some doubt. Patc
 so neighbouring frames err together, as those of a real network do.
 """
 
-import re
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -92,25 +93,32 @@ def corrupt_class_image(
 
 
 def write_corrupted_labels(
-    drive: Path, folder: Path, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    drive: Path,
+    folder: Path,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    workers: int | None = None,
 ) -> Path:
     """Corrupt all class images of a simulated drive's truth: `<folder>/<frame>.npz`, which `labels:FOLDER` reads.
 
-    Each holds `probabilities` and `class_names`. Raises DataError when the drive has no class images.
+    Each holds `probabilities` and `class_names`. `progress(done, frames)` is called after every frame; `workers`
+    threads share the work (None: one per core). Raises DataError when the drive has no class images.
     """
     paths = sorted((Path(drive) / "truth" / "train_ids").glob("*.png"))
     if not paths:
         raise DataError(f"{drive}: found no truth/train_ids/*.png, expected a simulated drive")
     Path(folder).mkdir(parents=True, exist_ok=True)
-    for done, path in enumerate(paths, 1):
-        number = re.fullmatch(r"(\d+)", path.stem)
-        train_ids = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-        if number is None or train_ids is None:
-            raise DataError(f"{path}: found no class image named by its frame; simulate the drive again")
-        probabilities = corrupt_class_image(np.asarray(train_ids), seed, int(number[1]))
-        np.savez_compressed(
-            Path(folder) / f"{path.stem}.npz", probabilities=probabilities, class_names=CLASS_NAMES
-        )
-        if progress is not None:
-            progress(done, len(paths))
+    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        for done, _ in enumerate(pool.map(lambda path: _write_corrupted(path, Path(folder), seed), paths), 1):
+            if progress is not None:
+                progress(done, len(paths))
     return Path(folder)
+
+
+def _write_corrupted(path: Path, folder: Path, seed: int) -> None:
+    train_ids = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if train_ids is None or not path.stem.isdecimal():
+        raise DataError(f"{path}: found no class image named by its frame; simulate the drive again")
+    probabilities = corrupt_class_image(np.asarray(train_ids), seed, int(path.stem))
+    np.savez_compressed(folder / f"{path.stem}.npz", probabilities=probabilities, class_names=CLASS_NAMES)

@@ -124,6 +124,8 @@ def prepare(
     rows = oxts_rows(ego, oxts_stamps, _PLACE, rng)
     sync = sweep_rows(oxts_stamps, sweeps.mean(axis=1), rng)
     world = World(town, ego, movers)
+    middles = sweeps.mean(axis=1)
+    world.remember(np.concatenate([sweeps[:, 0], middles, sweeps[:, 1], middles + EXPOSURE_AFTER_SCAN_S]))
     return Simulation(seed, world, lidar or Lidar(), camera or Camera(), sweeps, oxts_stamps, rows, sync)
 
 

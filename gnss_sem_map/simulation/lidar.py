@@ -7,15 +7,16 @@ in whole millimetres.
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, kernel
+from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, kernel
 from gnss_sem_map.simulation.ground import FAR
 from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, uniform
-from gnss_sem_map.simulation.raycast import GROUND, Scene, cast_ray
+from gnss_sem_map.simulation.raycast import Scene, cast_ray
 from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
 from gnss_sem_map.simulation.textures import window_at
 from gnss_sem_map.simulation.world import World
@@ -40,16 +41,23 @@ class Lidar:
     range_stddev_m: float = 0.02
     dropout: float = 0.015
 
-    @property
+    @cached_property
     def azimuths(self) -> Floats:
         """Azimuth of every column, rad in (-pi, pi], in file order (none lies on the seam)."""
         a = (np.arange(self.columns) + 0.25) * (2 * np.pi / self.columns)
         return np.where(a > np.pi, a - 2 * np.pi, a)
 
-    @property
+    @cached_property
     def fractions(self) -> Floats:
         """When every column is measured, as a part of the sweep."""
         return 0.5 - self.azimuths / (2 * np.pi)
+
+    @cached_property
+    def directions(self) -> Floats:
+        """Unit vectors of all rays in the LiDAR's axes, (rings, columns, 3)."""
+        a, e = self.azimuths[None, :], self.elevations[:, None]
+        parts = np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
+        return np.stack(parts, axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +79,28 @@ def _sweep(
     reflectances: Floats,
     lidar: tuple[float, float, float, float],
     key: int,
-    ranges: Floats,
-    intensities: Floats,
+    points: Singles,
+    columns: Integers,
     kinds: Bytes,
     things: Integers,
-) -> None:
-    """Cast all rays of a sweep: rings by columns. `lidar`: reach, blind range, range noise, dropout."""
+) -> int:
+    """Cast all rays of a sweep, ring after ring; returns how many came back, whose rows are filled in this order.
+
+    `lidar`: reach, blind range, range noise, dropout. Coordinates are whole millimetres.
+    """
     reach, blind, noise, dropout = lidar
+    count = 0
     for ring in range(directions.shape[0]):
         for column in range(directions.shape[1]):
+            if uniform(key, ring, column, 1) < dropout:
+                continue
             x, y, z = directions[ring, column, 0], directions[ring, column, 1], directions[ring, column, 2]
             dx = T[column, 0, 0] * x + T[column, 0, 1] * y + T[column, 0, 2] * z
             dy = T[column, 1, 0] * x + T[column, 1, 1] * y + T[column, 1, 2] * z
             dz = T[column, 2, 0] * x + T[column, 2, 1] * y + T[column, 2, 2] * z
             ox, oy, oz, f = T[column, 0, 3], T[column, 1, 3], T[column, 2, 3], fractions[column]
             t, thing, shape = cast_ray(scene, reach, False, f, ox, oy, oz, dx, dy, dz)
-            if t >= FAR or t < blind or uniform(key, ring, column, 1) < dropout:
+            if t >= FAR or t < blind:
                 continue
             surface, kind, n, p, _ = surface_at(scene, thing, shape, f, ox, oy, oz, dx, dy, dz, t)
             slant = abs(n[0] * dx + n[1] * dy + n[2] * dz)
@@ -99,9 +113,15 @@ def _sweep(
             echo = reflectances[surface] * (0.25 + 0.75 * np.sqrt(slant))
             if chance > 4000.0 * echo * (0.02 + slant) / (t * t):
                 continue
-            ranges[ring, column] = t + noise * gaussian(key, ring, column, 3)
-            intensities[ring, column] = min(0.99, max(0.0, echo + 0.05 * gaussian(key, ring, column, 4)))
-            kinds[ring, column], things[ring, column] = kind, thing
+            measured = 1000.0 * (t + noise * gaussian(key, ring, column, 3))
+            bright = min(0.99, max(0.0, echo + 0.05 * gaussian(key, ring, column, 4)))
+            points[count, 0] = np.float32(np.rint(measured * x) / 1000.0)
+            points[count, 1] = np.float32(np.rint(measured * y) / 1000.0)
+            points[count, 2] = np.float32(np.rint(measured * z) / 1000.0)
+            points[count, 3] = np.float32(np.rint(100.0 * bright) / 100.0)
+            columns[count], kinds[count], things[count] = column, kind, thing
+            count += 1
+    return count
 
 
 def render_scan(
@@ -121,21 +141,16 @@ def render_scan(
     lidar = lidar or Lidar()
     scene, fractions = world.scene(start, end), lidar.fractions
     T = world.ego.poses(start + fractions * (end - start)) @ T_imu_lidar
-    a, e = lidar.azimuths[None, :], lidar.elevations[:, None]
-    directions = np.stack(
-        np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)), axis=-1
-    )
-    shape = directions.shape[:2]
-    ranges, intensities = np.zeros(shape), np.zeros(shape)
-    kinds, things = np.zeros(shape, np.uint8), np.full(shape, GROUND, np.int32)
-    numbers = (lidar.range_m, lidar.blind_m, lidar.range_stddev_m, lidar.dropout)
-    key = seed * 1_000_003 + frame
-    _sweep(scene, T, directions, fractions, REFLECTANCES, numbers, key, ranges, intensities, kinds, things)
-    hit = ranges > 0
-    xyz = np.round(ranges[hit][:, None] * directions[hit], 3)
-    points = np.column_stack([xyz, np.round(intensities[hit], 2)]).astype(np.float32)
-    labels = hit_labels(world, kinds[hit], things[hit])
-    return SimulatedScan(points, labels, np.broadcast_to(fractions, shape)[hit])
+    rays = len(lidar.elevations) * lidar.columns
+    points, columns = np.zeros((rays, 4), np.float32), np.zeros(rays, np.int32)
+    kinds, things = np.zeros(rays, np.uint8), np.zeros(rays, np.int32)
+    count = _sweep(
+        scene, T, lidar.directions, fractions, REFLECTANCES,
+        (lidar.range_m, lidar.blind_m, lidar.range_stddev_m, lidar.dropout),
+        seed * 1_000_003 + frame, points, columns, kinds, things,
+    )  # fmt: skip
+    labels = hit_labels(world, kinds[:count], things[:count])
+    return SimulatedScan(points[:count].copy(), labels, fractions[columns[:count]])
 
 
 def hit_labels(

@@ -7,7 +7,6 @@ import numpy.typing as npt
 
 from factor_graphs.simulation import Motion
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.ground import height_gradient
 from gnss_sem_map.simulation.raycast import CELL_M, THING_COLUMNS, Scene
 from gnss_sem_map.simulation.town import Colour, Town
 
@@ -43,7 +42,8 @@ class World:
         self._still[:, [0, 1, 2, 3, 6, 7]] = [town.place(thing) for thing in town.things]
         self._moving = self._rows(np.array([m.model for m in movers], int))
         self._moving[:, 12] = 1.0
-        _aim(self._still)
+        self._still[:, 4], self._still[:, 5] = np.cos(self._still[:, 3]), np.sin(self._still[:, 3])
+        self._poses: dict[float, Floats] = {}
         self._make_grid()
 
     def _rows(self, model: npt.NDArray[np.int64]) -> Floats:
@@ -58,26 +58,39 @@ class World:
         rows[:, 20], rows[:, 21] = first[model], first[model + 1]
         return rows
 
+    def remember(self, stamps: Floats) -> None:
+        """Work out the movers' poses at many stamps at once; `scene` would do it one stamp after the other."""
+        poses = [mover.motion.poses(stamps) for mover in self.movers]
+        if poses:
+            self._poses.update(zip(stamps.tolist(), np.stack(poses, axis=1), strict=True))
+
     def scene(self, start: float, end: float) -> Scene:
         """The scene of a sweep from `start` to `end` (s); what moves does so steadily in between."""
         moving = self._moving.copy()
-        for row, mover in zip(moving, self.movers, strict=True):
-            self._move(row, mover.motion.poses([start, 0.5 * (start + end), end]))
-        _aim(moving)
+        if self.movers:
+            self._move(moving, *(self._poses_at(stamp) for stamp in (start, 0.5 * (start + end), end)))
         chain, links = self._chains(moving)
         return Scene(
             self.town.ground, np.concatenate([self._still, moving]), self._shapes, self._colours,
             self._corner, self._start, self._members, self._top, chain, links,
         )  # fmt: skip
 
-    def _move(self, row: Floats, T: Floats) -> None:
-        """Place a mover: its pose in the middle of the sweep, and what changes from start to end."""
-        yaw = np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
-        gx, gy = height_gradient(self.town.ground, T[1, 0, 3], T[1, 1, 3])
+    def _poses_at(self, stamp: float) -> Floats:
+        """(movers, 4, 4)."""
+        known = self._poses.get(float(stamp))
+        return np.concatenate([m.motion.poses([stamp]) for m in self.movers]) if known is None else known
+
+    def _move(self, rows: Floats, before: Floats, T: Floats, after: Floats) -> None:
+        """Place the movers: where they are in the middle of the sweep, and what changes from start to end."""
+        yaw = np.unwrap([np.arctan2(t[:, 1, 0], t[:, 0, 0]) for t in (before, T, after)], axis=0)
+        ground, (x, y, _) = self.town.ground, T[:, :3, 3].T
+        xx, xy, yy = ground.curvature
+        gx, gy = ground.slope[0] + xx * x + xy * y, ground.slope[1] + xy * x + yy * y
         c, s = np.cos(yaw[1]), np.sin(yaw[1])
-        row[:3], row[3], row[6:8] = T[1, :3, 3], yaw[1], (c * gx + s * gy, c * gy - s * gx)
-        row[8:11], row[11] = T[2, :3, 3] - T[0, :3, 3], yaw[2] - yaw[0]
-        row[19] += 0.5 * np.hypot(row[8], row[9])
+        rows[:, :3], rows[:, 3], rows[:, 4], rows[:, 5] = T[:, :3, 3], yaw[1], c, s
+        rows[:, 6], rows[:, 7] = c * gx + s * gy, c * gy - s * gx
+        rows[:, 8:11], rows[:, 11] = after[:, :3, 3] - before[:, :3, 3], yaw[2] - yaw[0]
+        rows[:, 19] += 0.5 * np.hypot(rows[:, 8], rows[:, 9])
 
     def _make_grid(self) -> None:
         """List what stands still by the cells that it touches."""
@@ -108,10 +121,6 @@ class World:
                     links.append((k, int(chain[i, j])))
                     chain[i, j] = len(links) - 1
         return chain, np.array(links, np.int32).reshape(-1, 2)
-
-
-def _aim(rows: Floats) -> None:
-    rows[:, 4], rows[:, 5] = np.cos(rows[:, 3]), np.sin(rows[:, 3])
 
 
 def _touched(row: Floats, corner: Floats, ny: int) -> npt.NDArray[np.int64]:

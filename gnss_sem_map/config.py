@@ -6,10 +6,10 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
@@ -31,12 +31,32 @@ _Yaml.yaml_implicit_resolvers = {
 _Yaml.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("^(true|false)$"), list("tf"))
 
 
+EQUATION_6: dict[str, dict[str, Any]] = {
+    "labelling": {"probability_floor": 0.01},
+    "refinement": {
+        "count_exponent": 1.0,
+        "geometry": "off",
+        "smoothing": "off",
+        "confidence_temperature": 1.0,
+    },
+}
+"""What `fusion: paper` sets. The floor is the least that keeps one look from deciding for ever."""
+
+
 class Settings(BaseModel):
     """Everything that can be chosen about a run; each part stands beside the stage that it drives."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     classes: str = Field("urban", description="Class set of the map: a shipped one, or a YAML file.")
+    calibration: Path | None = Field(
+        None, description="File of `gnss-sem-map calibrate`: what the network's answers are worth."
+    )
+    fusion: Literal["evidence", "paper"] = Field(
+        "evidence",
+        description="`paper` is eq. 6 to the letter: looks count in full, nothing but the images speaks."
+        " It sets what is not set beside it.",
+    )
     trajectory: TrajectorySettings = Field(
         default_factory=TrajectorySettings, description="GNSS and IMU smoothing, LiDAR odometry."
     )
@@ -45,6 +65,17 @@ class Settings(BaseModel):
     refinement: RefinementSettings = Field(
         default_factory=RefinementSettings, description="Batch refinement."
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_in_the_paper(cls, content: Any) -> Any:
+        if not isinstance(content, dict) or content.get("fusion") != "paper":
+            return content
+        if any(isinstance(content.get(section, {}), BaseModel) for section in EQUATION_6):
+            return content
+        return content | {
+            section: values | content.get(section, {}) for section, values in EQUATION_6.items()
+        }
 
     def to_yaml(self) -> str:
         """These settings as a file that `load` reads back."""

@@ -38,6 +38,10 @@ class LabellingSettings(BaseModel):
         0.05, ge=0, description="A point is visible up to this share behind the nearest,"
     )
     occlusion_m: float = Field(0.3, ge=0, description="plus this distance.")
+    abstain: bool = Field(
+        False,
+        description="A pixel where `other` wins says nothing; by default its five classes share its vote.",
+    )
     image_within_s: float = Field(
         0.06, gt=0, description="A scan takes labels from an image at most this far in time."
     )
@@ -146,6 +150,7 @@ def pixels_seen(
     class_height, class_width = classes.probabilities.shape[:2]
     voxel_kernels.visible(
         u, v, depth, nearest, settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
-        classes.shrink, class_width, class_height, pixels,
+        np.minimum(np.arange(height) // classes.shrink, class_height - 1),
+        np.minimum(np.arange(width) // classes.shrink, class_width - 1), class_width, pixels,
     )  # fmt: skip
     return pixels

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import labels
+from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.chunks import ChunkStore, open_store
 from gnss_sem_map.config import Settings
@@ -132,8 +132,7 @@ def fuse_scans(
 ) -> tuple[VoxelTable, VoxelTable]:
     """Fuse some scans of a drive: what stands, and what belongs to something that moved."""
     settings = drive.settings
-    label_set, floor = labels.label_set(settings.classes), settings.labelling.probability_floor
-    static, removed = (VoxelTable(settings.mapping.voxel_size_m, label_set, floor) for _ in range(2))
+    static, removed = _table(settings), _table(settings)
     for done, seen in enumerate(look_at(drive, scans, account)):
         if seen is not None:
             keys = static.keys_of(seen.p_map)
@@ -147,6 +146,18 @@ def fuse_scans(
                 static.add(keys, seen.pixels, seen.classes)
         progress("mapping", done + 1, len(scans))
     return static, removed
+
+
+def _table(settings: Settings) -> VoxelTable:
+    label_set = labels.label_set(settings.classes)
+    calibration = label_calibration.opened(settings.calibration, label_set)
+    return VoxelTable(
+        settings.mapping.voxel_size_m,
+        label_set,
+        settings.labelling.probability_floor,
+        None if calibration is None else calibration.log_likelihoods,
+        settings.labelling.abstain,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,6 +330,9 @@ def fingerprint(drive: Drive, labels_from: str, scans_per_chunk: int) -> str:
 
 def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
     calibration, trajectory = drive.log.calibration, drive.trajectory
+    learnt = label_calibration.opened(drive.settings.calibration, labels.label_set(drive.settings.classes))
+    if learnt is not None:
+        yield learnt.log_likelihoods
     yield from (trajectory.stamps, trajectory.T_map_imu, calibration.T_imu_lidar)
     for array in (trajectory.velocities, calibration.T_camera_lidar, calibration.K):
         if array is not None:

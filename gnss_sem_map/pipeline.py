@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import labels
+from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
@@ -74,6 +74,9 @@ def run(
     one scan can be used, MeasurementError and EstimationError from the smoother.
     """
     account = Account(skips=list(log.skips))
+    label_calibration.opened(
+        settings.calibration, labels.label_set(settings.classes)
+    )  # a wrong file is known now
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
         solutions = solve(log, settings, account, progress)
@@ -92,7 +95,8 @@ def run(
             )
     with account.stage("refinement"):
         progress("refinement", 0, 1)
-        refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked)
+        calibration = label_calibration.opened(settings.calibration, maps.static.label_set)
+        refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked, calibration)
         progress("refinement", 1, 1)
     raw = SemanticMap.of(maps.static + maps.removed)
     return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness)

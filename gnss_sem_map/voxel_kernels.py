@@ -55,12 +55,13 @@ def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
 def _home(key, size):
     """Row where the search for a key begins: a multiplicative hash, scaled to any table size.
 
-    Rows are in the order of their hash, so that a larger table is filled from front to back, never at random.
+    It is always the first of two rows that share a cache line. Rows are in the order of their hash, so that a larger
+    table is filled from front to back, never at random.
     """
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h ^= h >> uint64(32)
     h *= uint64(0xD6E8FEB86659FD93)
-    return int64(((h >> uint64(32)) * uint64(size)) >> uint64(32))
+    return int64((((h >> uint64(32)) * uint64(size >> 1)) >> uint64(32)) << uint64(1))
 
 
 @njit(cache=True, nogil=True)
@@ -91,14 +92,15 @@ def pack_keys(p_map, voxel_size_m, keys):
 
 @njit(cache=True, nogil=True)
 def fuse(
-    rows, ints, count, capacity, start, keys, pixels, classes, log_table, log_percent, floor_percent
+    rows, ints, count, capacity, start, keys, pixels, classes, log_table, log_percent, floor_percent, answers, abstain
 ):  # fmt: skip
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
     `pixels[i]` is the row of `classes` (p, c + 1; uint8 probabilities, `other` last) that point i saw, or -1. The
     classes of the map are renormalised without `other`, floored, and renormalised again, all in integers:
-    q = max(100 p, floor sum(p)); ln(q / sum(q)) by table. Returns the number of voxels and the first point that is
-    not in yet, or -1 - i for a point i whose voxel overflows.
+    q = max(100 p, floor sum(p)); ln(q / sum(q)) by table. `answers` (c + 1, c), or (0, c) for none, is added for what
+    is most probable in the pixel, `other` included; with `abstain` a pixel that is most probably `other` says nothing.
+    Returns the number of voxels and the first point that is not in yet, or -1 - i for a point i whose voxel overflows.
     """
     n, number_of_classes, size = len(keys), classes.shape[1] - 1, len(rows)
     hits_column = FIRST_SUM + number_of_classes
@@ -120,6 +122,18 @@ def fuse(
         total = int64(0)
         for c in range(number_of_classes):
             total += classes[pixel, c]
+        if len(answers) > 0 or abstain:
+            answer = 0
+            for c in range(1, number_of_classes + 1):
+                if classes[pixel, c] > classes[pixel, answer]:
+                    answer = c
+            if classes[pixel, answer] == 0 or (abstain and answer == number_of_classes):
+                continue
+            if len(answers) > 0:
+                for c in range(number_of_classes):
+                    ints[slot, FIRST_SUM + c] += answers[answer, c]
+                    if ints[slot, FIRST_SUM + c] < -EVIDENCE_LIMIT:
+                        return count, -1 - i
         if total == 0:
             continue
         floor = floor_percent * total
@@ -232,8 +246,11 @@ def project(p_map, P, nearest_m, half_columns, u, v, depth, nearest):
 
 
 @njit(cache=True, nogil=True)
-def visible(u, v, depth, nearest, half_rows, ratio, slack_m, shrink, class_width, class_height, pixels):
-    """Row of the class image that each point sees, -1 outside or where something nearer hides it; returns how many."""
+def visible(u, v, depth, nearest, half_rows, ratio, slack_m, row_of, column_of, class_width, pixels):
+    """Row of the class image that each point sees, -1 outside or where something nearer hides it; returns how many.
+
+    `row_of` (h,) and `column_of` (w,) say where a camera pixel lies in the class image: a division costs more.
+    """
     height, count = len(nearest), 0
     for i in range(len(u)):
         pixels[i] = -1
@@ -243,8 +260,7 @@ def visible(u, v, depth, nearest, half_rows, ratio, slack_m, shrink, class_width
         for r in range(max(v[i] - half_rows, 0), min(v[i] + half_rows + 1, height)):
             closest = min(closest, nearest[r, u[i]])
         if depth[i] <= (1.0 + ratio) * closest + slack_m:
-            row, column = min(v[i] // shrink, class_height - 1), min(u[i] // shrink, class_width - 1)
-            pixels[i] = row * class_width + column
+            pixels[i] = row_of[v[i]] * class_width + column_of[u[i]]
             count += 1
     return count
 
@@ -252,10 +268,11 @@ def visible(u, v, depth, nearest, half_rows, ratio, slack_m, shrink, class_width
 @njit(cache=True, nogil=True)
 def gather(probabilities, pixels, classes):
     """Copy the class probabilities (h, w, c + 1) of the pixels that are seen, and number those points by their copy."""
-    width, to = probabilities.shape[1], 0
+    width, to = np.uint32(probabilities.shape[1]), 0
     for i in range(len(pixels)):
         if pixels[i] >= 0:
-            row, column = pixels[i] // width, pixels[i] % width
+            row = np.uint32(pixels[i]) // width
+            column = np.uint32(pixels[i]) - row * width
             for c in range(probabilities.shape[2]):
                 classes[to, c] = probabilities[row, column, c]
             pixels[i] = to

@@ -109,18 +109,21 @@ class NumpyMap:
     voxel_size_m: float
     label_set: LabelSet
     floor_percent: int = 5
+    answers: NDArray[np.float64] | None = None
+    abstain: bool = False
     keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
         self.sums = np.empty((0, len(self.label_set.names) + 1), np.int64)
-        self._logs = log_table(len(self.label_set.names), self.floor_percent)
+        share = 1.0 if self.answers is None else 0.5
+        self._logs = log_table(len(self.label_set.names), self.floor_percent, share)
 
     def add(self, keys: NDArray[np.int64], pixels: NDArray[np.int32], classes: NDArray[np.uint8]) -> None:
         """Add one scan, as `VoxelTable.add`."""
         seen = pixels >= 0
         looks = np.zeros((len(keys), self.sums.shape[1]), np.int64)
         looks[:, -1] = 1
-        looks[seen, :-1] = log_likelihoods(classes[pixels[seen]], self._logs, self.floor_percent)
+        looks[seen, :-1] = self._looks(classes[pixels[seen]])
         order = np.argsort(keys)
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
         new_keys, sums = keys[order][starts], np.add.reduceat(looks[order], starts)
@@ -132,6 +135,14 @@ class NumpyMap:
         self.sums[places[known]] += sums[known]
         self.keys = np.insert(self.keys, places[~known], new_keys[~known])
         self.sums = np.insert(self.sums, places[~known], sums[~known], axis=0)
+
+    def _looks(self, seen: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Evidence (p, c) of class pixels (p, c + 1): the network's probabilities, and what its answer is worth."""
+        looks, answer = log_likelihoods(seen, self._logs, self.floor_percent), seen.argmax(axis=1)
+        if self.answers is not None:
+            looks += np.rint(512 * self.answers).astype(np.int32)[answer]
+        silent = ~seen.any(axis=1) | (self.abstain & (answer == seen.shape[1] - 1))
+        return np.where(silent[:, None], 0, looks)
 
     def to_map(self) -> VoxelMap:
         """The same value as `VoxelTable.to_map`."""

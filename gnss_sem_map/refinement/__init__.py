@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from gnss_sem_map.label_calibration import LabelCalibration
 from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.refinement import count_grid, vehicles
 from gnss_sem_map.refinement.count_grid import CountGridSettings
+from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
 from gnss_sem_map.refinement.ground import height_over_ground
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
@@ -110,26 +112,47 @@ def refine(
     settings: RefinementSettings | None = None,
     removed: VoxelMap | None = None,
     tracked: tuple[TrackedObject, ...] = (),
+    calibration: LabelCalibration | None = None,
 ) -> tuple[SemanticMap, RefinementReport]:
     """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled.
 
     `removed` holds the points of moving objects that were kept out of `voxels`; they come back as a layer of REMOVED
-    voxels wherever nothing else stands. `tracked` says why, for the report.
+    voxels wherever nothing else stands. `tracked` says why, for the report. A `calibration` brings where the classes
+    were found to stand, instead of rules, and its own temperature.
     """
     settings = settings or RefinementSettings()
-    scores = _discounted(voxels, settings.count_exponent)
-    heights = height_over_ground(voxels.centres)
-    scores, geometry = _weigh_heights(voxels, scores, heights, settings)
-    scores, columns = _correct_columns(voxels, scores, settings)
-    scores, moving, objects, judged = _judge_vehicles(voxels, scores, heights, settings)
-    scores, smoothed = _smooth(voxels, scores, settings)
-    scores, inferred, spread = _infer(voxels, scores, settings)
-    refined = _decide(voxels, scores, moving, inferred, settings.confidence_temperature)
-    steps = [geometry, columns, judged, smoothed, spread]
+    weighed = weigh(voxels, settings, calibration)
+    scores, inferred, spread = _infer(voxels, weighed.scores, settings)
+    temperature = settings.confidence_temperature if calibration is None else calibration.temperature
+    refined = _decide(voxels, scores, weighed.moving, inferred, temperature)
+    steps, objects = [*weighed.steps, spread], weighed.objects
     if removed is not None:
         refined, layered = _with_layer(refined, removed)
         steps.append(layered)
     return refined, RefinementReport(tuple(steps), objects, tracked)
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """All evidence together, before anything is decided."""
+
+    scores: Scores
+    moving: NDArray[np.bool_]
+    objects: tuple[VehicleObject, ...]
+    steps: tuple[Step, ...]
+
+
+def weigh(
+    voxels: VoxelMap, settings: RefinementSettings, calibration: LabelCalibration | None = None
+) -> Weighed:
+    """What images, heights, columns, objects and neighbours say of every voxel together."""
+    scores = _discounted(voxels, settings.count_exponent)
+    heights = height_over_ground(voxels.centres)
+    scores, geometry = _weigh_heights(voxels, scores, heights, settings, calibration)
+    scores, columns = _correct_columns(voxels, scores, settings)
+    scores, moving, objects, judged = _judge_vehicles(voxels, scores, heights, settings)
+    scores, smoothed = _smooth(voxels, scores, settings)
+    return Weighed(scores, moving, objects, (geometry, columns, judged, smoothed))
 
 
 def _with_layer(static: SemanticMap, removed: VoxelMap) -> tuple[SemanticMap, Step]:
@@ -156,12 +179,19 @@ def _labels(voxels: VoxelMap, scores: Scores) -> NDArray[np.int8]:
 
 
 def _weigh_heights(
-    voxels: VoxelMap, scores: Scores, heights: NDArray[np.float32], settings: RefinementSettings
+    voxels: VoxelMap,
+    scores: Scores,
+    heights: NDArray[np.float32],
+    settings: RefinementSettings,
+    calibration: LabelCalibration | None,
 ) -> tuple[Scores, Step]:
-    """Height over ground against classes that are not found there."""
+    """Height over ground, and with a calibration the surface's normal, against classes that are not found there."""
     if settings.geometry == "off":
         return scores, Step("heights", {}, SWITCHED_OFF)
-    refined = scores + against_by_height(heights, voxels.label_set, settings.heights)
+    if calibration is None:
+        refined = scores + against_by_height(heights, voxels.label_set, settings.heights)
+    else:
+        refined = scores + calibration.of_geometry(heights, flatness(voxels.keys))
     return refined, _step("heights", voxels, scores, refined)
 
 

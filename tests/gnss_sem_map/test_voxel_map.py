@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy_chain
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,6 +62,39 @@ def assert_same(a: VoxelMap, b: VoxelMap) -> None:
 def test_the_table_equals_the_numpy_map_bit_for_bit(floor: float) -> None:
     parts = batches(1)
     assert_same(by_table(parts, floor), by_numpy(parts, round(100 * floor)))
+
+
+def learnt(seed: int) -> NDArray[np.float64]:
+    """What six answers say of five classes, nat."""
+    return np.log(np.random.default_rng(seed).dirichlet(np.full(5, 0.4), 6) + 1e-4)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans(), st.permutations(range(4)))
+def test_calibrated_and_abstaining_looks_equal_plain_numpy_in_any_order(
+    seed: int, calibrated: bool, abstain: bool, order: list[int]
+) -> None:
+    answers = learnt(seed) if calibrated else None
+    parts = batches(seed, count=4, points=300, spread=1.0)
+    table = VoxelTable(0.2, URBAN, 0.05, answers, abstain)
+    plain = numpy_chain.NumpyMap(0.2, URBAN, answers=answers, abstain=abstain)
+    for i, (p_map, pixels, classes) in enumerate(parts):
+        plain.add(keys_of(p_map, 0.2), pixels, classes)
+        p_map, pixels, classes = parts[order[i]]
+        table.add(keys_of(p_map, 0.2), pixels, classes)
+    assert_same(table.to_map(), plain.to_map())
+
+
+def test_other_says_something_once_it_was_calibrated_and_a_void_pixel_never_does() -> None:
+    """Where `other` is seen on vegetation only, it is evidence for vegetation."""
+    answers = np.full((6, 5), np.log(0.2))
+    answers[5] = np.log([0.02, 0.02, 0.02, 0.02, 0.92])
+    classes = np.array([[0, 0, 0, 0, 0, 255], [0] * 6], np.uint8)
+    keys, pixels = keys_of(np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1]]), 0.2), np.array([0, 1], np.int32)
+    for calibrated, labels in ((None, [-1, -1]), (answers, [4, -1])):
+        table = VoxelTable(0.2, URBAN, answers=calibrated)
+        table.add(keys, pixels, classes)
+        assert table.to_map().labels.tolist() == labels
 
 
 def test_the_fixed_point_sums_are_the_logarithms_of_eq_6() -> None:

@@ -194,7 +194,7 @@ def cyclist() -> Model:
 
 def tree(name: str, rng: np.random.Generator, height: float, reach: float) -> Model:
     """A trunk, limbs, and a crown of a few overlapping volumes with gaps between the leaves."""
-    clear, girth = 0.36 * height, 0.022 * height * rng.uniform(0.75, 1.1)
+    clear, girth = 0.30 * height, 0.022 * height * rng.uniform(0.75, 1.1)
     crown_top, middle = 0.5 * (height - clear), 0.5 * (height + clear)
     rows = [
         _round(

@@ -121,7 +121,7 @@ def build_town(seed: int, crossings: int = 3) -> Town:
     builder = _Builder(rng, [*models.cars(), models.lamp_post(), models.traffic_light(), models.sign()], [])
     builder.models += [models.bollard(), models.person(), models.cyclist()]
     for k in range(7):
-        height, reach = rng.uniform(5.5, 9.5), rng.uniform(2.2, 3.1)
+        height, reach = rng.uniform(4.4, 8.5), rng.uniform(2.2, 3.1)
         builder.trees.append(builder.model(models.tree(f"tree {k}", rng, height, reach)))
     plan = _plan(route)
     for side in sides(streets, bare):
@@ -170,9 +170,12 @@ def _plan(route: list[Node]) -> dict[tuple[tuple[Node, Node], bool], tuple[str, 
     A row of cars bumper to bumper, cars on the sidewalk, parking bays, and trees that stand against walls.
     """
     wanted = [
-        [("tight", ["house", "wall garden", "house"]), ("sidewalk", ["house", "fence garden", "house"])],
+        [
+            ("tight", ["hedge garden", "wall garden", "house"]),
+            ("sidewalk", ["house", "fence garden", "hedge garden"]),
+        ],
         [("kerb", ["wall garden", "court", "house"]), ("tight", ["house", "hedge garden", "house"])],
-        [("tight", ["court", "house", "wall garden"]), ("kerb", ["house", "park", "house"])],
+        [("tight", ["court", "house", "wall garden"]), ("kerb", ["hedge garden", "park", "house"])],
     ]
     plan = {}
     for a, b, kerbs in zip(route[:-1], route[1:], wanted, strict=False):

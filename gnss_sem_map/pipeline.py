@@ -151,7 +151,8 @@ def solve(
     if smoother.lidar_odometry and log.scans:
         matches = match_scans(log, solutions[0].trajectory, smoother.scan_matching, progress)
         account.counts.update(matches.counts)
-        account.skips.extend(matches.skips)
+        # a scan that cannot be used at all is reported when the map is built
+        account.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
         if len(matches.relative_poses):
             solutions.append(smooth(imu, gnss, frame, smoother, lever, attitude, matches.relative_poses))
     account.warnings.extend(solutions[-1].notes)

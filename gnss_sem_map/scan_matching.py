@@ -80,7 +80,7 @@ class ScanMatches:
     relative_poses: RelativePoses
     """Between the stamps of matched sweeps, in the imu frame."""
     skips: tuple[Skip, ...]
-    """Sweeps that were not matched, each with the reason."""
+    """Sweeps that were not matched, each with the reason; a "scan" is not usable at all, for anything."""
     counts: Counter[str]
     """"scans matched", "scans not matched", "scans with an open direction", "local maps"."""
 
@@ -119,7 +119,9 @@ def match_scans(
         try:
             cloud, T_map_lidar = _deskewed(scan, trajectory, log.calibration.T_imu_lidar, settings)
             matches.append(odometry.match(scan, cloud, T_map_lidar))
-        except (DataError, MeasurementError, _NoMatch) as error:
+        except (DataError, MeasurementError) as error:
+            skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+        except _NoMatch as error:
             skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
         progress("scan matching", done + 1, len(log.scans))
     counts = Counter(
@@ -141,6 +143,10 @@ def _deskewed(
     points = scan.read()
     ranges = np.sqrt(np.einsum("ij,ij->i", points.xyz, points.xyz))
     points = points[(ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)]  # False for NaN
+    if not len(points.xyz):
+        raise DataError(
+            f"no point between {settings.nearest_m:g} and {settings.farthest_m:g} m of {len(ranges)}"
+        )
     T_map_lidar = trajectory.at([scan.stamp], EXTRAPOLATE_S)[0] @ T_imu_lidar
     p_map = points_in_map(points, scan.stamp, trajectory, T_imu_lidar)
     return (p_map - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3], T_map_lidar
@@ -173,9 +179,7 @@ class _Odometry:
     def _downsampled(self, cloud: Array) -> small_gicp.PointCloud:
         """One point per cube, each with its plane; sampled by one thread, for two keep other points every time."""
         settings = self._settings
-        points = small_gicp.PointCloud(cloud)
-        if len(cloud):
-            points = small_gicp.voxelgrid_sampling(points, settings.downsampling_m)
+        points = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(cloud), settings.downsampling_m)
         if points.size() < settings.min_points:
             raise _NoMatch(
                 f"found {points.size()} points after downsampling, expected at least {settings.min_points}"

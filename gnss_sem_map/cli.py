@@ -92,7 +92,7 @@ def run(
             workers=workers,
             labels_from=str(segmenter),
         )
-        about = run_folder.write_run(out, drive, log, result, settings, write_labels)
+        about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
     shutil.rmtree(work, ignore_errors=True)
     _warn(result.account.warnings)
     _report(about, out, as_json)
@@ -135,8 +135,8 @@ def trajectory(
     settings = _settings(config, set_)
     log = _open(drive, drive_format, None)
     account = Account(skips=list(log.skips))
-    with account.stage("trajectory"):
-        estimate, solution = pipeline.estimate_trajectory(log, settings, account)
+    with _progress() as progress, account.stage("trajectory"):
+        estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
     about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings)
     _warn(account.warnings)
     if as_json:
@@ -251,6 +251,37 @@ def evaluate(
         typer.echo(json.dumps(metrics))
     else:
         _print_metrics(metrics)
+
+
+@app.command()
+def calibrate(
+    run_folders: Annotated[
+        list[Path], typer.Argument(metavar="OUT...", help="Folders of runs, one or more.")
+    ],
+    truth: Annotated[
+        list[Path], typer.Option(help="Truth of each run, in the same order: .label files, or labels/ in it.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Calibration file to write.")] = Path(
+        "calibration.yaml"
+    ),
+    drive: Annotated[Path | None, typer.Option(help="The drive, where it is no longer where it was.")] = None,
+    segmenter: Segmenter = None,
+) -> None:
+    """Measure what the network's answers are worth; use it with --set calibration=FILE."""
+    from gnss_sem_map.export.atomic import replacing
+    from gnss_sem_map.io.calibrating import calibrate as measure
+
+    if len(truth) != len(run_folders):
+        raise typer.BadParameter(f"found {len(truth)} for {len(run_folders)} runs", param_hint="--truth")
+    with _progress() as progress:
+        found = measure(list(zip(run_folders, truth, strict=True)), drive, segmenter, progress)
+    with replacing(out) as file:
+        file.write(found.to_yaml().encode())
+    points = sum(int(street.answers.sum()) for street in found.streets)
+    typer.echo(
+        f"{points} points of {len(found.streets)} drives, temperature {found.temperature:.2f};"
+        f" now use --set calibration={out}"
+    )
 
 
 @app.command()

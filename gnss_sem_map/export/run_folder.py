@@ -66,7 +66,13 @@ def check_replaceable(out: Path) -> None:
 
 
 def write_run(
-    out: Path, drive: Path, log: SensorLog, result: Result, settings: Settings, write_labels: bool
+    out: Path,
+    drive: Path,
+    log: SensorLog,
+    result: Result,
+    settings: Settings,
+    write_labels: bool,
+    segmenter: str | None = None,
 ) -> dict[str, Any]:
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
     with new_folder(out) as folder:
@@ -79,10 +85,13 @@ def write_run(
                 write_point_labels(folder, log, result, settings)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, result.account) | {
+            "inputs": {"drive": str(drive.resolve()), "segmenter": _absolute(segmenter)},
             "trajectory": _about_solution(result.solution),
             "map": _about_map(result),
         }
-        metrics: dict[str, Any] = {}
+        metrics: dict[str, Any] = {
+            "sharpness": {name: figures.as_dict() for name, figures in result.sharpness.items()}
+        }
         _write_json(folder / "run.json", about)
         _write_json(folder / "metrics.json", metrics)
         write_report(folder, about, metrics)
@@ -160,9 +169,8 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
     """
     for name in ("labels", "labels_raw", "confidence", "removed"):
         (folder / name).mkdir()
-    ids = np.append(result.raw.voxels.label_set.semantic_kitti_ids, 0).astype(
-        "<u4"
-    )  # -1, unlabelled, is the last
+    known_ids = result.raw.voxels.label_set.semantic_kitti_ids
+    ids = np.append(known_ids, 0).astype("<u4")  # the label -1 finds the last
     maps = (result.raw, result.refined)
     for scan, (raw, refined) in label_points(log, result.trajectory, maps, settings, result.moving):
         ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
@@ -199,7 +207,7 @@ def _about_map(result: Result) -> dict[str, Any]:
         "voxels": len(result.raw),
         "points": int(result.raw.voxels.hits.sum()),
         "labelled": {
-            stage: {name: int(np.count_nonzero(m.labels == i)) for i, name in enumerate(names)}
+            stage: {name: int(np.count_nonzero(m.labels[m.shown] == i)) for i, name in enumerate(names)}
             for stage, m in (("raw", result.raw), ("refined", result.refined))
         },
         "refinement": _about_refinement(result.refinement),
@@ -231,6 +239,15 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
             for thing in report.tracked
         ],
     }
+
+
+def _absolute(segmenter: str | None) -> str | None:
+    """The segmenter's description, good in any working directory."""
+    kind, colon, rest = (segmenter or "").partition(":")
+    place, mark, options = rest.partition("?")
+    if not place or not Path(place).exists():
+        return segmenter
+    return f"{kind}{colon}{Path(place).resolve()}{mark}{options}"
 
 
 def _version(package: str) -> str | None:

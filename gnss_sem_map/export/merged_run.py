@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gnss_sem_map import config, labels, tiles
+from gnss_sem_map import config, label_calibration, labels, tiles
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
@@ -27,8 +27,10 @@ def merge_run_folders(first: Path, second: Path, out: Path) -> dict[str, Any]:
         if not (run / "run.json").is_file():
             raise DataError(f"{run}: no run folder here; expected the -o of an earlier `gnss-sem-map run`")
     settings = config.load(first / "config.yaml")
-    static, removed, frame = merge_runs(first, second, labels.label_set(settings.classes))
-    refined, _ = refine(static, settings.refinement, removed)
+    label_set = labels.label_set(settings.classes)
+    static, removed, frame = merge_runs(first, second, label_set)
+    calibration = label_calibration.opened(settings.calibration, label_set)
+    refined, _ = refine(static, settings.refinement, removed, calibration=calibration)
     raw = SemanticMap.of(static + removed)
     about = {
         "name": f"{first.name} + {second.name}",

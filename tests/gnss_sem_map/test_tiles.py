@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,60 @@ def test_a_damaged_or_missing_tile_is_named(tmp_path: Path) -> None:
 def test_a_voxel_too_high_for_a_tile_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="do not fit a tile"):
         tiles.write(random_map(height=20_000), tmp_path / "map", FRAME)
+
+
+def test_a_box_gives_the_voxels_inside_and_opens_only_its_tiles(tmp_path: Path) -> None:
+    written = random_map(count=20_000)
+    tiles.write(written, tmp_path / "map", FRAME)
+    low, high = np.array([-40.0, 10.0, -5.0]), np.array([80.0, 120.0, 15.0])
+    centres = written.voxels.centres
+    inside = ((centres >= low) & (centres <= high)).all(axis=1)
+    for path in (tmp_path / "map").glob("*.parquet"):
+        if path.name not in ("-1_0.parquet", "0_0.parquet", "-1_1.parquet", "0_1.parquet"):
+            path.write_bytes(b"must not be opened")
+    read = tiles.read(tmp_path / "map", box=(low, high))
+    assert 0 < len(read) < len(written)
+    np.testing.assert_array_equal(read.voxels.keys, written.voxels.keys[inside])
+    np.testing.assert_array_equal(read.labels, written.labels[inside])
+    with pytest.raises(DataError, match="checksum"):
+        tiles.read(tmp_path / "map")
+
+
+def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    path = sorted((tmp_path / "map").glob("*.parquet"))[2]
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=f"{path.name}: damaged tile .its checksum"):
+        tiles.read(tmp_path / "map", URBAN)
+
+
+def test_a_tile_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    about = json.loads((tmp_path / "map/map.json").read_text())
+    name, file = about["files"].popitem()
+    about["files"][f"../{name}"] = file
+    (tmp_path / "map/map.json").write_text(json.dumps(about))
+    with pytest.raises(DataError, match="expected a name like"):
+        tiles.read(tmp_path / "map", URBAN)
+
+
+def test_a_map_of_another_class_set_or_in_the_way_is_refused(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    with pytest.raises(DataError, match="found classes"):
+        tiles.read(tmp_path / "map", replace(URBAN, names=(*URBAN.names[:4], "water"), sources={}))
+    with pytest.raises(DataError, match="exists"):
+        tiles.write(random_map(), tmp_path / "map", FRAME)
+    assert len(tiles.read(tmp_path / "map")) == len(random_map())
+    assert tiles.read_frame(tmp_path / "map") == FRAME
+
+
+def test_the_pieces_by_tile_are_the_map(tmp_path: Path) -> None:
+    voxels = random_map().voxels
+    pieces = dict(tiles.by_tile(voxels))
+    assert list(pieces) == sorted(pieces)
+    for tile, piece in pieces.items():
+        np.testing.assert_array_equal(piece.indices[:, :2] >> 9, np.tile(tile, (len(piece), 1)))
+    keys = np.concatenate([piece.keys for piece in pieces.values()])
+    np.testing.assert_array_equal(np.sort(keys), voxels.keys)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy_chain
 import pytest
@@ -11,7 +13,17 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of, log_table, pack, unpack
+from gnss_sem_map.voxel_map import (
+    LARGE_TABLE,
+    SemanticMap,
+    State,
+    VoxelMap,
+    VoxelTable,
+    keys_of,
+    log_table,
+    pack,
+    unpack,
+)
 
 URBAN = label_set()
 Batch = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.uint8]]
@@ -186,3 +198,38 @@ def test_a_selection_keeps_what_the_mask_says() -> None:
     assert part.observed.all()
     np.testing.assert_array_equal(fused.places(part.keys), np.flatnonzero(fused.observed))
     assert (fused.places(np.array([1, part.keys[0] + 1], np.int64))[:1] == -1).all()
+
+
+def test_a_large_table_takes_at_most_50_bytes_per_voxel_and_keeps_all() -> None:
+    table, keys = VoxelTable(0.2, URBAN), np.arange(1 << 40, (1 << 40) + 1_500_000)
+    np.random.default_rng(6).shuffle(keys)
+    worst = 0.0
+    for part in np.array_split(keys, 30):
+        table.add(part)
+        if len(table) > LARGE_TABLE:
+            worst = max(worst, table.nbytes / len(table))
+    assert 45 < worst <= 50
+    np.testing.assert_array_equal(table.to_map().keys, np.sort(keys))
+
+
+@pytest.mark.parametrize("names", [2, 5, 6, 19])
+def test_rows_hold_any_number_of_classes(names: int) -> None:
+    some = replace(URBAN, names=tuple(f"c{i}" for i in range(names)), sources={})
+    rng = np.random.default_rng(7)
+    table = VoxelTable(0.2, some)
+    classes = rng.integers(0, 256, (50, names + 1)).astype(np.uint8)
+    table.add(
+        table.keys_of(rng.normal(0, 3, (2000, 3))), rng.integers(-1, 50, 2000).astype(np.int32), classes
+    )
+    fused = table.to_map()
+    assert_same(VoxelMap.of_rows(rng.permutation(fused.to_rows()), 0.2, some), fused)
+
+
+def test_adding_maps_that_would_overflow_is_an_error() -> None:
+    keys = pack(np.zeros((1, 3), int))
+    most = VoxelMap(0.2, URBAN, keys, np.full((1, 5), -(1 << 29) - 1, np.int32), np.ones(1, np.uint32))
+    with pytest.raises(DataError, match="overflow"):
+        most + most
+    many = VoxelMap(0.2, URBAN, keys, np.zeros((1, 5), np.int32), np.full(1, (1 << 31) - 1, np.uint32))
+    with pytest.raises(DataError, match="overflow"):
+        many + many

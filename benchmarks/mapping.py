@@ -1,0 +1,421 @@
+"""How fast the map is built, beside other people's tools doing the same, and what it costs in memory and on disk.
+
+    python benchmarks/mapping.py DRIVE SEGMENTER [DRIVE SEGMENTER ...] [--scans 240] [--large]
+
+prints the figures and writes benchmarks/results/mapping.json. SEGMENTER as in `gnss-sem-map run`, such as
+labels:DRIVE/truth/train_ids. Times are CPU time of this process, each tool in turn on every scan, medians over the
+scans after the first; what counts is their ratio. Peers (open3d, kiss-icp, pandas, duckdb, polars) that are not
+installed are left out and named. `--large` adds the table of fifty million voxels (5 GB of memory, minutes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("POLARS_MAX_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import numpy as np
+import numpy_chain
+from numba import njit
+from numpy.typing import NDArray
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import labels, seen_scans, tiles
+from gnss_sem_map.account import Account
+from gnss_sem_map.config import Settings
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.labelling import ClassImage, class_image
+from gnss_sem_map.mapping import STATIC, Drive, fuse_scans, map_chunks
+from gnss_sem_map.seen_scans import SeenScan
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
+from gnss_sem_map.voxel_kernels import _prefetch
+from gnss_sem_map.voxel_map import SemanticMap, VoxelTable, keys_of
+
+SETTINGS = Settings()
+SIZE = SETTINGS.mapping.voxel_size_m
+URBAN = labels.label_set()
+Figures = dict[str, Any]
+
+
+class Race:
+    """CPU time of several contestants, alternated."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, list[float]] = {}
+
+    def run(self, name: str, work: Callable[[], Any]) -> Any:
+        """Run and time one turn of a contestant."""
+        start = time.process_time()
+        result = work()
+        self.seconds.setdefault(name, []).append(time.process_time() - start)
+        return result
+
+    def medians(self) -> dict[str, float]:
+        """s per turn, the first left out."""
+        return {name: float(np.median(s[1:] if len(s) > 1 else s)) for name, s in self.seconds.items()}
+
+
+def open_job(drive: Path, spec: str, scans: int) -> Drive:
+    """A drive with the trajectory that its own navigation system reports."""
+    log = open_drive(drive)
+    segmenter = open_segmenter(spec, URBAN, expected_size=log.calibration.image_size)
+    trajectory = log.given or log.reference
+    if trajectory is None:
+        raise SystemExit(f"{drive}: has no trajectory of its own")
+    with_image = [scan for scan in log.scans if log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)]
+    return Drive(_only(log, with_image[:scans]), trajectory, segmenter, SETTINGS)
+
+
+def _only(log: SensorLog, scans: Sequence[Scan]) -> SensorLog:
+    return replace(log, scans=tuple(scans))
+
+
+def image_of(job: Drive, scan: Scan) -> tuple[Image, ClassImage]:
+    """The image of a scan, decoded."""
+    image = job.log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)
+    assert image is not None
+    assert job.segmenter is not None
+    assert job.log.calibration.image_size is not None
+    seen = job.segmenter(image)
+    return image, class_image(seen, job.segmenter.class_names, URBAN, job.log.calibration.image_size, "")
+
+
+def whole_chain(job: Drive) -> Figures:
+    """Read, deskew, project, occlusion, fuse: compiled against numpy, with decoded labels and with decoding them."""
+    race, log = Race(), job.log
+    table, plain = VoxelTable(SIZE, URBAN), numpy_chain.NumpyMap(SIZE, URBAN)
+    points = 0
+
+    def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
+        seen = seen_scans._see(job, scan, scan.read(), (image, classes), Account())
+        assert seen is not None
+        table.add(table.keys_of(seen.p_map), seen.pixels, seen.classes)
+
+    def in_numpy(scan: Scan, image: Image, classes: ClassImage) -> None:
+        p_map = numpy_chain.points_in_map(
+            scan.read(), scan.stamp, job.trajectory, log.calibration.T_imu_lidar, SETTINGS.mapping
+        )
+        pixels = numpy_chain.pixels_seen(
+            p_map, image, job.trajectory, log.calibration, classes, SETTINGS.labelling
+        )
+        plain.add(numpy_chain.keys_of(p_map, SIZE), pixels, classes.rows)
+
+    for scan in log.scans:
+        image, classes = race.run("decode", lambda scan=scan: image_of(job, scan))
+        race.run("ours", lambda a=(scan, image, classes): compiled(*a))
+        race.run("numpy", lambda a=(scan, image, classes): in_numpy(*a))
+        points += len(scan.read().xyz)
+    fused, oracle = table.to_map(), plain.to_map()
+    same = all(np.array_equal(getattr(fused, n), getattr(oracle, n)) for n in ("keys", "evidence", "hits"))
+    s = race.medians()
+    return {
+        "scans": len(log.scans), "points_per_scan": points // len(log.scans), "voxels": len(fused),
+        "ms_per_scan": {name: 1e3 * value for name, value in s.items()}, "bit_identical_to_numpy": same,
+        "ratio_labels_decoded": s["numpy"] / s["ours"],
+        "ratio_with_decoding": (s["numpy"] + s["decode"]) / (s["ours"] + s["decode"]),
+    }  # fmt: skip
+
+
+def real_time(job: Drive) -> Figures:
+    """The pipeline's own loop, decoding included, all threads counted: CPU seconds against 0.1 s a scan."""
+    best = np.inf
+    for _ in range(3):
+        start = time.process_time()
+        fuse_scans(job, job.log.scans, Account())
+        best = min(best, (time.process_time() - start) / len(job.log.scans))
+    return {"cpu_ms_per_scan": 1e3 * best, "real_time_factor": 0.1 / best}
+
+
+def seen_of(job: Drive) -> list[SeenScan]:
+    """The scans, placed and looked at once, for those who only fuse."""
+    return list(seen_scans.seen_scans(job))
+
+
+def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]:
+    """Transform with one pose a scan, for no peer knows more, and fuse, as far as each peer goes."""
+    race, missing = Race(), []
+    table, bare = VoxelTable(SIZE, URBAN), VoxelTable(SIZE, URBAN)
+    contestants: dict[str, Callable[[SeenScan, Points], Any]] = {
+        "ours, classes": lambda s, p: table.add(keys_of(_moved(job, s, p), SIZE), s.pixels, s.classes),
+        "ours, no classes": lambda s, p: bare.add(keys_of(_moved(job, s, p), SIZE)),
+    }
+    for name, build in (("open3d HashSet + numpy", _open3d), ("kiss-icp VoxelHashMap", _kiss_icp)):
+        try:
+            contestants[name] = build(job)
+        except ImportError as error:
+            missing.append(f"{name}: {error}")
+    for one in seen:
+        read = one.scan.read()
+        points = Points(read.xyz, read.intensity, None)
+        for name, work in contestants.items():
+            race.run(name, lambda work=work, a=(one, points): work(*a))
+    s = race.medians()
+    return {
+        "ms_per_scan": {name: 1e3 * value for name, value in s.items()},
+        "ratio": {
+            "open3d": s.get("open3d HashSet + numpy", np.nan) / s["ours, classes"],
+            "kiss-icp": s.get("kiss-icp VoxelHashMap", np.nan) / s["ours, no classes"],
+        },
+    }, missing  # fmt: skip
+
+
+def _moved(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.float64]:
+    return seen_scans.map_points(points, seen.scan, job.trajectory, job.log, SETTINGS.mapping)[0]
+
+
+def _pose(job: Drive, seen: SeenScan) -> NDArray[np.float64]:
+    T = np.asarray(job.trajectory.at([seen.scan.stamp], 0.15)[0] @ job.log.calibration.T_imu_lidar)
+    left, _, right = np.linalg.svd(
+        T[:3, :3]
+    )  # kiss-icp refuses a rotation that is off by 1e-9, as KITTI's are
+    T[:3, :3] = left @ right
+    return T
+
+
+def _open3d(job: Drive) -> Callable[[SeenScan, Points], None]:
+    """Open3D's hash of integer voxels, sums and hits in numpy."""
+    import open3d as o3d
+
+    core, capacity = o3d.core, 3_000_000
+    voxels = core.HashSet(capacity, core.int32, (3,), core.Device("CPU:0"))
+    evidence, hits = np.zeros((capacity, 5), np.int32), np.zeros(capacity, np.uint32)
+    logs = numpy_chain.log_table(5, 5)
+
+    def add(seen: SeenScan, points: Points) -> None:
+        T = _pose(job, seen)
+        p_map = points.xyz[seen.valid].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        indices = core.Tensor.from_numpy(np.floor(p_map / SIZE).astype(np.int32))
+        voxels.insert(indices)
+        slots = voxels.find(indices)[0].numpy()
+        np.add.at(hits, slots, 1)
+        looked = seen.pixels >= 0
+        looks = numpy_chain.log_likelihoods(seen.classes[seen.pixels[looked]], logs, 5)
+        for c in range(5):
+            np.add.at(evidence[:, c], slots[looked], looks[:, c])
+
+    return add
+
+
+def _kiss_icp(job: Drive) -> Callable[[SeenScan, Points], None]:
+    from kiss_icp.mapping import VoxelHashMap
+
+    voxels = VoxelHashMap(SIZE, 120.0, 20)
+    return lambda seen, points: voxels.update(points.xyz[seen.valid].astype(np.float64), _pose(job, seen))
+
+
+def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
+    """Ten scans at once, all in memory, keys and log-likelihoods ready: who groups fastest."""
+    race, missing, seen = Race(), [], seen[:10]
+    logs = numpy_chain.log_table(5, 5)
+    keys = np.concatenate([keys_of(s.p_map, SIZE) for s in seen])
+    looks = np.zeros((len(keys), 5), np.int32)
+    pixels = np.concatenate([s.pixels for s in seen])
+    looks[pixels >= 0] = np.concatenate([numpy_chain.log_likelihoods(s.classes, logs, 5) for s in seen])
+    columns = {
+        "key": keys,
+        **{f"e{c}": looks[:, c].copy() for c in range(5)},
+        "hits": np.ones(len(keys), np.uint32),
+    }
+    parts = [(keys_of(s.p_map, SIZE), s.pixels, s.classes) for s in seen]
+
+    def ours() -> int:
+        table = VoxelTable(SIZE, URBAN)
+        for part in parts:
+            table.add(*part)
+        return len(table)
+
+    contestants: dict[str, Callable[[], int]] = {"ours": ours}
+    for name, build in (("pandas", _pandas), ("duckdb", _duckdb), ("polars", _polars)):
+        try:
+            contestants[name] = build(columns)
+        except ImportError as error:
+            missing.append(f"{name}: {error}")
+    for _ in range(4):
+        found = {name: race.run(name, work) for name, work in contestants.items()}
+        assert len(set(found.values())) == 1, found
+    s = race.medians()
+    return {
+        "ns_per_point": {name: 1e9 * value / len(keys) for name, value in s.items()},
+        "ratio": {name: value / s["ours"] for name, value in s.items() if name != "ours"},
+    }, missing  # fmt: skip
+
+
+def _pandas(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
+    import pandas
+
+    frame = pandas.DataFrame(columns)
+    return lambda: len(frame.groupby("key", sort=False).sum())
+
+
+def _duckdb(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
+    import duckdb
+    import pyarrow
+
+    base = duckdb.connect(config={"threads": 1})
+    base.register("points", pyarrow.table(columns))
+    base.execute("create table t as select * from points")
+    sums = ", ".join(f"sum({name})" for name in columns if name != "key")
+    return lambda: len(base.execute(f"select key, {sums} from t group by key").fetchnumpy()["key"])
+
+
+def _polars(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
+    import polars
+
+    frame = polars.DataFrame(columns)
+    return lambda: len(frame.group_by("key").agg(polars.all().sum()))
+
+
+@njit(cache=True, nogil=True)
+def _touch(rows: Any, ints: Any, places: Any) -> None:
+    """The least that fusing a point can cost: fetch a row, add to it."""
+    for i in range(len(places)):
+        if i + 16 < len(places):
+            _prefetch(rows, places[i + 16])
+        ints[places[i], 7] += 1
+
+
+def over_the_floor(seen: list[SeenScan], voxels: int) -> Figures:
+    """Fusing the scans into a map of so many voxels, against random prefetched updates of a table of the same size."""
+    rng, table = np.random.default_rng(0), VoxelTable(SIZE, URBAN)
+    while len(table) < voxels:  # surface voxels far from the scans
+        indices = rng.integers(-(1 << 19), 1 << 19, (min(1_000_000, voxels - len(table)), 3))
+        table.add(numpy_chain.pack(indices * (1, 1, 0) + (1 << 19, 0, 0)))
+    keys = [keys_of(s.p_map, SIZE) for s in seen]
+    for part, s in zip(keys, seen, strict=True):
+        table.add(part, s.pixels, s.classes)
+    shuffled = [rng.permutation(part) for part in keys]
+    places = [rng.integers(0, len(table._rows), len(part)) for part in keys]
+    race = Race()
+    for i, s in enumerate(seen):
+        race.run("drive order, looks", lambda i=i, s=s: table.add(keys[i], s.pixels, s.classes))
+        race.run("drive order", lambda i=i: table.add(keys[i]))
+        race.run("random order", lambda i=i: table.add(shuffled[i]))
+        race.run("floor", lambda i=i: _touch(table._rows, table._rows.view(np.int32), places[i]))
+    n = np.median([len(part) for part in keys])
+    s_ = {name: 1e9 * value / n for name, value in race.medians().items()}
+    return {
+        "voxels": len(table), "bytes_per_voxel": table.nbytes / len(table), "ns_per_point": s_,
+        "over_the_floor": s_["drive order, looks"] / s_["floor"],
+    }  # fmt: skip
+
+
+def on_disk(job: Drive) -> Figures:
+    """Bytes of the tiles of the drive's map, and what writing and reading them costs."""
+    table = fuse_scans(job, job.log.scans, Account())[0]
+    raw, race = SemanticMap.of(table.to_map()), Race()
+    with tempfile.TemporaryDirectory() as folder:
+        race.run("write", lambda: tiles.write(raw, Path(folder) / "map", None))
+        race.run("read", lambda: tiles.read(Path(folder) / "map", URBAN))
+        size = sum(path.stat().st_size for path in (Path(folder) / "map").glob("*.parquet"))
+    s = race.medians()
+    return {
+        "voxels": len(raw), "disk_bytes_per_voxel": size / len(raw), "ram_bytes_per_voxel": table.nbytes / len(table),
+        "ns_per_voxel": {name: 1e9 * value / len(raw) for name, value in s.items()},
+    }  # fmt: skip
+
+
+def cheap_drive(scans: int) -> Drive:
+    """A straight street at 10 m/s: the same sweep of 120,000 points again and again, 1 m farther each time."""
+    rng, n = np.random.default_rng(0), 60_000
+    road = np.column_stack([rng.uniform(-80, 80, n), rng.uniform(-9, 9, n), np.full(n, -1.7)])
+    walls = np.column_stack([rng.uniform(-80, 80, n), rng.choice([-9.0, 9.0], n), rng.uniform(-1.7, 8, n)])
+    xyz = np.vstack([road, walls]).astype(np.float32)
+    xyz = xyz[np.lexsort((np.arctan2(xyz[:, 1], xyz[:, 0]), np.round(xyz[:, 2], 1)))]
+    points = Points(xyz, np.zeros(len(xyz), np.float32), None)
+    stamps = np.arange(scans + 1) * 0.1
+    T = np.tile(np.eye(4), (scans + 1, 1, 1))
+    T[:, 0, 3] = 10 * stamps
+    log = SensorLog(
+        "street", 0, Calibration(np.eye(4)),
+        tuple(Scan(str(k), k, float(stamps[k]), lambda: points) for k in range(scans)), (),
+        given=Trajectory(stamps, T),
+    )  # fmt: skip
+    return Drive(log, Trajectory(stamps, T), None, SETTINGS)
+
+
+def peak_of(scans: int) -> None:
+    """In a process of its own: map the cheap drive to tiles on disk, and print the peak memory in MB."""
+    with tempfile.TemporaryDirectory() as folder:
+        job = cheap_drive(scans)
+        store = map_chunks(job, Path(folder) / "work", Account())
+        pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
+        tiles.write_tiles(pieces, Path(folder) / "map", None, SIZE, URBAN)
+        about = json.loads((Path(folder) / "map/map.json").read_text())
+    status = Path("/proc/self/status").read_text()  # ru_maxrss would begin at the parent's
+    peak = int(status.split("VmHWM:")[1].split()[0]) / 1024
+    print(json.dumps({"scans": scans, "voxels": about["voxels"], "peak_mb": peak}))
+
+
+def first_scan(drive: str, spec: str) -> None:
+    """In a process of its own: seconds from the imports' end to the first fused scan, compiled code cached."""
+    job = open_job(Path(drive), spec, 1)
+    start, cpu = time.perf_counter(), time.process_time()
+    fuse_scans(job, job.log.scans, Account())
+    print(json.dumps({"wall_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}))
+
+
+def _child(call: str) -> Figures:
+    code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import mapping; mapping.{call}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout.splitlines()[-1]))
+
+
+def measure(drive: Path, spec: str, scans: int) -> tuple[Figures, list[str]]:
+    """Everything that one drive can say."""
+    job = open_job(drive, spec, scans)
+    fuse_scans(job, job.log.scans[:2], Account())  # compile
+    figures: Figures = {"full chain": whole_chain(job), "real time": real_time(job), "map": on_disk(job)}
+    seen = seen_of(replace(job, log=_only(job.log, job.log.scans[-40:])))
+    figures["peers"], missing = against_peers(job, seen)
+    figures["one-shot group-by"], more = against_group_by(seen)
+    figures["floor, 1e6 voxels"] = over_the_floor(seen, 1_000_000)
+    first_scan_call = f"first_scan({str(drive)!r}, {spec!r})"
+    figures["first scan"] = min((_child(first_scan_call) for _ in range(3)), key=lambda f: float(f["cpu_s"]))
+    return figures, missing + more
+
+
+def main() -> None:
+    """Measure, print, and write the results."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("drives", nargs="*", help="DRIVE SEGMENTER pairs")
+    parser.add_argument("--scans", type=int, default=240)
+    parser.add_argument("--large", action="store_true")
+    given = parser.parse_args()
+    results: Figures = {
+        "machine": platform.processor() or platform.machine(), "python": platform.python_version(),
+        "versions": {name: version(name) for name in ("numpy", "numba", "pyarrow")}, "drives": {},
+    }  # fmt: skip
+    missing: list[str] = []
+    for drive, spec in zip(given.drives[::2], given.drives[1::2], strict=True):
+        results["drives"][Path(drive).name], missing = measure(Path(drive), spec, given.scans)
+    short, long = _child("peak_of(277)"), _child("peak_of(2769)")
+    results["peak memory"] = {
+        "277 scans": short, "2769 scans": long, "ratio": long["peak_mb"] / short["peak_mb"]
+    }  # fmt: skip
+    if given.large:
+        job = open_job(Path(given.drives[0]), given.drives[1], 20)
+        results["floor, 5e7 voxels"] = over_the_floor(seen_of(job), 50_000_000)
+    results["not installed"] = missing
+    text = json.dumps(results, indent=1, default=float)
+    print(text)
+    folder = Path(__file__).parent / "results"
+    folder.mkdir(exist_ok=True)
+    (folder / "mapping.json").write_text(text + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -59,7 +59,7 @@ def write_cache(
 ) -> CacheReport:
     """Segment every image that has no file in `folder` yet, and write `<number>.npz`: 8 bits per class and pixel.
 
-    Classes are summed by name into those of `label_set` and `other`. A KITTI image at half its size takes about 110 kB.
+    Classes are summed by name into those of `label_set` and `other`. A KITTI image at half its size takes 70 to 130 kB.
     Every file appears whole or not at all, so an interrupted call is simply made again. `description` (the
     segmenter's SPEC) must be the one that began the folder. Frames whose image is damaged are skipped and reported.
     Raises ConfigError for a folder of another segmenter, DataError when it cannot be written or nothing was segmented.

@@ -32,8 +32,8 @@ Array = NDArray[np.float64]
 # them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
 TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
 MAX_ITERATIONS = 30
-# A point's plane is that of so many neighbours. Planes are computed side by side; sums are not, so that they repeat.
-NEIGHBOURS, THREADS = 6, 2
+# A point's plane is that of so many neighbours: ten and twenty tilt it at edges, and roll the sweep with it.
+NEIGHBOURS = 6
 
 
 class ScanMatchingSettings(BaseModel):
@@ -177,7 +177,7 @@ class _Odometry:
         return _Match(scan, self.local_maps, T, covariance, is_open)
 
     def _downsampled(self, cloud: Array) -> small_gicp.PointCloud:
-        """One point per cube, each with its plane; sampled by one thread, for two keep other points every time."""
+        """One point per cube, each with its plane. By one thread: two keep other points every time."""
         settings = self._settings
         points = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(cloud), settings.downsampling_m)
         if points.size() < settings.min_points:
@@ -185,7 +185,7 @@ class _Odometry:
                 f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
             )
         tree = small_gicp.KdTree(points)
-        small_gicp.estimate_covariances(points, tree, NEIGHBOURS, num_threads=THREADS)
+        small_gicp.estimate_covariances(points, tree, NEIGHBOURS)
         return points
 
     def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:

@@ -1,0 +1,319 @@
+"""How sharp the map is with LiDAR odometry and without, what it costs, and how far an outage leads astray.
+
+    python benchmarks/sharpness.py [--seconds 100] [--only excerpt simulated outage]
+
+prints the tables and writes benchmarks/results/sharpness.json. The real excerpt is read from $GNSS_SEM_MAP_DATA (or
+../shared/data) and left out where it is absent; the simulated drive has exact truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.accuracy import errors
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.relative_poses import RelativePoses
+from factor_graphs.simulation import simulate_gnss, simulate_imu
+from factor_graphs.smoothing import Solution, smooth
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import sharpness
+from gnss_sem_map.deskew import points_in_map
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.scan_matching import ScanMatches, match_scans
+from gnss_sem_map.sensor_log import Calibration, Points, Scan, SensorLog
+from gnss_sem_map.sharpness import Sharpness, SharpnessSettings
+from gnss_sem_map.simulation import Simulation, prepare
+from gnss_sem_map.simulation.rig import T_IMU_LIDAR
+
+Array = NDArray[np.float64]
+DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
+POSE = ("tx", "ty", "tz", "rz")
+MOVED_M, BOX_MARGIN_M = 2.0, 0.2
+SEED, LEVER = 901, np.array([0.5, 0.3, 1.0])
+OUTAGE_SEEDS = (0, 1)
+
+
+def excerpt() -> dict[str, Any] | None:
+    """Frames 114 to 153 of the real drive: static points, every trajectory."""
+    data = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not (data / DRIVE).is_dir():
+        print(f"no real data at {data}: excerpt left out")
+        return None
+    log = open_drive(data / DRIVE)
+    unit, alone, matches, bound, cost = estimate(log)
+    assert log.reference is not None
+    odometry = chained(matches.relative_poses, log.reference)
+    boxes = moving_boxes(data / DRIVE / "tracklet_labels.xml", log)
+    trajectories = {"navigation unit": unit, "GNSS + IMU": alone.trajectory, "scan matching alone": odometry}
+    trajectories["GNSS + IMU + LiDAR"] = bound.trajectory
+    figures = {name: static_sharpness(log, t, boxes) for name, t in trajectories.items()}
+    show("drive 0005, frames 114 to 153, static points", figures)
+    off = bound.fix_residuals[np.isfinite(bound.fix_residuals[:, 0])]
+    assert log.gnss is not None
+    to_fixes = {
+        "rms_per_axis_m": np.sqrt(np.mean(off**2, axis=0)).round(3).tolist(),
+        "largest_m": float(np.linalg.norm(off, axis=1).max()),
+        "fixes_say_m": float(np.median(log.gnss.stddevs)),
+    }
+    ratio = figures["GNSS + IMU + LiDAR"].voxels / figures["GNSS + IMU"].voxels
+    print(
+        f"voxels against GNSS + IMU: {ratio:.3f}; distance to the fixes, nothing aligned: {to_fixes}; {cost}"
+    )
+    return {
+        "sharpness": {name: s.as_dict() for name, s in figures.items()},
+        "voxels_against_gnss_and_imu": ratio, "distance_to_fixes": to_fixes, "cost": cost,
+        "second_deskewing": second_deskewing(log, bound, boxes),
+    }  # fmt: skip
+
+
+def second_deskewing(log: SensorLog, bound: Solution, boxes: list[Any]) -> dict[str, Any]:
+    """What it would bring to match once more, deskewed by the better trajectory."""
+    again = solve(log, match_scans(log, bound.trajectory).relative_poses)
+    found = static_sharpness(log, again.trajectory, boxes)
+    show("the same, matched again by the result", {"GNSS + IMU + LiDAR": found})
+    return found.as_dict()
+
+
+def solve(log: SensorLog, relative: RelativePoses | None = None) -> Solution:
+    assert log.imu is not None
+    assert log.gnss is not None
+    assert log.frame is not None
+    lever, attitude = log.calibration.p_imu_antenna, log.initial_attitude
+    return smooth(log.imu, log.gnss, log.frame, None, lever, attitude, relative)
+
+
+def estimate(log: SensorLog) -> tuple[Trajectory, Solution, ScanMatches, Solution, dict[str, float]]:
+    """The unit's own trajectory, GNSS + IMU, the matches, all together, and the cost of a scan in ms."""
+    alone = solve(log)
+    match_scans(SensorLog(**(vars(log) | {"scans": log.scans[:2]})), alone.trajectory)  # compiled and warm
+    wall, cpu = time.perf_counter(), time.process_time()
+    matches = match_scans(log, alone.trajectory)
+    scans = len(log.scans) / 1000.0
+    cost = {
+        "wall_ms_per_scan": (time.perf_counter() - wall) / scans,
+        "cpu_ms_per_scan": (time.process_time() - cpu) / scans,
+    }
+    unit = log.reference or alone.trajectory
+    return unit, alone, matches, solve(log, matches.relative_poses), {k: round(v, 1) for k, v in cost.items()}
+
+
+def chained(relative: RelativePoses, start: Trajectory) -> Trajectory:
+    """Scan matching alone: its single steps in a row, from where `start` is."""
+    length = np.diff(relative.stamps, axis=1)[:, 0]
+    steps = relative[length < 1.5 * length.min()]
+    T = [start.at([steps.stamps[0, 0]])[0]]
+    for T_imu_imu in steps.T_imu_imu:
+        T.append(T[-1] @ T_imu_imu)
+    return Trajectory(np.append(steps.stamps[:, 0], steps.stamps[-1, 1]), np.array(T))
+
+
+def moving_boxes(tracklets: Path, log: SensorLog) -> list[tuple[Array, int, Array]]:
+    """Size, first frame and poses (x, y, z, yaw; lidar frame) of every box that moves more than 2 m."""
+    T_map_lidar = {}
+    assert log.reference is not None
+    for scan in log.scans:
+        T_map_lidar[scan.number] = log.reference.at([scan.stamp], 0.15)[0] @ log.calibration.T_imu_lidar
+    boxes = []
+    for item in ET.parse(tracklets).getroot().iterfind("tracklets/item"):
+        first = int(item.findtext("first_frame", "0"))
+        poses = np.array(
+            [[float(pose.findtext(name, "0")) for name in POSE] for pose in item.iterfind("poses/item")]
+        )
+        seen = [k for k in range(first, first + len(poses)) if k in T_map_lidar]
+        places = np.array([(T_map_lidar[k] @ [*poses[k - first, :3], 1.0])[:3] for k in seen])
+        if len(seen) > 1 and np.linalg.norm(places[-1] - places[0]) > MOVED_M:
+            boxes.append((np.array([float(item.findtext(n, "0")) for n in "lwh"]), first, poses))
+    return boxes
+
+
+def static_sharpness(log: SensorLog, trajectory: Trajectory, boxes: list[Any]) -> Sharpness:
+    settings = SharpnessSettings()
+    stamps = np.array([scan.stamp for scan in log.scans])
+    positions = trajectory.at(stamps, 0.15)[::10, :3, 3]
+    length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    return sharpness.of_clouds(static_clouds(log, trajectory, boxes, settings), length, settings)
+
+
+def static_clouds(
+    log: SensorLog, trajectory: Trajectory, boxes: list[Any], settings: SharpnessSettings
+) -> Iterator[Array]:
+    for scan in log.scans:
+        points = scan.read()
+        ranges = np.linalg.norm(points.xyz, axis=1)
+        use = (ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)
+        use[np.arange(len(use)) % settings.every_nth_point > 0] = False
+        for size, first, poses in boxes:
+            if first <= scan.number < first + len(poses):
+                x, y, z, yaw = poses[scan.number - first]
+                local = Rotation.from_euler("z", -yaw).apply(points.xyz - np.array([x, y, z]))
+                half = size[:2] / 2 + BOX_MARGIN_M
+                inside = (np.abs(local[:, :2]) < half).all(axis=1) & (local[:, 2] < size[2] + BOX_MARGIN_M)
+                use &= ~(inside & (local[:, 2] > -BOX_MARGIN_M))
+        yield points_in_map(points[use], scan.stamp, trajectory, log.calibration.T_imu_lidar)
+
+
+def show(title: str, figures: dict[str, Sharpness]) -> None:
+    print(f"\n{title}\n{'':26}{'plane':>8}{'ground':>8}{'wall':>8} cm{'MME':>9}{'voxels':>10}")
+    for name, s in figures.items():
+        cm = "".join(f"{100 * v:8.2f}" for v in (s.thickness_m, s.ground_thickness_m, s.wall_thickness_m))
+        print(f"{name:26}{cm}   {s.mean_map_entropy:9.3f}{s.voxels:10d}")
+
+
+@cache
+def simulation(seconds: float) -> tuple[Simulation, tuple[Scan, ...], tempfile.TemporaryDirectory[str]]:
+    """A simulated drive with its sweeps on disk; stamps are those of the simulation."""
+    simulated = prepare(seconds, SEED)
+    folder = tempfile.TemporaryDirectory(prefix="sharpness-")
+    scans = []
+    for k, (start, end) in enumerate(simulated.sweeps):
+        scan = simulated.scan(k)
+        path = Path(folder.name) / f"{k}.npz"
+        stamps = start + scan.fractions * (end - start)
+        np.savez(path, points=scan.points, stamps=stamps)
+        scans.append(Scan(f"{k:010d}", k, float(simulated.stamps[k]), partial(_read, path)))
+    return simulated, tuple(scans), folder
+
+
+def _read(path: Path) -> Points:
+    with np.load(path) as content:
+        points = content["points"]
+        return Points(points[:, :3], points[:, 3], content["stamps"])
+
+
+def simulated_log(seconds: float, imu: ImuSamples, gnss: GnssFixes, lever: Array, **more: Any) -> SensorLog:
+    drive, scans, _ = simulation(seconds)
+    calibration = Calibration(T_IMU_LIDAR, p_imu_antenna=lever)
+    return SensorLog(
+        "simulated", 0, calibration, scans, (), frame=drive.frame, imu=imu, gnss=gnss, **more
+    )  # fmt: skip
+
+
+def true_trajectory(seconds: float) -> Trajectory:
+    drive, _, _ = simulation(seconds)
+    stamps = np.arange(drive.oxts_stamps[0], drive.oxts_stamps[-1], 0.1)
+    T = drive.world.ego.poses(stamps)
+    T[:, :3, 3] = drive.to_map(T[:, :3, 3])
+    return Trajectory(stamps, T)
+
+
+def simulated(seconds: float) -> dict[str, Any]:
+    """The drive as its inertial unit reports it: 100 Hz IMU, positions ten times a second that drift together."""
+    drive, _, _ = simulation(seconds)
+    rows = drive.oxts
+    positions = drive.frame.to_map(*rows[drive.sync, :3].T)
+    imu = ImuSamples(drive.oxts_stamps, rows[:, 11:14], rows[:, 17:20])
+    gnss = GnssFixes(drive.oxts_stamps[drive.sync], positions, np.repeat(rows[drive.sync, 23:24], 3, axis=1))
+    attitude = Rotation.from_euler("ZYX", rows[0, [5, 4, 3]]).as_matrix()
+    prior = AttitudePrior(attitude, np.array([0.005, 0.005, 0.02]))
+    log = simulated_log(seconds, imu, gnss, np.zeros(3), initial_attitude=prior)
+    _, alone, matches, bound, cost = estimate(log)
+    truth = true_trajectory(seconds)
+    found = {"GNSS + IMU": alone.trajectory, "GNSS + IMU + LiDAR": bound.trajectory}
+    figures = dict(zip(found, sharpness.of_drive(log, list(found.values())), strict=True))
+    show(f"simulated drive, {seconds:g} s", figures)
+    accuracy = {name: per_100_m(t, truth) for name, t in found.items()}
+    for name, a in accuracy.items():
+        print(f"{name:26}" + "".join(f"{key} {value:.4g}   " for key, value in a.items()))
+    print(f"{dict(matches.counts)}; {cost}")
+    return {
+        "seconds": seconds, "sharpness": {name: s.as_dict() for name, s in figures.items()}, "accuracy": accuracy,
+        "counts": dict(matches.counts), "cost": cost, "chi2_per_dof": bound.chi2_per_dof,
+    }  # fmt: skip
+
+
+def per_100_m(found: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Relative pose error over 100 m of way, mean over all starts, and the heading error."""
+    inside = truth.stamps[(truth.stamps > found.start) & (truth.stamps < found.end)]
+    wanted, got = truth.at(inside), found.at(inside)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(wanted[:, :3, 3], axis=0), axis=1))])
+    ends = np.searchsorted(way, way + 100.0)
+    starts = np.flatnonzero(ends < len(way))
+    i, j = starts, ends[starts]
+    off = np.linalg.inv(np.linalg.inv(wanted[i]) @ wanted[j]) @ (np.linalg.inv(got[i]) @ got[j])
+    turn = np.degrees(Rotation.from_matrix(off[:, :3, :3]).magnitude())
+    heading = errors(found, truth).rotation[:, 2]
+    return {
+        "translation_percent": float(np.mean(np.linalg.norm(off[:, :3, 3], axis=1))),
+        "rotation_deg_per_m": float(np.mean(turn) / 100.0),
+        "heading_rms_deg": float(np.degrees(np.sqrt(np.mean(heading**2)))),
+        "way_m": float(way[-1]),
+    }
+
+
+def outage(seconds: float) -> dict[str, Any]:
+    """A MEMS IMU and a 1 Hz receiver (1, 1, 2 m of white noise) that is silent for 60 s in the middle."""
+    drive, _, _ = simulation(seconds)
+    first, last = seconds / 2 - 30.0, seconds / 2 + 30.0
+    truth = true_trajectory(seconds)
+    rows = []
+    for seed in OUTAGE_SEEDS:
+        rng = np.random.default_rng(seed)
+        imu = simulate_imu(drive.world.ego, drive.oxts_stamps, drive.frame, ImuNoise(), rng)
+        seen = np.arange(drive.oxts_stamps[0] + 0.5, drive.oxts_stamps[-1] - 0.5)
+        fixes = simulate_gnss(drive.world.ego, seen, (1.0, 1.0, 2.0), LEVER, rng, outages=[(first, last)])
+        gnss = GnssFixes(fixes.stamps, drive.to_map(fixes.positions), fixes.stddevs)
+        log = simulated_log(seconds, imu, gnss, LEVER)
+        _, alone, _, bound, _ = estimate(log)
+        row = {}
+        for name, t in (("without", alone.trajectory), ("with", bound.trajectory)):
+            e = errors(t, truth)
+            row[f"{name}_inside_m"] = e.within([(first, last)]).horizontal_rms_m
+            row[f"{name}_whole_m"] = e.horizontal_rms_m
+        rows.append(row)
+        print(f"outage of 60 s, seed {seed}: " + "   ".join(f"{k} {v:.3f}" for k, v in row.items()))
+    mean = {key: float(np.sqrt(np.mean([row[key] ** 2 for row in rows]))) for key in rows[0]}
+    print("outage of 60 s, rms over the seeds: " + "   ".join(f"{k} {v:.3f}" for k, v in mean.items()))
+    return {"seconds": seconds, "seeds": rows, "rms": mean}
+
+
+PARTS: dict[str, Callable[[float], dict[str, Any] | None]] = {
+    "excerpt": lambda seconds: excerpt(),
+    "simulated": simulated,
+    "outage": outage,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seconds", type=float, default=100.0, help="length of the simulated drive")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=list(PARTS), help="the others are kept as they are"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path(__file__).parent / "results" / "sharpness.json"
+    )
+    arguments = parser.parse_args()
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    results = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
+    results["machine"] = (
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()},"
+        f" small_gicp {version('small_gicp')}, gtsam {version('gtsam')}"
+    )
+    for part in arguments.only:
+        found = PARTS[part](arguments.seconds)
+        if found is not None:
+            results[part] = found
+        arguments.output.write_text(json.dumps(results, indent=1) + "\n")
+    print(f"\nwritten to {arguments.output}")
+
+
+if __name__ == "__main__":
+    main()

@@ -79,6 +79,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
             _pairs(run.get("trajectory") or {}),
             _pairs(metrics.get("trajectory", {})),
         ),
+        _section("Sharpness", _sharpness(metrics.get("sharpness", {}))),
         _section("Time and memory", _stages(run.get("seconds", {}), run.get("peak_memory_mb", {}))),
         _section("Files", _files(folder)),
         _section("Versions", _pairs(run.get("versions", {}))),
@@ -92,6 +93,19 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
 def _section(title: str, *parts: str) -> str:
     content = "\n".join(filter(None, parts))
     return f"<section><h2>{escape(title)}</h2>\n{content}</section>" if content else ""
+
+
+def _sharpness(sharpness: Mapping[str, Mapping[str, Any]]) -> str:
+    """Surface thickness of the map, and of the map that GNSS and IMU alone would give: blur shows wrong calibration."""
+    if not sharpness:
+        return ""
+    figures = list(dict.fromkeys(name for values in sharpness.values() for name in values))
+    rows = [(name.replace("_", " "), *(_number(v.get(name)) for v in sharpness.values())) for name in figures]
+    return _table(("figure", *sharpness), rows)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
 
 
 def _facts(run: Mapping[str, Any]) -> str:

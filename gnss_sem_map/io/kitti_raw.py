@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import frames, kitti_calibration
@@ -27,8 +27,17 @@ Array = NDArray[np.float64]
 T = TypeVar("T", Scan, Image)
 
 CAMERA_TIME_OFFSET_S = -0.0085
-ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.02])
+ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.01])
 """How far the unit's first roll, pitch and yaw are believed; a looser yaw lets a short track turn the whole map."""
+OXTS_NOISE = ImuNoise(
+    accelerometer_noise_density=5e-4,
+    gyroscope_noise_density=3e-5,
+    accelerometer_bias_walk=1e-5,
+    gyroscope_bias_walk=1e-7,
+    accelerometer_bias_stddev=0.02,
+    gyroscope_bias_stddev=1e-4,
+)
+"""Of the RT3003, whose rates and forces are already corrected for bias by its own filter."""
 OXTS_COLUMNS = 30
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
@@ -61,6 +70,7 @@ def read(drive: Path) -> SensorLog:
         frame=frame,
         imu=ImuSamples(imu_stamps, imu_rows[:, SPECIFIC_FORCE], imu_rows[:, ANGULAR_RATE]),
         gnss=gnss,
+        imu_noise=OXTS_NOISE,
         initial_attitude=AttitudePrior(reference.T_map_imu[0, :3, :3], ATTITUDE_STDDEVS_RAD),
         reference=reference,
         skips=(*skips, *imu_skips, *scan_skips, *image_skips),

@@ -27,12 +27,21 @@ def score_run(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | N
     `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
     the imu in the map frame at the scans' stamps). `restrict_to`: only points labelled there. Raises DataError.
     """
-    metrics = _score_points(out, truth, label_set, restrict_to)
+    metrics = _known_metrics(out) | _score_points(out, truth, label_set, restrict_to)
     path = truth / "trajectory_lidar.tum"
     if path.is_file():
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
     (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", "utf-8")
     return metrics
+
+
+def _known_metrics(out: Path) -> dict[str, Any]:
+    """What the run itself measured without a truth."""
+    try:
+        known = json.loads((out / "metrics.json").read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{out / 'metrics.json'}: no run folder here ({error})") from None
+    return dict(known)
 
 
 def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:

@@ -1,0 +1,104 @@
+"""The demo as a newcomer runs it, on a shorter drive, and its scores against the exact truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
+    """Folder of the run, folder of the truth, and what was printed."""
+    out = tmp_path_factory.mktemp("demo") / "demo"
+    done = gnss_sem_map("demo", "-o", out, "--seconds", "3", "--seed", "1")
+    assert done.returncode == 0, done.stderr
+    (drive,) = (out.parent / "demo_drive").glob("*/*_sync")
+    return out, drive / "truth", done.stdout
+
+
+def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
+    out, _, _ = demo
+    metrics = json.loads((out / "metrics.json").read_text())
+    for stage in ("raw", "refined"):
+        figures = metrics["semantics"][stage]
+        assert set(figures) >= {"mean_accuracy", "mean_iou", "coverage", "classes"}
+        assert list(figures["classes"]) == ["road", "sidewalk", "vehicle", "building", "vegetation"]
+        assert 0 < figures["mean_iou"] <= figures["mean_accuracy"] <= 1
+    assert metrics["semantics"]["refined"]["mean_iou"] > metrics["semantics"]["raw"]["mean_iou"]
+    assert set(metrics["dynamic"]) >= {"SA", "DA", "AA"}
+    assert metrics["trajectory"]["ate_m"] < 2.0
+    assert 0 <= metrics["calibration"]["ece"] < 0.2
+
+
+def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, Path, str]) -> None:
+    out, _, printed = demo
+    for says in ("sidewalk", "moving vehicles removed", "trajectory", "refinement", "mapping"):
+        assert says in printed, says
+    for name in ("perspective.png", "topview.png", "report.html", "viewer.html"):
+        assert str(out / name) in printed
+        assert (out / name).stat().st_size > 10_000
+
+
+def test_scores_agree_with_the_independent_scorer(
+    demo: tuple[Path, Path, str], real_data: Path, tmp_path: Path
+) -> None:
+    out, truth, _ = demo
+    subprocess.run(
+        [
+            sys.executable, real_data.parent / "score.py", out / "labels", truth / "labels",
+            "--json", tmp_path / "s.json",
+        ],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    theirs = json.loads((tmp_path / "s.json").read_text())["POOLED"]
+    ours = json.loads((out / "metrics.json").read_text())["semantics"]["refined"]
+    assert ours["mean_iou"] == theirs["observed"]["mean_iou"]
+    assert ours["mean_accuracy"] == theirs["observed"]["mean_accuracy"]
+    assert ours["coverage"] == theirs["coverage"]
+    assert ours["strict"]["mean_iou"] == theirs["strict"]["mean_iou"]
+
+
+def test_a_run_can_be_scored_again_on_fewer_points(demo: tuple[Path, Path, str]) -> None:
+    out, truth, _ = demo
+    done = gnss_sem_map("evaluate", out, "--truth", truth, "--restrict-to", truth / "single_frame", "--json")
+    assert done.returncode == 0, done.stderr
+    restricted = json.loads(done.stdout)["semantics"]["refined"]
+    whole = gnss_sem_map("evaluate", out, "--truth", truth, "--json")
+    everything = json.loads(whole.stdout)["semantics"]["refined"]
+    assert restricted["points"] < everything["points"]
+    assert restricted["coverage"] > everything["coverage"]
+
+
+def test_a_truth_that_does_not_fit_is_refused(demo: tuple[Path, Path, str], tmp_path: Path) -> None:
+    out, truth, _ = demo
+    shutil.copytree(truth / "labels", tmp_path / "labels")
+    victim = sorted((tmp_path / "labels").iterdir())[4]
+    np.fromfile(victim, "<u4")[:-1].tofile(victim)
+    for says, change in (
+        (f"{victim.stem}.label: found", None),
+        ("no truth for 1 of 30 scans", victim.unlink),
+    ):
+        if change is not None:
+            change()
+        done = gnss_sem_map("evaluate", out, "--truth", tmp_path)
+        assert done.returncode == 1
+        assert says in done.stderr
+    done = gnss_sem_map("evaluate", out, "--truth", out / "map")
+    assert done.returncode == 1
+    assert "no .label files" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -63,8 +63,8 @@ def pixels_seen(
     w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     ahead = np.flatnonzero(w > NEAREST_DEPTH_M)
     x, y, z, w = x[ahead], y[ahead], z[ahead], w[ahead]
-    u = np.floor((P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w + 0.5).astype(np.int64)
-    v = np.floor((P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w + 0.5).astype(np.int64)
+    u = np.floor((P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w).astype(np.int64)
+    v = np.floor((P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w).astype(np.int64)
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     ahead, u, v, depth = ahead[inside], u[inside], v[inside], w[inside].astype(np.float32)
     nearest = np.full((height, width), np.inf, np.float32)

@@ -93,7 +93,7 @@ def test_what_stands_behind_something_is_not_seen() -> None:
     assert seen[h:].all()
 
 
-def test_a_pixel_index_is_the_nearest_pixel_and_its_half() -> None:
+def test_a_point_is_in_the_pixel_that_its_coordinates_fall_into_and_in_that_ones_half() -> None:
     rng = np.random.default_rng(0)
     T_map_camera = street.T_IMU_LIDAR @ np.linalg.inv(street.T_CAMERA_LIDAR)
     u, v = rng.uniform(-40, street.WIDTH + 40, 500), rng.uniform(-40, street.HEIGHT + 40, 500)
@@ -105,7 +105,7 @@ def test_a_pixel_index_is_the_nearest_pixel_and_its_half() -> None:
         size = (street.HEIGHT // shrink, street.WIDTH // shrink)
         classes = ClassImage(np.zeros((*size, 6), np.uint8), shrink)
         pixels = pixels_seen(p_map, 0.5, standing(np.eye(4)), CAMERA, classes, alone)
-        column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
+        column, row = np.floor(u).astype(int), np.floor(v).astype(int)
         inside = (column >= 0) & (column < street.WIDTH) & (row >= 0) & (row < street.HEIGHT)
         expected = np.minimum(row // shrink, size[0] - 1) * size[1] + np.minimum(
             column // shrink, size[1] - 1

@@ -1,0 +1,230 @@
+"""From pixels to voxels: what a single image says, what eq. 6 makes of many, and what everything else adds.
+
+    python benchmarks/fusion.py [--data FOLDER] [--seconds 10] [--seeds 1 2]
+
+prints the tables and writes benchmarks/results/fusion.json. Every method is judged on the same points: those that the
+image of their own scan labels. A point without a prediction there is a miss (strict); counts are pooled over all scans.
+A calibration file is learnt on the other excerpts of the same kind, never on the one that it is tried on.
+
+SemanticKITTI excerpts (frames 0 to 9 of 00 and 08, a real network's output) come from FOLDER, by default
+$GNSS_SEM_MAP_DATA or ../shared/data; where there are none, only simulated drives are measured.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map import evaluation, labels, pipeline
+from gnss_sem_map.config import Settings
+from gnss_sem_map.evaluation import Tables
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.io.calibrating import fit_temperature, measure
+from gnss_sem_map.io.point_labels import label_files, read_labels
+from gnss_sem_map.label_calibration import LabelCalibration
+from gnss_sem_map.mapping import label_points
+from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.simulation import simulate, write_corrupted_labels
+
+URBAN = labels.label_set("urban")
+TABLES = Tables.of(URBAN)
+IDS = np.append(URBAN.semantic_kitti_ids, 0).astype(np.uint32)
+"""Raw id of every class; -1, unlabelled, is the last."""
+SINGLE, PAPER, PLAIN, DEFAULT, CALIBRATED = (
+    "single frame",
+    "eq. 6, floor 1 %",
+    "eq. 6",
+    "default",
+    "calibrated",
+)
+Labels = dict[str, NDArray[np.uint32]]
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """A drive with its truth and what a network saw in its images."""
+
+    name: str
+    drive: Path
+    segmenter: str
+    truth: Path
+    single_frame: Path | None = None
+    """What the image of its own scan says of every point; None: found here."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What is counted of one method on one excerpt; scores add up."""
+
+    confusion: NDArray[np.int64]
+    calibration: NDArray[np.float64]
+
+    def __add__(self, other: "Score") -> "Score":
+        return Score(self.confusion + other.confusion, self.calibration + other.calibration)
+
+    def figures(self) -> dict[str, Any]:
+        """Strict accuracy and IoU, per class and on average, and the calibration error."""
+        found = evaluation.semantics(self.confusion, URBAN)
+        hits, true = np.diag(self.confusion), self.confusion.sum(axis=1)
+        union = np.maximum(true + self.confusion[:, :-1].sum(axis=0) - hits, 1)
+        return found["strict"] | {
+            "coverage": found["coverage"],
+            "iou": {name: float(hits[i] / union[i]) for i, name in enumerate(URBAN.names) if true[i]},
+            "ece": evaluation.calibration(self.calibration)["ece"],
+        }
+
+
+def single_frame(excerpt: Excerpt, drive: Drive) -> Labels:
+    """The most probable of the five classes in each visible point's own pixel."""
+    if excerpt.single_frame is not None:
+        return {name: read_labels(path) for name, path in label_files(excerpt.single_frame).items()}
+    found = {}
+    for seen in seen_scans(drive):
+        entries = np.zeros(len(seen.valid), np.uint32)
+        five = seen.classes[:, :-1]
+        of_pixel = np.append(np.where(five.any(axis=1), IDS[five.argmax(axis=1)], 0), 0)  # -1 is the last
+        entries[seen.valid] = of_pixel[seen.pixels]
+        found[seen.scan.name] = entries
+    return found
+
+
+def score(predicted: Labels, confidence: dict[str, NDArray[np.float32]], truth: Path, only: Labels) -> Score:
+    """Counts over all scans, of the points that their own image labels."""
+    total = Score(np.zeros((5, 6), np.int64), np.zeros((evaluation.CALIBRATION_BINS, 3)))
+    for name, path in label_files(truth).items():
+        if name not in predicted:
+            continue
+        true = np.where(only[name] & 0xFFFF != 0, read_labels(path), 0).astype(np.uint32)
+        total += Score(
+            evaluation.confusion(predicted[name], true, TABLES, name),
+            evaluation.calibration_counts(confidence[name], predicted[name], true, TABLES),
+        )
+    return total
+
+
+def mapped(excerpt: Excerpt, drive: Drive, settings: Settings, only: Labels) -> tuple[Score, Score]:
+    """The map before and after refinement."""
+    result = pipeline.run(drive.log, drive.segmenter, settings)
+    names: list[str] = []
+    both: tuple[Labels, Labels] = ({}, {})
+    sure: tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]] = ({}, {})
+    maps = (result.raw, result.refined)
+    for scan, found in label_points(drive.log, result.trajectory, maps, settings, result.moving):
+        names.append(scan.name)
+        for stage, of_map in enumerate(found):
+            both[stage][scan.name], sure[stage][scan.name] = IDS[of_map.labels], of_map.confidence
+    raw, refined = (score(both[i], sure[i], excerpt.truth, only) for i in range(2))
+    return raw, refined
+
+
+def learn(drives: list[tuple[Excerpt, Drive]]) -> LabelCalibration:
+    """A calibration file from labelled excerpts."""
+    counted = []
+    for excerpt, drive in drives:
+        raw = pipeline.run(drive.log, drive.segmenter, drive.settings).raw
+        counted.append(measure(drive, raw.voxels, label_files(excerpt.truth)))
+    true, scores = (np.concatenate(parts) for parts in zip(*(points for _, points in counted), strict=True))
+    streets = tuple(street for street, _ in counted)
+    return LabelCalibration(URBAN.name, URBAN.names, streets, fit_temperature(true, scores))
+
+
+def compare(excerpts: list[Excerpt], folder: Path) -> dict[str, dict[str, Score]]:
+    """Method -> excerpt -> score."""
+    drives = [(excerpt, opened(excerpt)) for excerpt in excerpts]
+    table: dict[str, dict[str, Score]] = {}
+    for excerpt, drive in drives:
+        only = single_frame(excerpt, drive)
+        certain = {name: np.ones(len(entries), np.float32) for name, entries in only.items()}
+        scores = {SINGLE: score(only, certain, excerpt.truth, only)}
+        scores[PLAIN], scores[DEFAULT] = mapped(excerpt, drive, drive.settings, only)
+        scores[PAPER], _ = mapped(excerpt, drive, Settings(fusion="paper"), only)
+        others = [pair for pair in drives if pair[0] is not excerpt]
+        if others:
+            file = folder / f"{excerpt.name}.yaml"
+            file.write_text(learn(others).to_yaml(), "utf-8")
+            _, scores[CALIBRATED] = mapped(excerpt, drive, Settings(calibration=file), only)
+        for method, found in scores.items():
+            table.setdefault(method, {})[excerpt.name] = found
+    return table
+
+
+def opened(excerpt: Excerpt) -> Drive:
+    """The drive, with the trajectory that a run would use."""
+    log, settings = open_drive(excerpt.drive), Settings()
+    network = open_segmenter(excerpt.segmenter, URBAN, expected_size=log.calibration.image_size)
+    trajectory, _ = pipeline.estimate_trajectory(log, settings, pipeline.Account())
+    return Drive(log, trajectory, network, settings)
+
+
+def report(title: str, table: dict[str, dict[str, Score]]) -> dict[str, Any]:
+    """Print every excerpt and all of them pooled; returns the figures."""
+    figures: dict[str, Any] = {}
+    for method, by_excerpt in table.items():
+        parts = list(by_excerpt.values())
+        pooled = sum(parts[1:], parts[0])
+        figures[method] = {name: part.figures() for name, part in by_excerpt.items()}
+        figures[method]["pooled"] = pooled.figures()
+    for name in (*next(iter(table.values())), "pooled"):
+        print(f"\n{title} {name:26} mIoU   acc   ECE   " + "  ".join(f"{n[:8]:>8}" for n in URBAN.names))
+        for method in figures:
+            f = figures[method][name]
+            shares = (f["mean_iou"], f["mean_accuracy"], f["ece"])
+            means = " ".join(f"{100 * share:5.1f}" for share in shares)
+            per_class = "  ".join(f"{100 * f['iou'].get(n, float('nan')):8.1f}" for n in URBAN.names)
+            print(f"  {method:34} {means}   {per_class}")
+    return figures
+
+
+def semantic_kitti(data: Path) -> Iterator[Excerpt]:
+    """Excerpts that are there."""
+    for name in ("00", "08"):
+        drive = data / "semantic_kitti" / "sequences" / name
+        if drive.is_dir():
+            probabilities = data / "labels" / "semantic_kitti" / name / "probabilities"
+            yield Excerpt(
+                name, drive, f"labels:{probabilities}", drive / "labels", data / "single_frame" / name
+            )
+
+
+def simulated(folder: Path, seeds: list[int], seconds: float) -> Iterator[Excerpt]:
+    """Simulated drives with class images corrupted as a network would."""
+    for seed in seeds:
+        drive = simulate(folder / f"drive{seed}", seconds, seed)
+        probabilities = write_corrupted_labels(drive, folder / f"probabilities{seed}", seed)
+        yield Excerpt(f"seed {seed}", drive, f"labels:{probabilities}", drive / "truth" / "labels")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    here = Path(__file__).resolve().parent
+    default = os.environ.get("GNSS_SEM_MAP_DATA", here.parents[1] / "shared" / "data")
+    parser.add_argument("--data", type=Path, default=Path(default))
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2])
+    parser.add_argument("--out", type=Path, default=here / "results" / "fusion.json")
+    asked = parser.parse_args()
+    results = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        real = list(semantic_kitti(asked.data))
+        if real:
+            results["semantic_kitti"] = report("SemanticKITTI", compare(real, folder))
+        towns = list(simulated(folder, asked.seeds, asked.seconds))
+        if towns:
+            results["simulated"] = report("simulated", compare(towns, folder))
+    asked.out.parent.mkdir(exist_ok=True)
+    asked.out.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

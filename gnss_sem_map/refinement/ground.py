@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 CELL_M = 1.0
+BLOCK_M, MARGIN_M = 256.0, 32.0
 QUANTILE = 0.05
 """A cell's ground is this quantile of its heights: the lowest returns are often reflections from below."""
 OPENING_CELLS = 7
@@ -17,11 +18,25 @@ STEP_M = 0.3
 def height_over_ground(centres: NDArray[np.float64]) -> NDArray[np.float32]:
     """Height of every voxel centre over the local ground: (v, 3) m -> (v,) m.
 
-    The ground is a grid of 1 m cells: low quantile per cell, gaps from the nearest cell, capped 0.3 m over
-    its morphological opening, smoothed, bilinear between cell centres.
+    The ground is a grid of 1 m cells: low quantile per cell, gaps from the nearest cell, capped 0.3 m over its
+    morphological opening, smoothed, bilinear between cell centres. It is made block by block, with a margin, so that
+    memory grows with the voxels and not with the area that they span.
     """
-    if len(centres) == 0:
-        return np.empty(0, np.float32)
+    heights = np.empty(len(centres), np.float32)
+    order = np.argsort(centres[:, 0], kind="stable")  # voxels of a map are in this order already
+    x, y = centres[order, 0], centres[order, 1]
+    for east in np.unique(np.floor(x / BLOCK_M)) * BLOCK_M:
+        start, end = np.searchsorted(x, [east - MARGIN_M, east + BLOCK_M + MARGIN_M])
+        slab, slab_y = order[start:end], y[start:end]
+        inside = (x[start:end] >= east) & (x[start:end] < east + BLOCK_M)
+        for north in np.unique(np.floor(slab_y[inside] / BLOCK_M)) * BLOCK_M:
+            near = (slab_y >= north - MARGIN_M) & (slab_y < north + BLOCK_M + MARGIN_M)
+            own = inside[near] & (slab_y[near] >= north) & (slab_y[near] < north + BLOCK_M)
+            heights[slab[near][own]] = _height_in_block(centres[slab[near]])[own]
+    return heights
+
+
+def _height_in_block(centres: NDArray[np.float64]) -> NDArray[np.float64]:
     cells = np.floor(centres[:, :2] / CELL_M).astype(np.int64)
     origin = cells.min(axis=0)
     cells -= origin
@@ -31,8 +46,7 @@ def height_over_ground(centres: NDArray[np.float64]) -> NDArray[np.float32]:
     opened = ndimage.grey_opening(ground, size=(OPENING_CELLS, OPENING_CELLS))
     ground = ndimage.gaussian_filter(np.minimum(ground, opened + STEP_M), sigma=1.0, mode="nearest")
     at = centres[:, :2] / CELL_M - origin - 0.5
-    below = ndimage.map_coordinates(ground, at.T, order=1, mode="nearest")
-    return np.asarray(centres[:, 2] - below, np.float32)
+    return np.asarray(centres[:, 2] - ndimage.map_coordinates(ground, at.T, order=1, mode="nearest"))
 
 
 def _lowest(cells: NDArray[np.int64], z: NDArray[np.float64]) -> NDArray[np.float64]:

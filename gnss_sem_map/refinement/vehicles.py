@@ -8,9 +8,13 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy import ndimage
+from scipy.spatial import cKDTree
 
-from gnss_sem_map.refinement.dbscan import NOISE, dbscan
+from gnss_sem_map.refinement.dbscan import NOISE, TIE, dbscan
+from gnss_sem_map.voxel_map import pack, unpack
+
+COLUMN = np.array([1, 1, 0], np.int32)
+"""Times a voxel, its column."""
 
 
 class VehicleSettings(BaseModel):
@@ -166,12 +170,7 @@ def _over(indices: NDArray[np.int32], road: NDArray[np.int32], reach_voxels: flo
     """Which voxels (v, 3) have a road voxel (r, 3) within a distance in x and y."""
     if len(indices) == 0 or len(road) == 0:
         return np.zeros(len(indices), np.bool_)
-    margin = int(reach_voxels)
-    lowest = indices[:, :2].min(axis=0) - margin
-    extent = indices[:, :2].max(axis=0) + margin + 1 - lowest
-    near = ((road[:, :2] >= lowest) & (road[:, :2] < lowest + extent)).all(axis=1)
-    grid = np.zeros(extent, np.bool_)
-    grid[tuple((road[near, :2] - lowest).T)] = True
-    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
-    grid = ndimage.binary_dilation(grid, structure=x**2 + y**2 <= reach_voxels**2 + 1e-9)
-    return np.asarray(grid[tuple((indices[:, :2] - lowest).T)])
+    columns, column = np.unique(pack(indices * COLUMN), return_inverse=True)
+    roads = unpack(np.unique(pack(road * COLUMN)))[:, :2]
+    distances = cKDTree(roads).query(unpack(columns)[:, :2], distance_upper_bound=reach_voxels + TIE)[0]
+    return np.asarray(np.isfinite(distances)[column])

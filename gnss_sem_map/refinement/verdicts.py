@@ -42,7 +42,7 @@ class MotionSettings(BaseModel):
     least_shift_m: float = Field(default=1.5, gt=0, description="Both ends of a mover went this far, m,")
     least_speed_m_s: float = Field(default=1.0, gt=0, description="and at least this fast, m/s,")
     least_through_per_hit: float = Field(
-        default=0.15, ge=0, description="and its track was seen through at least this often, per hit."
+        default=0.25, ge=0, description="and its track was seen through at least this often, per hit."
     )
     window_scans: int = Field(
         default=150, ge=10, description="A scan is judged when so many later ones were seen, or at the end."

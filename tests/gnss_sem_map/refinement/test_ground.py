@@ -40,6 +40,13 @@ def test_returns_from_below_the_road_do_not_lower_the_ground():
     assert abs(np.median(heights[: len(ground)])) < 0.1
 
 
+def test_the_ground_does_not_notice_where_its_blocks_meet():
+    ground = plane(slope=0.02, side=30.0)
+    within = height_over_ground(ground + np.array([100.0, 100.0, 0.0]))
+    across = height_over_ground(ground + np.array([256.0 - 15.0, 512.0 - 15.0, 0.0]))
+    np.testing.assert_allclose(within, across, atol=0.02)
+
+
 def test_no_voxels_have_no_heights():
     assert height_over_ground(np.empty((0, 3))).shape == (0,)
 

@@ -94,10 +94,10 @@ def test_a_row_of_parked_cars_stays_to_the_last_point():
     ("name", "mover"),
     [
         ("ahead, as fast as the ego vehicle", going(15, 0, 6.0)),
-        ("ahead, slow", going(18, -3.0, 1.5)),
-        ("oncoming", going(60, -3.5, -9.0)),
+        pytest.param("ahead, slow", going(18, -3.0, 1.5), marks=pytest.mark.slow),
+        pytest.param("oncoming", going(60, -3.5, -9.0), marks=pytest.mark.slow),
         ("waits, then leaves", going(14, -3.5, 5.0, start=2.0)),
-        ("comes, then waits", going(40, -3.5, -6.0, stop=2.0)),
+        pytest.param("comes, then waits", going(40, -3.5, -6.0, stop=2.0), marks=pytest.mark.slow),
     ],
 )
 def test_whatever_moves_between_parked_cars_goes_and_they_stay(name, mover):
@@ -110,6 +110,7 @@ def test_whatever_moves_between_parked_cars_goes_and_they_stay(name, mover):
     assert mover_seen.reason
 
 
+@pytest.mark.slow
 def test_an_overtaken_car_is_followed_around_after_the_camera_lost_it():
     share, others, _ = drive([*ROW, going(10, -3.5, 2.0)], view_deg=80.0)
     assert share[-1] > 0.95
@@ -124,6 +125,7 @@ def test_a_car_that_no_camera_ever_shows_goes_when_it_moves_and_stays_when_it_is
     assert others < 2e-4
 
 
+@pytest.mark.slow
 def test_an_overtaking_car_is_followed_back_to_where_the_camera_had_not_seen_it():
     share, others, _ = drive([*ROW, going(-20, -3.5, 14.0)], view_deg=80.0)
     assert share[-1] > 0.95
@@ -131,12 +133,14 @@ def test_an_overtaking_car_is_followed_back_to_where_the_camera_had_not_seen_it(
     assert others < 2e-4
 
 
+@pytest.mark.slow
 def test_poses_that_drift_by_decimetres_remove_no_parked_car():
     share, _, _ = drive([*ROW, going(60, -3.5, -9.0)], drift_m=0.15)
     assert share[:-1].max() < 0.02
     assert share[-1] > 0.95
 
 
+@pytest.mark.slow
 def test_a_car_that_stood_and_was_gone_when_seen_again_has_left():
     def gone(t):
         return (25, -3.5) if t < 1.0 else None
@@ -147,6 +151,7 @@ def test_a_car_that_stood_and_was_gone_when_seen_again_has_left():
     np.testing.assert_array_equal(share[:-1], 0)
 
 
+@pytest.mark.slow
 def test_a_drive_that_stands_still_tells_movers_from_parked_cars():
     share, others, _ = drive([*ROW, going(-30, -3.5, 8.0)], ego_speed=0.0)
     assert share[-1] > 0.98
@@ -196,6 +201,7 @@ def test_every_point_called_vehicle_is_no_error():
     assert removed == 0
 
 
+@pytest.mark.slow
 def test_settling_in_windows_says_what_deciding_at_the_end_says_and_forgets_the_points():
     whole, windows = {}, {}
     for found, window in ((whole, 1000), (windows, 10)):

@@ -45,17 +45,16 @@ def write_vehicles(
     path: Path, world: World, stamps: Floats, zero_s: float, to_map: Callable[[Floats], Floats]
 ) -> None:
     """Who stood or drove where at every scan's stamp: everybody within the LiDAR's range, moving or not."""
-    details = {number: (name, model, moving) for number, name, model, moving in _everybody(world)}
+    details = {number: (name, _size(model), moving) for number, name, model, moving in _everybody(world)}
     lines = ["stamp_s,instance,name,moving,x_m,y_m,z_m,yaw_rad,length_m,width_m,height_m\n"]
     for stamp in stamps:
         here = world.ego.poses([stamp])[0, :2, 3]
         numbers, poses = vehicle_poses(world, float(stamp))
         near = np.hypot(*(poses[:, :2] - here).T) < _RANGE_M
         for number, place, yaw in zip(numbers[near], to_map(poses[near, :3]), poses[near, 3], strict=True):
-            name, model, moving = details[int(number)]
+            name, (length, width, height), moving = details[int(number)]
             x, y, z = place
             yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
-            length, width, height = _size(model)
             lines.append(
                 f"{stamp - zero_s:.6f},{number},{name},{int(moving)},{x:.4f},{y:.4f},{z:.4f},{yaw:.6f},"
                 f"{length:.3f},{width:.3f},{height:.3f}\n"

@@ -63,7 +63,9 @@ def _dbscan_sorted(
     x, y, z = (voxels + AXIS_OFFSET).T
     columns = ((x + _MARGIN) << _Y_BITS | (y + _MARGIN)) << _BLOCK_BITS
     keys, masks, _, own, bits = _words(columns, z)
-    core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
+    core = np.ones(len(voxels), np.bool_)
+    if min_samples > 1:  # else every voxel is its own sample
+        core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
     around = keys[own]
     keys, masks, first, own, core_bits = _words(columns[core], z[core])
     parents = np.arange(core.sum())

@@ -139,7 +139,7 @@ def resumed_after_kills(
 def test_a_killed_run_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
 ) -> None:
-    resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 3, 1)
+    resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 2, 1)
 
 
 @pytest.mark.slow

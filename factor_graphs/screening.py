@@ -10,6 +10,8 @@ Mask = NDArray[np.bool_]
 
 # However slow the vehicle, two good fixes may differ by this much, m.
 ALLOWANCE_M = 50.0
+# So many runs of fixes between impossible jumps are tried as the true one.
+BELIEVED_RUNS = 20
 # Who reports positions more often than this, s, reports what a filter makes of them.
 DRIFTING_BELOW_S = 0.5
 
@@ -22,20 +24,23 @@ def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
 def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
     """The fixes that a vehicle can have driven to from the others, (m,).
 
-    The fixes fall into runs between impossible jumps. The longest run is believed, and from it outwards
-    every run that can be reached at `max_speed_mps`.
+    The fixes fall into runs between impossible jumps. A run is believed, and from it outwards every other
+    that can be reached at `max_speed_mps`; of the longest runs, the one that most fixes agree with wins.
     """
-    m = len(fixes)
-    if m == 0:
+    if len(fixes) == 0:
         return np.zeros(0, dtype=bool)
     steps = np.linalg.norm(np.diff(fixes.positions, axis=0), axis=1)
     jumps = steps > max_speed_mps * np.diff(fixes.stamps) + ALLOWANCE_M
-    runs = np.split(np.arange(m), np.flatnonzero(jumps) + 1)
-    longest = max(range(len(runs)), key=lambda i: len(runs[i]))
-    keep = np.zeros(m, dtype=bool)
-    keep[runs[longest]] = True
-    for outwards, facing in ((runs[longest + 1 :], 0), (runs[:longest][::-1], -1)):
-        edge = runs[longest][-1 - facing]
+    runs = np.split(np.arange(len(fixes)), np.flatnonzero(jumps) + 1)
+    longest = sorted(range(len(runs)), key=lambda i: -len(runs[i]))[:BELIEVED_RUNS]
+    return max((_agreeing(fixes, runs, i, max_speed_mps) for i in longest), key=np.count_nonzero)
+
+
+def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max_speed_mps: float) -> Mask:
+    keep = np.zeros(len(fixes), dtype=bool)
+    keep[runs[believed]] = True
+    for outwards, facing in ((runs[believed + 1 :], 0), (runs[:believed][::-1], -1)):
+        edge = runs[believed][-1 - facing]
         for run in outwards:
             step = np.linalg.norm(fixes.positions[run[facing]] - fixes.positions[edge])
             if step <= max_speed_mps * abs(fixes.stamps[run[facing]] - fixes.stamps[edge]) + ALLOWANCE_M:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 
 import numpy as np
@@ -38,6 +39,11 @@ class Drive:
     settings: Settings
     moving: Mapping[int, NDArray[np.int64]] | None = None
     """Frame number -> places, among the points that `map_points` gives, that belong to something that moved."""
+
+    @cached_property
+    def label_set(self) -> labels.LabelSet:
+        """The classes of the map."""
+        return labels.label_set(self.settings.classes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +93,7 @@ def _see(
         account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {len(valid)}"))
         return None
     pixels = np.full(len(p_map), -1, np.int32)
-    classes = np.empty((0, len(labels.label_set(settings.classes).names) + 1), np.uint8)
+    classes = np.empty((0, len(drive.label_set.names) + 1), np.uint8)
     if image is not None:
         stamp = exposure_stamp(image[0], log.calibration, settings.labelling)
         pixels = pixels_seen(p_map, stamp, drive.trajectory, log.calibration, image[1], settings.labelling)

@@ -1,8 +1,8 @@
 """Moving objects by evidence: a segment of one scan that other scans look through was not there to stay.
 
-Every scan is observed once, in time order: its range image and the points of its segments are kept, and those points
-held back from the map. `decide` then follows the segments through time, looks at their places in all scans, and says
-which of the held points belong to something that moved.
+Every scan is observed once, in time order; its range image and the points of its segments are kept. `settle` and
+`decide` then follow the segments through time, look at their places in all scans, and say which of the points belong
+to something that moved.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class MovingObjects:
 
 @dataclass(frozen=True, eq=False)
 class _Observation:
-    """What is kept of one scan; h points are held."""
+    """What is kept of one scan: h of its points, in or beside a segment."""
 
     number: int
     stamp: float
     T_lidar_map: NDArray[np.float64]
     image: NDArray[np.uint16]
     places: NDArray[np.int64]
-    """(h,) where the held points are in the scan."""
+    """(h,) where these points are in the scan."""
     p_map: NDArray[np.float64]
     """(h, 3) m."""
     is_object: NDArray[np.bool_]
@@ -61,7 +61,7 @@ class _Observation:
 
 
 class MovingObjectDetector:
-    """Collects scans in time order; memory: two windows of scans, 122 kB and the held points of each."""
+    """Collects scans in time order; memory: two windows of scans, a range image and some points of each."""
 
     def __init__(self, settings: MotionSettings | None = None) -> None:
         self._settings = settings or MotionSettings()
@@ -78,8 +78,8 @@ class MovingObjectDetector:
         T_map_lidar: NDArray[np.float64],
         is_object: NDArray[np.bool_],
         is_known: NDArray[np.bool_] | None = None,
-    ) -> NDArray[np.bool_]:
-        """Take in one scan, and say which of its points to hold back until `decide`: (n,).
+    ) -> None:
+        """Take in one scan.
 
         `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) says
         which points are called vehicle, `is_known` (n,) which have been called anything (default: all). Raises
@@ -91,38 +91,10 @@ class MovingObjectDetector:
                 " give scans in time order, each once"
             )
         self._last_stamp = stamp
-        settings = self._settings
-        T_lidar_map = np.asarray(np.linalg.inv(T_map_lidar), np.float64)
-        image = range_images.empty_image()
-        range_images.draw(p_map, T_lidar_map, image)
-        heights = height_over_ground(p_map)
-        above = np.flatnonzero((heights > FOOT_M) & _within(p_map, T_map_lidar, settings.farthest_held_m))
-        points, named = p_map[above], is_object[above]
-        body = np.flatnonzero(heights[above] > BODY_M)
-        # nobody testifies on what is farther away, so that only a name makes it an object
-        known = ~_within(points[body], T_map_lidar, settings.farthest_m)
-        known |= is_known[above[body]] if is_known is not None else True
-        segments = np.full(len(above), -1, np.int32)
-        segments[body], cut = find_segments(points[body], named[body], known, settings.segment_eps_m)
-        cut |= range_images.hidden_sides(points, segments, T_lidar_map, image, len(cut), HIDING_M)
-        keep = near(points, segments >= 0, settings.grow_m)
-        places = above[keep]
-        seen = _Observation(
-            number=number,
-            stamp=stamp,
-            T_lidar_map=T_lidar_map,
-            image=image,
-            places=places,
-            p_map=points[keep],
-            is_object=named[keep],
-            is_body=heights[places] > BODY_M,
-            segments=segments[keep],
-            cut=cut,
+        known = np.ones(len(p_map), np.bool_) if is_known is None else is_known
+        self._observations.append(
+            _observe(number, stamp, p_map, T_map_lidar, is_object, known, self._settings)
         )
-        self._observations.append(seen)
-        held = np.zeros(len(p_map), np.bool_)
-        held[places] = True
-        return held
 
     def settle(self) -> MovingObjects:
         """Decide about the scans that a whole window of later ones has testified on: often none."""
@@ -181,6 +153,42 @@ def _sums(numbers: NDArray[np.int64], values: NDArray[np.int32], count: int) -> 
     return np.asarray(np.bincount(numbers, values, count), np.float64)
 
 
+def _observe(
+    number: int,
+    stamp: float,
+    p_map: NDArray[np.float64],
+    T_map_lidar: NDArray[np.float64],
+    is_object: NDArray[np.bool_],
+    is_known: NDArray[np.bool_],
+    settings: MotionSettings,
+) -> _Observation:
+    T_lidar_map = np.asarray(np.linalg.inv(T_map_lidar), np.float64)
+    image = range_images.empty_image()
+    range_images.draw(p_map, T_lidar_map, image)
+    heights = height_over_ground(p_map)
+    above = np.flatnonzero((heights > FOOT_M) & _within(p_map, T_map_lidar, settings.farthest_object_m))
+    points, named = p_map[above], is_object[above]
+    body = np.flatnonzero(heights[above] > BODY_M)
+    # nobody testifies on what is farther away, so that only a name makes it an object
+    known = is_known[above[body]] | ~_within(points[body], T_map_lidar, settings.farthest_m)
+    segments = np.full(len(above), -1, np.int32)
+    segments[body], cut = find_segments(points[body], named[body], known, settings.segment_eps_m)
+    cut |= range_images.hidden_sides(points, segments, T_lidar_map, image, len(cut), HIDING_M)
+    keep = near(points, segments >= 0, settings.grow_m)
+    return _Observation(
+        number=number,
+        stamp=stamp,
+        T_lidar_map=T_lidar_map,
+        image=image,
+        places=above[keep],
+        p_map=points[keep],
+        is_object=named[keep],
+        is_body=heights[above[keep]] > BODY_M,
+        segments=segments[keep],
+        cut=cut,
+    )
+
+
 def _within(
     p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64], reach_m: float
 ) -> NDArray[np.bool_]:
@@ -189,7 +197,7 @@ def _within(
 
 
 def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list[NDArray[np.int64]]]:
-    """The segments of all scans in time order, and for each scan that of every held point, -1 for none."""
+    """The segments of all scans in time order, and for each scan that of every kept point, -1 for none."""
     segments: list[Segment] = []
     of_point = []
     for scan, seen in enumerate(observations):
@@ -212,7 +220,7 @@ def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list
 
 
 def _grown(seen: _Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
-    """The held points of segments that are gone, the bodies beside them and their feet: (h,)."""
+    """The points of segments that are gone, the bodies beside them and their feet: (h,)."""
     grown = gone.copy()
     if not gone.any() or reach_m == 0:
         return grown

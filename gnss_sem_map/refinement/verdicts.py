@@ -47,7 +47,7 @@ class MotionSettings(BaseModel):
     window_scans: int = Field(
         default=150, ge=10, description="A scan is judged when so many later ones were seen, or at the end."
     )
-    farthest_held_m: float = Field(default=60.0, gt=0, description="No objects are sought farther away, m.")
+    farthest_object_m: float = Field(default=60.0, gt=0, description="No objects are sought farther away, m.")
     grow_m: float = Field(
         default=0.5, ge=0, description="Points above ground this near to a moving segment are part of it, m."
     )

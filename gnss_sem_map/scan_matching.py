@@ -197,28 +197,26 @@ class _Odometry:
             max_correspondence_distance=settings.voxel_size_m,
             max_iterations=MAX_ITERATIONS,
         )
+        found = result.num_inliers / points.size()
+        if found < settings.min_inlier_share:
+            raise _NoMatch(
+                f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
+            )
         information, weight = _information(result, points)
         length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
         T, covariance, is_open = _close_open_directions(
             guess, _rigid(result.T_target_source), information, weight, length, settings
         )
         # at its limit, not stuck at a minimum; where a direction is open, sliding along it does no harm
-        endless = not result.converged and result.iterations >= MAX_ITERATIONS - 1 and not is_open
-        _refuse_divergence(endless, result.num_inliers / points.size(), _inverse(guess) @ T, settings)
+        if not result.converged and result.iterations >= MAX_ITERATIONS - 1 and not is_open:
+            raise _NoMatch(f"the registration did not converge in {MAX_ITERATIONS} iterations")
+        _refuse_divergence(_inverse(guess) @ T, settings)
         return T, covariance, is_open
 
 
-def _refuse_divergence(
-    endless: bool, found: float, correction: Array, settings: ScanMatchingSettings
-) -> None:
+def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> None:
     shift = float(np.linalg.norm(correction[:3, 3]))
     turn = float(np.degrees(Rotation.from_matrix(correction[:3, :3]).magnitude()))
-    if endless:
-        raise _NoMatch(f"the registration did not converge in {MAX_ITERATIONS} iterations")
-    if found < settings.min_inlier_share:
-        raise _NoMatch(
-            f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
-        )
     if shift > settings.max_correction_m or turn > settings.max_correction_deg:
         raise _NoMatch(
             f"the registration went {shift:.2f} m and {turn:.1f}° from its start, expected at most"

@@ -211,18 +211,19 @@ def test_empty_and_unreadable_sweeps_are_left_out() -> None:
     assert found.counts["scans not matched"] == 2
 
 
-def test_a_sweep_of_another_place_is_dropped() -> None:
+@pytest.mark.parametrize("height_m", [4.0, 50.0])
+def test_a_sweep_of_another_place_is_dropped(height_m: float) -> None:
     log, truth = street()
     elsewhere = log.scans[4].read()
+    R = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     turned = Points(
-        (elsewhere.xyz @ Rotation.from_euler("z", 40, degrees=True).as_matrix().T + [3, 9, 4]).astype(
-            np.float32
-        ),
+        (elsewhere.xyz @ R.T + [3, 9, height_m]).astype(np.float32),
         elsewhere.intensity,
         elsewhere.stamps,
     )
     found = match_scans(with_scan(log, 4, turned), truth)
     assert [skip.where for skip in found.skips] == ["frame 4"]
+    assert found.skips[0].what == "scan matching"
     off = errors(found.relative_poses, truth)
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.02
 

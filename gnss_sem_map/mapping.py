@@ -276,8 +276,8 @@ def _map_all(
                 raise
     except BrokenProcessPool:
         raise DataError(
-            f"{store.folder}: a worker process died: for lack of memory (take fewer --workers, and --resume), or because"
-            " a script calls this outside `if __name__ == '__main__':`"
+            f"{store.folder}: a worker process died: for lack of memory (take fewer --workers, and --resume), or"
+            " because a script calls this outside `if __name__ == '__main__':`"
         ) from None
 
 

@@ -285,6 +285,49 @@ def calibrate(
 
 
 @app.command()
+def check(
+    drive: Drive,
+    images: Annotated[int, typer.Option(min=5, help="Images to look at, spread over the drive.")] = 40,
+    config: Config = None,
+    set_: Set = None,
+    frames: Frames = None,
+    drive_format: Format = None,
+    as_json: Json = False,
+) -> None:
+    """Is the camera where, and when, the calibration says? Depth edges against image edges."""
+    from dataclasses import asdict
+
+    from gnss_sem_map import pipeline
+    from gnss_sem_map.account import Account
+    from gnss_sem_map.camera_check import check_camera, check_projection
+
+    settings, log = _settings(config, set_), _open(drive, drive_format, frames)
+    check_projection(log)
+    with _progress() as progress:
+        trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
+        found = check_camera(log, trajectory, settings, images, progress)
+    if as_json:
+        typer.echo(json.dumps(asdict(found)))
+        return
+    typer.echo(
+        f"{log.name}: {found.edges} depth edges in {found.images} images; image edges are there"
+        f" {found.agreement:.2f} times as strong as elsewhere, at best {found.best_agreement:.2f}"
+    )
+    typer.echo(
+        f"exposure minus image stamp: {1e3 * found.time_offset_s:.1f} +- {1e3 * found.time_offset_stddev_s:.1f} ms"
+        f" (the file says {1e3 * found.given_time_offset_s:.1f})"
+    )
+    turns = zip("xyz", found.rotation_deg, found.rotation_stddev_deg, strict=True)
+    typer.echo(
+        "camera turned about "
+        + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
+    )
+    _warn(list(found.warnings))
+    if not found.warnings:
+        typer.echo("time and mounting fit the images")
+
+
+@app.command()
 def simulate(
     out: Out,
     seconds: Annotated[float, typer.Option(min=0.3, help="Length of the drive, s.")] = 30.0,

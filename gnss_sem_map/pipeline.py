@@ -23,6 +23,7 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
+from gnss_sem_map.camera_check import check_projection
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import build_maps
@@ -74,9 +75,7 @@ def run(
     one scan can be used, MeasurementError and EstimationError from the smoother.
     """
     account = Account(skips=list(log.skips))
-    label_calibration.opened(
-        settings.calibration, labels.label_set(settings.classes)
-    )  # a wrong file is known now
+    _refuse_early(log, segmenter, settings)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
         solutions = solve(log, settings, account, progress)
@@ -100,6 +99,13 @@ def run(
         progress("refinement", 1, 1)
     raw = SemanticMap.of(maps.static + maps.removed)
     return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness)
+
+
+def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
+    """What cannot end well is said before hours are spent: a calibration file of other classes, a camera turned away."""
+    label_calibration.opened(settings.calibration, labels.label_set(settings.classes))
+    if segmenter is not None and log.images and log.calibration.has_camera:
+        check_projection(log)
 
 
 def _without_moving(

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast, get_args
+from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
+from gnss_sem_map.console import print_metrics, print_run, progress_bars, warn
+
 if TYPE_CHECKING:
-    from gnss_sem_map.account import Progress
     from gnss_sem_map.config import Settings
     from gnss_sem_map.sensor_log import SensorLog
 
@@ -81,7 +80,7 @@ def run(
         label_set = labels.label_set(settings.classes)
         network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
     work = out.with_name(f".{out.name}.work")
-    with _progress() as progress:
+    with progress_bars() as progress:
         result = pipeline.run(
             log,
             network,
@@ -94,8 +93,8 @@ def run(
         )
         about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
     shutil.rmtree(work, ignore_errors=True)
-    _warn(result.account.warnings)
-    _report(about, out, as_json)
+    warn(result.account.warnings)
+    print_run(about, out, as_json)
 
 
 @app.command()
@@ -135,10 +134,10 @@ def trajectory(
     settings = _settings(config, set_)
     log = _open(drive, drive_format, None)
     account = Account(skips=list(log.skips))
-    with _progress() as progress, account.stage("trajectory"):
+    with progress_bars() as progress, account.stage("trajectory"):
         estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
     about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings)
-    _warn(account.warnings)
+    warn(account.warnings)
     if as_json:
         typer.echo(json.dumps(about))
     else:
@@ -167,9 +166,9 @@ def segment(
     log = _open(drive, drive_format, None)
     label_set = labels.label_set(classes)
     network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
-    with _progress() as progress:
+    with progress_bars() as progress:
         report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
-    _warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
+    warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
     typer.echo(
         f"{report.written} images segmented, {report.kept} kept, {len(report.skips)} skipped;"
         f" {report.bytes_per_frame / 1000:.0f} kB per image, {report.images_per_second:.1f} images/s;"
@@ -209,7 +208,7 @@ def train(
 
     settings = config.parse(TrainingSettings, set_ or ())
     learnt, checked = ([LabelledFolder.parse(text) for text in texts] for texts in (data, validation))
-    with _progress() as progress:
+    with progress_bars() as progress:
         report = train_network(
             learnt,
             checked,
@@ -250,7 +249,7 @@ def evaluate(
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
-        _print_metrics(metrics)
+        print_metrics(metrics)
 
 
 @app.command()
@@ -273,7 +272,7 @@ def calibrate(
 
     if len(truth) != len(run_folders):
         raise typer.BadParameter(f"found {len(truth)} for {len(run_folders)} runs", param_hint="--truth")
-    with _progress() as progress:
+    with progress_bars() as progress:
         found = measure(list(zip(run_folders, truth, strict=True)), drive, segmenter, progress)
     with replacing(out) as file:
         file.write(found.to_yaml().encode())
@@ -303,7 +302,7 @@ def check(
 
     settings, log = _settings(config, set_), _open(drive, drive_format, frames)
     check_projection(log)
-    with _progress() as progress:
+    with progress_bars() as progress:
         trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
         found = check_camera(log, trajectory, settings, images, progress)
     if as_json:
@@ -322,7 +321,7 @@ def check(
         "camera turned about "
         + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
     )
-    _warn(list(found.warnings))
+    warn(list(found.warnings))
     if not found.warnings:
         typer.echo("time and mounting fit the images")
 
@@ -338,7 +337,7 @@ def simulate(
     """Write a simulated drive in KITTI raw format, with the exact truth beside it."""
     from gnss_sem_map.simulation import simulate as write_drive
 
-    with _progress() as progress:
+    with progress_bars() as progress:
         drive = write_drive(out, seconds, seed, lambda done, total: progress("simulate", done, total))
     typer.echo(f"drive in {drive}")
 
@@ -361,7 +360,7 @@ def demo(
     world = out.with_name(f"{out.name}_drive")
     shutil.rmtree(world, ignore_errors=True)
     start = time.perf_counter()
-    with _progress() as progress:
+    with progress_bars() as progress:
         drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
         simulated = time.perf_counter()
         labels = write_corrupted_labels(
@@ -387,52 +386,6 @@ def demo(
 def config(config: Config = None, set_: Set = None) -> None:
     """Print all settings as YAML, with the values that a run would use."""
     typer.echo(_settings(config, set_).to_yaml(), nl=False)
-
-
-def _warn(warnings: list[str]) -> None:
-    for warning in warnings:
-        typer.echo(f"warning: {warning}", err=True)
-
-
-def _print_metrics(metrics: dict[str, Any]) -> None:
-    """One table: accuracy and IoU per class before and after refinement, then the single figures."""
-    from rich.console import Console
-    from rich.table import Table
-
-    raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
-    table = Table(title="Semantics, % of labelled points")
-    table.add_column("class")
-    for column in ("accuracy raw", "refined", "IoU raw", "refined"):
-        table.add_column(column, justify="right")
-    for name, after in refined["classes"].items():
-        before = raw["classes"][name] or {}
-        after = after or {}
-        cells = (side.get(figure) for figure in ("accuracy", "iou") for side in (before, after))
-        table.add_row(name, *map(_percent, cells))
-    means = (side[f"mean_{figure}"] for figure in ("accuracy", "iou") for side in (raw, refined))
-    table.add_section()
-    table.add_row("mean", *map(_percent, means))
-    console = Console(soft_wrap=True)
-    console.print(table)
-    moving = metrics["dynamic"]
-    lines = [
-        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined, of all points",
-        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
-        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
-        f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",
-    ]
-    if "trajectory" in metrics:
-        t = metrics["trajectory"]
-        lines.append(
-            f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
-            f" heading {t['heading_rms_deg']:.3f} deg, {100 * t['rpe_translation_share']:.2f} % relative"
-        )
-    for line in lines:
-        console.print(line, highlight=False)
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f}"
 
 
 def _settings(file: Path | None, overrides: list[str] | None) -> Settings:
@@ -467,38 +420,6 @@ def _frame_range(frames: str) -> tuple[int, float]:
         raise typer.BadParameter(
             f"found {frames!r}, expected A:B with frame numbers", param_hint="--frames"
         ) from None
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A progress bar per stage on stderr; nothing when that is not a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
-
-        yield show
-
-
-def _report(about: dict[str, Any], out: Path, as_json: bool) -> None:
-    if as_json:
-        typer.echo(json.dumps(about))
-        return
-    counts, seconds = about["counts"], about["seconds"]
-    typer.echo(
-        f"{about['name']}: {counts.get('scans', 0)} scans, {counts.get('points', 0)} points,"
-        f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
-    )
-    typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
-    typer.echo(f"results in {out}")
 
 
 def main() -> None:

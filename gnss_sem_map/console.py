@@ -1,0 +1,94 @@
+"""What the terminal shows: progress, warnings, tables and summaries."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from gnss_sem_map.account import Progress
+
+
+@contextmanager
+def progress_bars() -> Iterator[Progress]:
+    """A progress bar per stage on stderr; nothing when that is not a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Warnings on stderr, a line each."""
+    for warning in warnings:
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
+    """What a run was and cost, in three lines or as JSON."""
+    if as_json:
+        typer.echo(json.dumps(about))
+        return
+    counts, seconds = about["counts"], about["seconds"]
+    typer.echo(
+        f"{about['name']}: {counts.get('scans', 0)} scans, {counts.get('points', 0)} points,"
+        f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
+    )
+    typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
+    typer.echo(f"results in {out}")
+
+
+def print_metrics(metrics: dict[str, Any]) -> None:
+    """One table: accuracy and IoU per class before and after refinement, then the single figures."""
+    from rich.console import Console
+    from rich.table import Table
+
+    raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
+    table = Table(title="Semantics, % of labelled points")
+    table.add_column("class")
+    for column in ("accuracy raw", "refined", "IoU raw", "refined"):
+        table.add_column(column, justify="right")
+    for name, after in refined["classes"].items():
+        before = raw["classes"][name] or {}
+        after = after or {}
+        cells = (side.get(figure) for figure in ("accuracy", "iou") for side in (before, after))
+        table.add_row(name, *map(_percent, cells))
+    means = (side[f"mean_{figure}"] for figure in ("accuracy", "iou") for side in (raw, refined))
+    table.add_section()
+    table.add_row("mean", *map(_percent, means))
+    console = Console(soft_wrap=True)
+    console.print(table)
+    moving = metrics["dynamic"]
+    lines = [
+        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined, of all points",
+        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
+        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
+        f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",
+    ]
+    if "trajectory" in metrics:
+        t = metrics["trajectory"]
+        lines.append(
+            f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
+            f" heading {t['heading_rms_deg']:.3f} deg, {100 * t['rpe_translation_share']:.2f} % relative"
+        )
+    for line in lines:
+        console.print(line, highlight=False)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"

@@ -102,7 +102,7 @@ def run(
 
 
 def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
-    """What cannot end well is said before hours are spent: a calibration file of other classes, a camera turned away."""
+    """Say before hours are spent what cannot end well: a calibration file of other classes, a camera turned away."""
     label_calibration.opened(settings.calibration, labels.label_set(settings.classes))
     if segmenter is not None and log.images and log.calibration.has_camera:
         check_projection(log)
@@ -134,8 +134,7 @@ def estimate_trajectory(
 
 
 def _final(log: SensorLog, solutions: tuple[Solution, ...]) -> tuple[Trajectory, Solution | None]:
-    if not solutions:
-        assert log.given is not None
+    if log.given is not None:
         return log.given, None
     return solutions[-1].trajectory, solutions[-1]
 

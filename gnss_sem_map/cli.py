@@ -347,6 +347,9 @@ def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the results.")] = Path("demo"),
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
     seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
+    network: Annotated[
+        bool, typer.Option("--network", help="Segment the images with the small network made for this town.")
+    ] = False,
 ) -> None:
     """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
     import shutil
@@ -362,14 +365,16 @@ def demo(
     start = time.perf_counter()
     with progress_bars() as progress:
         drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
-        simulated = time.perf_counter()
-        labels = write_corrupted_labels(
-            drive, world / "probabilities", seed, lambda done, total: progress("segment", done, total)
+        simulated, labels = time.perf_counter(), world / "probabilities"
+        if not network:
+            write_corrupted_labels(drive, labels, seed, lambda done, total: progress("segment", done, total))
+    if network:
+        segment(drive, labels, "demo")
+    else:
+        typer.echo(
+            "Labels: the true class images, corrupted as a network would: blurred borders, confused classes."
         )
     segmented = time.perf_counter()
-    typer.echo(
-        "Labels: the simulator's class images, corrupted as a network would (blurred borders, confused classes)."
-    )
     run(drive, out, segmenter=f"labels:{labels}", write_labels=True)
     evaluate(out, drive / "truth")
     about = json.loads((out / "run.json").read_text("utf-8"))

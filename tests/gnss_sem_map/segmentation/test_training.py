@@ -118,10 +118,10 @@ def test_a_folder_with_a_training_is_neither_overwritten_nor_mixed(streets: Any,
 
 
 def test_it_learns_the_streets_and_the_file_opens_as_a_segmenter(streets: Any, tmp_path: Path) -> None:
-    plan = CALM.model_copy(update={"steps": 120, "validate_every": 40, "batch_size": 4, "warmup_steps": 5})
+    plan = CALM.model_copy(update={"steps": 240, "validate_every": 80, "batch_size": 4, "warmup_steps": 5})
     report = train(**streets, out=tmp_path, label_set=URBAN, settings=plan, device="cpu")
     rows = list(csv.DictReader((tmp_path / "log.csv").read_text().splitlines()))
-    assert [int(row["step"]) for row in rows] == [40, 80, 120]
+    assert [int(row["step"]) for row in rows] == [80, 160, 240]
     assert float(rows[-1]["loss"]) < 0.6 * float(rows[0]["loss"])
     assert report.best_mean_iou == pytest.approx(max(float(row["mean_iou"]) for row in rows), abs=1e-4)
     segment = open_segmenter(f"refinenet:{report.network}?shrink=1", URBAN, "cpu")

@@ -11,6 +11,7 @@ this process; what counts is their ratio.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import sys
 import tempfile
@@ -25,7 +26,6 @@ import numpy as np
 import tracklets
 from numpy.typing import NDArray
 
-from factor_graphs.smoothing import smooth
 from gnss_sem_map import labels
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
@@ -33,6 +33,7 @@ from gnss_sem_map.evaluation import Tables, confusion, dynamic, dynamic_counts, 
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.mapping import build_maps
 from gnss_sem_map.motion import find_moving
+from gnss_sem_map.pipeline import solve
 from gnss_sem_map.refinement import RefinementSettings, refine
 from gnss_sem_map.refinement.count_grid import count_grid
 from gnss_sem_map.refinement.dbscan import dbscan
@@ -71,9 +72,10 @@ def main() -> None:
         figures["removal, raw drive 0005, excerpt"] = on_raw_drive(options.data)
         figures["semantics, SemanticKITTI 00 and 08"] = on_semantic_kitti(options.data)
     with tempfile.TemporaryDirectory() as folder:
-        drives = [*options.simulated, *simulated(Path(folder), options.seeds, options.seconds)]
-        for drive in drives:
-            figures[f"simulated, {drive.parent.parent.name}/{drive.name}"] = on_simulated_drive(drive)
+        drives = {f"simulated, {drive.name}": drive for drive in options.simulated}
+        drives |= simulated(Path(folder), options.seeds, options.seconds)
+        for name, drive in drives.items():
+            figures[name] = on_simulated_drive(drive)
     print(json.dumps(figures, indent=1))
     results = Path(__file__).parent / "results" / "refinement.json"
     results.parent.mkdir(exist_ok=True)
@@ -157,14 +159,15 @@ def on_raw_drive(data: Path) -> Figures:
     """A van ahead, a car that pulls out, nine parked vehicles; boxes as truth."""
     log = open_drive(data / RAW_0005)
     segmenter = open_segmenter(f"labels:{data / 'labels/kitti_raw_0005/probabilities'}", URBAN)
-    assert (
-        log.imu is not None and log.gnss is not None and log.frame is not None and log.reference is not None
+    alone = Settings()
+    alone = alone.model_copy(
+        update={"trajectory": alone.trajectory.model_copy(update={"lidar_odometry": False})}
     )
-    smoothed = smooth(log.imu, log.gnss, log.frame).trajectory
     figures: Figures = {}
     for name, trajectory in (
-        ("oxts poses", log.reference),
-        ("GNSS/IMU smoothed, no LiDAR factors", smoothed),
+        ("as the pipeline runs", solve(log, Settings(), Account())[-1].trajectory),
+        ("the unit's own poses", log.reference),
+        ("GNSS and IMU alone", solve(log, alone, Account())[-1].trajectory),
     ):
         drive = Drive(log, trajectory, segmenter, Settings())
         points, ms = timed_find_moving(drive)
@@ -173,11 +176,14 @@ def on_raw_drive(data: Path) -> Figures:
     return figures
 
 
-def simulated(folder: Path, seeds: int, seconds: float) -> list[Path]:
+def simulated(folder: Path, seeds: int, seconds: float) -> dict[str, Path]:
     """Drives of other seeds than the demo's, simulated here."""
     from gnss_sem_map.simulation import simulate
 
-    return [simulate(folder / f"seed_{seed}", seconds, seed) for seed in range(101, 101 + seeds)]
+    return {
+        f"simulated, seed {seed}, {seconds:g} s": simulate(folder / f"seed_{seed}", seconds, seed)
+        for seed in range(101, 101 + seeds)
+    }
 
 
 def on_simulated_drive(folder: Path) -> Figures:
@@ -186,6 +192,7 @@ def on_simulated_drive(folder: Path) -> Figures:
     segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
     drive = Drive(log, log.given or log.reference, segmenter, Settings())
     points, ms = timed_find_moving(drive)
+    names = instance_names(folder / "truth" / "vehicles.csv")
     figures: Figures = {}
     for name, chosen in (("evidence", points), ("paper's rule", by_the_paper(drive))):
         counts, cases = np.zeros((3, 2), np.int64), {}
@@ -197,16 +204,25 @@ def on_simulated_drive(folder: Path) -> Figures:
             moving = np.isin(truth & 0xFFFF, (252, 256, 257, 258, 259))
             for instance in np.unique(truth[moving] >> 16):
                 of_it = moving & (truth >> 16 == instance)
-                seen_points, gone = cases.get(int(instance), (0, 0))
-                cases[int(instance)] = (seen_points + int(of_it.sum()), gone + int(removed[of_it].sum()))
+                case = names[int(instance)]
+                before, gone = cases.get(case, (0, 0))
+                cases[case] = (before + int(of_it.sum()), gone + int(removed[of_it].sum()))
         figures[name] = dynamic(counts) | {
-            "movers": {str(i): {"points": n, "removed": k / n} for i, (n, k) in sorted(cases.items())}
+            "movers": {
+                case: {"points": n, "removed": round(k / n, 4)} for case, (n, k) in sorted(cases.items())
+            }
         }
     figures["evidence"]["ms_per_scan"] = ms
     figures["semantics"] = before_and_after(
         drive, points, folder / "truth" / "labels", folder / "truth" / "single_frame"
     )
     return figures
+
+
+def instance_names(file: Path) -> dict[int, str]:
+    """What the vehicle of every instance number is called, or does."""
+    with file.open(newline="") as rows:
+        return {int(row["instance"]): row["name"] for row in csv.DictReader(rows)}
 
 
 def on_semantic_kitti(data: Path) -> Figures:

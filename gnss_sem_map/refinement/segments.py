@@ -11,6 +11,8 @@ from gnss_sem_map.refinement.dbscan import dbscan
 from gnss_sem_map.voxel_map import keys_of, unpack
 
 VOXEL_M = 0.2
+CLOSER = 0.5
+"""What is larger than a vehicle is taken apart at this share of the distance."""
 PART_M = 0.2
 """A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
 GROUND_CELL_M = 1.0
@@ -88,10 +90,9 @@ def find_segments(
     """
     segments = np.full(len(p_map), -1, np.int32)
     candidates = np.flatnonzero(is_object | ~is_known)
-    clusters = _cluster(p_map[candidates], eps_m)
-    if len(clusters) == 0:
+    if len(candidates) == 0:
         return segments, np.zeros(0, np.bool_)
-    clusters = _whole(*_boxes(p_map[candidates, :2], clusters, clusters.max() + 1))[clusters]
+    clusters = _objects(p_map[candidates], eps_m)
     shown = np.bincount(clusters, is_object[candidates]) > 0
     points = np.bincount(clusters)
     low, high = _boxes(p_map[candidates], clusters, len(points))
@@ -107,6 +108,16 @@ def find_segments(
     cut = np.zeros(parts.max(initial=-1) + 1, np.bool_)
     cut[parts] = joined[clusters[~fits[clusters] & is_object[candidates]]]
     return segments, np.concatenate([np.zeros(fits.sum(), np.bool_), cut])
+
+
+def _objects(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int64]:
+    """Cluster of every point (n, 3): what is too large comes apart, and what is a part of another is joined to it."""
+    clusters = _cluster(p_map, eps_m).astype(np.int64)
+    low, high = _boxes(p_map[:, :2], clusters, clusters.max() + 1)
+    large = np.hypot(*(high - low).T)[clusters] > LONGEST_M
+    clusters[large] = _cluster(p_map[large], CLOSER * eps_m) + clusters.max() + 1
+    clusters = np.unique(clusters, return_inverse=True)[1]
+    return np.asarray(_whole(*_boxes(p_map[:, :2], clusters, clusters.max() + 1))[clusters])
 
 
 def _cluster(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int32]:

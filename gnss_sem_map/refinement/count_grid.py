@@ -62,40 +62,57 @@ def count_grid(
     """
     counts = np.zeros((len(keys), 2), np.int32)
     if len(keys):
-        z = (keys & AXIS_MASK) // layer_voxels
-        y = ((keys >> AXIS_BITS) & AXIS_MASK) // cell_voxels
+        low_y, high_y, low_z, high_z = _reach_of(keys)
         _count(
             keys, labels, classes[0], classes[1], cell_voxels, layer_voxels, reach_layers,
-            int(y.min()), int(y.max() - y.min()) + 1, int(z.min()), int(z.max() - z.min()) + 1, counts,
+            low_y, high_y, low_z, high_z, counts,
         )  # fmt: skip
     return counts
 
 
 @njit(cache=True, nogil=True)
+def _reach_of(keys):  # type: ignore[no-untyped-def]
+    """Lowest and highest y, and z, of packed voxels."""
+    low_y, high_y, low_z, high_z = AXIS_MASK, 0, AXIS_MASK, 0
+    for key in keys:
+        y, z = (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
+        low_y, high_y, low_z, high_z = min(low_y, y), max(high_y, y), min(low_z, z), max(high_z, z)
+    return low_y, high_y, low_z, high_z
+
+
+@njit(cache=True, nogil=True)
 def _count(  # type: ignore[no-untyped-def]
-    keys, labels, a, b, cell, layer, reach, first_y, ny, first_z, nz, counts
+    keys, labels, a, b, cell, layer, reach, low_y, high_y, low_z, high_z, counts
 ):
-    """One slab of cells at a time: sorted keys keep its voxels together, and the grid (y, z) small."""
-    grid = np.zeros((ny, nz, 2), np.int32)
+    """One slab of cells at a time: sorted keys keep its voxels together, and the grid (y, z) small.
+
+    A column's voxels follow each other, so that its cell is found once: divisions are what costs here.
+    """
+    first_y, first_z = low_y // cell, low_z // layer
+    nz = high_z // layer - first_z + 1
+    grid = np.zeros((high_y // cell - first_y + 1, nz, 2), np.int32)
     start = 0
     while start < len(keys):
-        slab = (keys[start] >> (2 * AXIS_BITS)) // cell
-        end = start
-        while end < len(keys) and (keys[end] >> (2 * AXIS_BITS)) // cell == slab:
+        slab_end = ((keys[start] >> (2 * AXIS_BITS)) // cell + 1) * cell
+        end, column, y = start, int64(-1), int64(0)
+        while end < len(keys) and (keys[end] >> (2 * AXIS_BITS)) < slab_end:
+            if keys[end] >> AXIS_BITS != column:
+                column = keys[end] >> AXIS_BITS
+                y = (column & AXIS_MASK) // cell - first_y
             if labels[end] == a or labels[end] == b:
-                y = ((keys[end] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
-                z = (keys[end] & AXIS_MASK) // layer - first_z
+                z = (keys[end] & AXIS_MASK) // layer - first_z if nz > 1 else int64(0)
                 grid[y, z, int64(labels[end] == b)] += 1
             end += 1
+        column = int64(-1)
         for i in range(start, end):
-            y = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
-            z = (keys[i] & AXIS_MASK) // layer - first_z
+            if keys[i] >> AXIS_BITS != column:
+                column = keys[i] >> AXIS_BITS
+                y = (column & AXIS_MASK) // cell - first_y
+            z = (keys[i] & AXIS_MASK) // layer - first_z if nz > 1 else int64(0)
             for k in range(max(z - reach, 0), min(z + reach + 1, nz)):
                 counts[i, 0] += grid[y, k, 0]
                 counts[i, 1] += grid[y, k, 1]
-        for i in range(start, end):
-            y = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell - first_y
-            grid[y, (keys[i] & AXIS_MASK) // layer - first_z, :] = 0
+        grid[:] = 0
         start = end
 
 

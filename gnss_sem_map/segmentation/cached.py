@@ -67,7 +67,7 @@ class CachedLabels:
 
     def _read(self, path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
         if self._evidence is not None:
-            return self._evidence[self._read_ids(path)]
+            return np.take(self._evidence, self._read_ids(path), axis=0)
         probabilities, names = read_probabilities(path, self._size)
         if names != self.class_names:
             raise DataError(

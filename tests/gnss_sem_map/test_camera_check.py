@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import pipeline
 from gnss_sem_map.camera_check import check_camera, check_projection
+from gnss_sem_map.cli import app
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import open_drive
@@ -24,10 +27,15 @@ CAMERA = Camera(620, 188, 360.0, 305.0, 86.0)
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Case:
-    """Two seconds of town with its exact trajectory."""
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of town."""
     lidar = Lidar(np.radians(np.linspace(2.0, -18.0, 32)), columns=1000, range_stddev_m=0.01)
-    drive = simulate(tmp_path_factory.mktemp("check"), 2.0, 3, lidar=lidar, camera=CAMERA, workers=2)
+    return simulate(tmp_path_factory.mktemp("check"), 2.0, 3, lidar=lidar, camera=CAMERA, workers=2)
+
+
+@pytest.fixture(scope="module")
+def town(drive: Path) -> Case:
+    """The same, opened, with its exact trajectory."""
     return open_drive(drive), read_tum(drive / "truth" / "trajectory.tum")
 
 
@@ -116,3 +124,15 @@ def test_the_exposure_of_a_real_camera_is_where_it_was_measured(real_data: Path)
     assert abs(found.time_offset_s + 0.0085) < 0.003
     assert np.abs(found.rotation_deg).max() < 0.2
     assert found.warnings == ()
+
+
+@pytest.mark.slow
+def test_the_command_says_what_it_found_and_warns_of_a_wrong_setting(drive: Path) -> None:
+    wrong = ["--set", "labelling.camera_time_offset_s=0.03"]
+    said = CliRunner().invoke(app, ["check", str(drive)])
+    assert said.exit_code == 0, said.output
+    assert "time and mounting fit the images" in said.output
+    found = json.loads(CliRunner().invoke(app, ["check", str(drive), "--json", *wrong]).stdout)
+    assert found["given_time_offset_s"] == pytest.approx(0.03)
+    assert abs(found["time_offset_s"] + 0.0085) < 0.005
+    assert "camera_time_offset_s" in found["warnings"][0]

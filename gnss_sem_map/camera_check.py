@@ -9,7 +9,7 @@ lasers" (2013); the time offset beside the rotation is ours.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,7 @@ def check_camera(
         edges=len(edges.p_map),
         warnings=(),
     )
-    return CameraCheck(**{**found.__dict__, "warnings": tuple(_warnings(found))})
+    return replace(found, warnings=tuple(_warnings(found)))
 
 
 def check_projection(log: SensorLog, scans: int = 3) -> None:
@@ -147,52 +147,60 @@ def check_projection(log: SensorLog, scans: int = 3) -> None:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Depth edges of one scan, and the image that they are to be found in."""
+
+    p_map: Array
+    weights: Array
+    stamp: float
+    gradients: dict[float, NDArray[np.float32]]
+
+
 def _find_edges(
     log: SensorLog, trajectory: Trajectory, settings: Settings, images: int, progress: Progress
 ) -> _Edges:
     """Depth edges in map coordinates, and gradient images, of scans spread over the drive."""
     chosen = np.unique(np.linspace(0, len(log.scans) - 1, min(images, len(log.scans))).astype(int))
-    p_map, weights, numbers, refused = [], [], [], ""
-    stamps: list[float] = []
-    gradients: dict[float, list[NDArray[np.float32]]] = {COARSE_PX: [], FINE_PX: []}
+    views: list[_View] = []
+    refused = ""
     for done, place in enumerate(chosen):
-        scan = log.scans[place]
-        image = log.image_at(scan.stamp, settings.labelling.image_within_s)
-        progress("check", done + 1, len(chosen))
-        if image is None:
-            refused = refused or f"frame {scan.number}: no image near its stamp"
-            continue
-        stamp = exposure_stamp(image, log.calibration, settings.labelling)
         try:
-            p, weight, everything = _depth_edges(scan, log, trajectory, settings)
-            u, v, inside = _project(
-                everything, _T_camera_map(np.array([stamp]), trajectory, log.calibration), log.calibration
-            )
-            grey = image.read().mean(axis=2, dtype=np.float32)
+            views.append(_look(log.scans[place], log, trajectory, settings))
         except (DataError, MeasurementError) as error:
             refused = refused or str(error)
-            continue
-        for blur, of_blur in gradients.items():
-            gradient = _gradient(grey, blur)
-            average = (
-                float(gradient[v[inside].astype(int), u[inside].astype(int)].mean()) if inside.any() else 0
-            )
-            of_blur.append(gradient / np.float32(average or 1.0))
-        numbers.append(np.full(len(p), len(stamps)))
-        p_map.append(p)
-        weights.append(weight)
-        stamps.append(stamp)
-    edges = sum(map(len, p_map))
-    if len(stamps) < LEAST_IMAGES or edges < LEAST_EDGES:
+        progress("check", done + 1, len(chosen))
+    counts = [len(view.p_map) for view in views]
+    if len(views) < LEAST_IMAGES or sum(counts) < LEAST_EDGES:
         why = f"; first reason: {refused}" if refused else ""
         raise DataError(
-            f"{log.name}: found {len(stamps)} usable images and {edges} depth edges of {len(chosen)} scans, expected"
-            f" at least {LEAST_IMAGES} and {LEAST_EDGES} (points ring by ring, as the scanner gives them){why}"
+            f"{log.name}: found {len(views)} usable images and {sum(counts)} depth edges of {len(chosen)} scans,"
+            f" expected at least {LEAST_IMAGES} and {LEAST_EDGES} (points ring by ring, as the scanner gives them){why}"
         )
-    stacks = {blur: np.stack(of_blur) for blur, of_blur in gradients.items()}
     return _Edges(
-        np.concatenate(p_map), np.concatenate(weights), np.concatenate(numbers), np.array(stamps), stacks
+        np.concatenate([view.p_map for view in views]),
+        np.concatenate([view.weights for view in views]),
+        np.repeat(np.arange(len(views)), counts),
+        np.array([view.stamp for view in views]),
+        {blur: np.stack([view.gradients[blur] for view in views]) for blur in (COARSE_PX, FINE_PX)},
     )
+
+
+def _look(scan: Scan, log: SensorLog, trajectory: Trajectory, settings: Settings) -> _View:
+    """One scan and its image; raises DataError or MeasurementError where they cannot be used."""
+    image = log.image_at(scan.stamp, settings.labelling.image_within_s)
+    if image is None:
+        raise DataError(f"frame {scan.number}: no image near its stamp")
+    stamp = exposure_stamp(image, log.calibration, settings.labelling)
+    p_map, weights, everything = _depth_edges(scan, log, trajectory, settings)
+    T_camera_map = _T_camera_map(np.array([stamp]), trajectory, log.calibration)
+    u, v, inside = _project(everything, T_camera_map, log.calibration)
+    rows, columns = v[inside].astype(int), u[inside].astype(int)
+    grey = image.read().mean(axis=2, dtype=np.float32)
+    gradients = {blur: _gradient(grey, blur) for blur in (COARSE_PX, FINE_PX)}
+    for gradient in gradients.values():
+        gradient /= (gradient[rows, columns].mean() if len(rows) else 0.0) or 1.0  # an image of one colour
+    return _View(p_map, weights, stamp, gradients)
 
 
 def _depth_edges(

@@ -67,7 +67,7 @@ def draw_cubes(centres: NDArray[np.float64], half_m: NDArray[np.float64], camera
 
 
 @njit(cache=True, nogil=True)
-def _draw(centres, half, order, axes, focal, depth, cube, face):  # type: ignore[no-untyped-def]
+def _draw(centres, half, order, axes, focal, depth, cube, face):
     """Ray against box (slabs) for all pixels of every cube's bounding square; rays have forward component 1."""
     height, width = depth.shape
     for i in order:

@@ -71,7 +71,7 @@ def count_grid(
 
 
 @njit(cache=True, nogil=True)
-def _reach_of(keys):  # type: ignore[no-untyped-def]
+def _reach_of(keys):
     """Lowest and highest y, and z, of packed voxels."""
     low_y, high_y, low_z, high_z = AXIS_MASK, 0, AXIS_MASK, 0
     for key in keys:
@@ -81,9 +81,7 @@ def _reach_of(keys):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _count(  # type: ignore[no-untyped-def]
-    keys, labels, a, b, cell, layer, reach, low_y, high_y, low_z, high_z, counts
-):
+def _count(keys, labels, a, b, cell, layer, reach, low_y, high_y, low_z, high_z, counts):
     """One slab of cells at a time: sorted keys keep its voxels together, and the grid (y, z) small.
 
     A column's voxels follow each other, so that its cell is found once: divisions are what costs here.

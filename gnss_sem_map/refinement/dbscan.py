@@ -98,7 +98,7 @@ def _stencil(eps_voxels: float) -> NDArray[np.int64]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _popcount(word):  # type: ignore[no-untyped-def]
+def _popcount(word):
     """Set bits of a 64-bit word: sums of 2, 4, 8 bits, then of bytes; LLVM makes one instruction of it."""
     word -= (word >> uint64(1)) & uint64(0x5555555555555555)
     word = (word & uint64(0x3333333333333333)) + ((word >> uint64(2)) & uint64(0x3333333333333333))
@@ -107,18 +107,18 @@ def _popcount(word):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _lowest_bit(word):  # type: ignore[no-untyped-def]
+def _lowest_bit(word):
     return _popcount((word & (~word + uint64(1))) - uint64(1))
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _window(mask, bit, half):  # type: ignore[no-untyped-def]
+def _window(mask, bit, half):
     """The bits of a word from `bit - half` to `bit + half`, moved down to bit 0."""
     return (mask >> uint64(bit - half)) & ((uint64(1) << uint64(2 * half + 1)) - uint64(1))
 
 
 @njit(cache=True, nogil=True)
-def _words(columns, z):  # type: ignore[no-untyped-def]
+def _words(columns, z):
     """Overlapping words of the sorted voxels: word k of a column holds z from 32 k - 32 to 32 k + 31.
 
     Returns packed column and k (w,), masks (w,), the first voxel of each word (w,), and for every voxel the
@@ -146,7 +146,7 @@ def _words(columns, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_root(parents, i):  # type: ignore[no-untyped-def]
+def _find_root(parents, i):
     while parents[i] != i:
         parents[i] = parents[parents[i]]
         i = parents[i]
@@ -154,7 +154,7 @@ def _find_root(parents, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _count_neighbours(keys, masks, own, bits, stencil):  # type: ignore[no-untyped-def]
+def _count_neighbours(keys, masks, own, bits, stencil):
     """Voxels within the radius of each voxel, itself included."""
     counts = np.zeros(len(own), np.int32)
     for s in range(len(stencil)):
@@ -170,7 +170,7 @@ def _count_neighbours(keys, masks, own, bits, stencil):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True)
-def _join_cores(keys, masks, first, own, bits, stencil, parents):  # type: ignore[no-untyped-def]
+def _join_cores(keys, masks, first, own, bits, stencil, parents):
     """Union of all core voxels within the radius of each other; half of the stencil sees every pair once.
 
     After a join the next bits within the radius are skipped: they are joined to that bit within their own
@@ -203,7 +203,7 @@ def _join_cores(keys, masks, first, own, bits, stencil, parents):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
-def _reach_borders(wanted_keys, bits, keys, masks, first, stencil, core_clusters, clusters):  # type: ignore[no-untyped-def]
+def _reach_borders(wanted_keys, bits, keys, masks, first, stencil, core_clusters, clusters):
     """Give every voxel that is no core the lowest cluster among the core voxels within its radius."""
     column_reach = stencil[len(stencil) // 2, 1]
     for s in range(len(stencil)):
@@ -227,7 +227,7 @@ def _reach_borders(wanted_keys, bits, keys, masks, first, stencil, core_clusters
 
 
 @njit(cache=True, nogil=True)
-def _number(parents, positions):  # type: ignore[no-untyped-def]
+def _number(parents, positions):
     """Cluster of every core voxel; numbers are given in the order of `positions`."""
     clusters = np.full(len(parents), NOISE, np.int32)
     count = 0

@@ -36,7 +36,7 @@ def flatness(keys: NDArray[np.int64]) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True)
-def _gather(keys, stencil, steps, moments):  # type: ignore[no-untyped-def]
+def _gather(keys, stencil, steps, moments):
     """Add 1, d and the six products d d^T of every occupied neighbour at d to the moments (v, 10) of both voxels."""
     for k in range(len(stencil)):
         x, y, z = steps[k]

@@ -21,14 +21,14 @@ LEAST_FILLED = 3
 
 
 @njit(cache=True, nogil=True)
-def _pixel(x, y, z, r):  # type: ignore[no-untyped-def]
+def _pixel(x, y, z, r):
     row = int64(np.floor((np.degrees(np.arcsin(z / r)) - LOWEST_DEG) / ROW_DEG))
     column = int64(np.floor((np.degrees(np.arctan2(y, x)) + 180.0) / COLUMN_DEG)) % COLUMNS
     return row, column
 
 
 @njit(cache=True, nogil=True)
-def draw(p_map, T_lidar_map, image):  # type: ignore[no-untyped-def]
+def draw(p_map, T_lidar_map, image):
     """Draw the points (n, 3) of a scan into its range image (68, 900) of cm: the nearest return of each pixel."""
     T = T_lidar_map
     for i in range(len(p_map)):
@@ -44,7 +44,7 @@ def draw(p_map, T_lidar_map, image):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _look(image, row, column, r, margin_m):  # type: ignore[no-untyped-def]
+def _look(image, row, column, r, margin_m):
     """What one scan says of a place at range r: 1 it was hit, -1 seen through, 0 hidden or unknown."""
     filled, rows = 0, 0
     nearer = False
@@ -64,7 +64,7 @@ def _look(image, row, column, r, margin_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):  # type: ignore[no-untyped-def]
+def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
     """Segments (count,) of a scan that go on behind something nearer, to the left or to the right.
 
     The sides of a segment are its outermost columns; something nearer in the next ones hides what is there.
@@ -110,7 +110,7 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):  # type:
 
 
 @njit(cache=True, nogil=True)
-def look_at(places, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin_ratio, hits, throughs):  # type: ignore[no-untyped-def]
+def look_at(places, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin_ratio, hits, throughs):
     """Count for every place (m, 3) the scans that hit it and those that saw through it.
 
     `images` (k, 68, 900), `T_lidar_map` (k, 4, 4); only scans with the place in range count, with a margin that

@@ -23,7 +23,7 @@ LEAST_POINTS = 20
 
 
 @njit(cache=True, nogil=True)
-def _boxes(points, clusters, count):  # type: ignore[no-untyped-def]
+def _boxes(points, clusters, count):
     """Lowest and highest corner of the points (n, d) of every cluster: (count, d) each."""
     low, high = np.full((count, points.shape[1]), np.inf), np.full((count, points.shape[1]), -np.inf)
     for i in range(len(points)):
@@ -34,7 +34,7 @@ def _boxes(points, clusters, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _whole(low, high):  # type: ignore[no-untyped-def]
+def _whole(low, high):
     """The cluster that each one is part of: its own, or the first of vehicle size whose box (s, 2) holds its box."""
     owners = np.arange(len(low))
     for j in range(len(low)):
@@ -52,7 +52,7 @@ def _whole(low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cells(p_map, size_m):  # type: ignore[no-untyped-def]
+def _cells(p_map, size_m):
     """Cell in x and y of every point (n, 3), from 0, and how many cells there are."""
     cells = np.empty((len(p_map), 2), np.int64)
     for i in range(len(p_map)):
@@ -63,7 +63,7 @@ def _cells(p_map, size_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lowest(cells, z, ground):  # type: ignore[no-untyped-def]
+def _lowest(cells, z, ground):
     for i in range(len(z)):
         ground[cells[i, 0], cells[i, 1]] = min(ground[cells[i, 0], cells[i, 1]], z[i])
 

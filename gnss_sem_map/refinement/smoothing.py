@@ -91,7 +91,7 @@ def infer(
 
 
 @njit(cache=True, nogil=True)
-def _hear(keys, q, stencil, heard):  # type: ignore[no-untyped-def]
+def _hear(keys, q, stencil, heard):
     """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""
     for offset in stencil:
         j = 0

@@ -58,7 +58,7 @@ def test_a_class_of_which_nothing_was_seen_is_neither_excluded_nor_preferred() -
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 2**31), min_size=1, max_size=4), st.randoms(use_true_random=False))
-def test_every_street_counts_the_same_in_any_order(seeds: list[int], chance) -> None:  # type: ignore[no-untyped-def]
+def test_every_street_counts_the_same_in_any_order(seeds: list[int], chance) -> None:
     streets = [street(seed) for seed in seeds]
     shuffled = list(streets)
     chance.shuffle(shuffled)

@@ -84,9 +84,7 @@ def constant_velocity(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array,
         covariances.append(kalman.P)
         Fs.append(F)
         Qs.append(Q)
-    smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[
-        0
-    ]
+    smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0]
     return smoothed[:, :3], smoothed[:, 3:]
 
 

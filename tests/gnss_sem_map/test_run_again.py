@@ -49,11 +49,12 @@ def test_a_run_killed_at_several_moments_and_resumed_gives_the_same_bytes(
     small_drive: Street, whole: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    for seconds in (2.0, 4.0, 6.0):
+    for seconds in (1.0, 2.0, 3.0, 4.0):
         with subprocess.Popen(command(*run_of(small_drive, out, "--resume"))) as process:
             time.sleep(seconds)
             process.kill()
-        assert not (out / "run.json").exists() or process.returncode == 0
+        if out.exists():  # the machine was quick: then everything is there, for it appears at once
+            assert_same_maps(out, whole)
     done = run(*run_of(small_drive, out, "--resume", "--workers", "2"))
     assert done.returncode == 0, done.stderr
     assert_same_maps(out, whole)

@@ -301,8 +301,7 @@ def _rigid(T: Array) -> Array:
 
 
 def _inverse(T: Array) -> Array:
-    inverse: Array = np.linalg.inv(T)  # type: ignore[assignment]
-    return inverse
+    return np.asarray(np.linalg.inv(T), np.float64)
 
 
 def _cross_matrix(v: Array) -> Array:

@@ -83,10 +83,7 @@ def _cast(origins: Array, rays: Array, stamps: Array, boxes: Sequence[Box]) -> A
 
 def log_of(points: dict[int, Points], trajectory: Trajectory) -> SensorLog:
     """A drive with these sweeps by number, and poses."""
-    scans = tuple(
-        Scan(f"{k:06d}", k, (k + 0.5) * SWEEP_S, lambda k=k: points[k])  # type: ignore[misc]
-        for k in sorted(points)
-    )
+    scans = tuple(Scan(f"{k:06d}", k, (k + 0.5) * SWEEP_S, lambda k=k: points[k]) for k in sorted(points))
     return SensorLog("scene", 0, Calibration(T_IMU_LIDAR), scans, (), frame=FRAME, given=trajectory)
 
 

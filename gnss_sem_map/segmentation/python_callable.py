@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,4 +56,4 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
     if not callable(function):
         raise ConfigError(f"python:{place}: found {type(function).__name__}, expected a callable")
-    return function  # type: ignore[no-any-return]
+    return cast("Callable[[NDArray[np.uint8]], Any]", function)

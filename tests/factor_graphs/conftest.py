@@ -37,7 +37,7 @@ def drive(seed: int, seconds: float = 120.0, noise: ImuNoise | None = None, **gn
     biases = np.zeros((len(stamps), 6)) if noise is None else simulate_biases(stamps, noise, rng)
     imu = simulate_imu(motion, stamps, FRAME, noise, rng, biases=biases)
     fix_stamps = np.arange(0.37, seconds - 0.5, 1.0)
-    fixes = simulate_gnss(motion, fix_stamps, STDDEVS, LEVER, None if noise is None else rng, **gnss)  # type: ignore[arg-type]
+    fixes = simulate_gnss(motion, fix_stamps, STDDEVS, LEVER, None if noise is None else rng, **gnss)
     return Drive(motion, imu, fixes, biases)
 
 

@@ -98,7 +98,7 @@ def test_a_camera_that_looks_away_from_every_point_is_an_error_of_check_and_of_r
     with pytest.raises(DataError, match="behind the camera"):
         check_camera(away, trajectory)
     with pytest.raises(DataError, match="behind the camera"):
-        pipeline.run(away, lambda image: None, Settings())  # type: ignore[arg-type]
+        pipeline.run(away, lambda image: None, Settings())
 
 
 def test_a_drive_without_images_or_with_too_few_says_so(town: Case) -> None:

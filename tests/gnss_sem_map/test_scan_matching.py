@@ -252,7 +252,7 @@ def test_a_jump_in_stamps_begins_a_new_local_map() -> None:
     scans = tuple(
         scan
         if scan.number < 8
-        else replace(scan, stamp=scan.stamp + 5.0, read=lambda k=scan.number: moved(k))  # type: ignore[misc]
+        else replace(scan, stamp=scan.stamp + 5.0, read=lambda k=scan.number: moved(k))
         for scan in log.scans
     )
     found = match_scans(replace(log, scans=scans), later)

@@ -18,7 +18,7 @@ from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.refinement import count_grid, vehicles
 from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.flatness import flatness
-from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
+from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
@@ -67,12 +67,14 @@ class RefinementSettings(BaseModel):
         description="n looks at a voxel count as n to this power: they repeat each other's errors. 1 is eq. 6.",
     )
     geometry: Literal["rules", "off"] = Field(
-        default="rules", description="Height over ground as evidence against classes."
+        default="rules", description="Height over ground, and how flat it lies, as evidence against classes."
     )
     smoothing: Literal["mean_field", "off"] = Field(
         default="mean_field", description="Neighbouring voxels as evidence for each other."
     )
-    heights: GeometrySettings = Field(default=GeometrySettings(), description="Numbers of the height rules.")
+    heights: GeometrySettings = Field(
+        default=GeometrySettings(), description="Numbers of the geometry rules."
+    )
     columns: CountGridSettings = Field(default=CountGridSettings(), description="Numbers of the count grids.")
     support: VehicleSettings = Field(default=VehicleSettings(), description="Numbers of the vehicle rules.")
     neighbours: SmoothingSettings = Field(
@@ -185,13 +187,14 @@ def _weigh_heights(
     settings: RefinementSettings,
     calibration: LabelCalibration | None,
 ) -> tuple[Scores, Step]:
-    """Height over ground, and with a calibration the surface's normal, against classes that are not found there."""
+    """Height over ground and the surface's normal against classes that are not found there."""
     if settings.geometry == "off":
         return scores, Step("heights", {}, SWITCHED_OFF)
+    lie = flatness(voxels.keys, voxels.observed)
     if calibration is None:
-        refined = scores + against_by_height(heights, voxels.label_set, settings.heights)
+        refined = scores + against(heights, lie, voxels.label_set, settings.heights)
     else:
-        refined = scores + calibration.of_geometry(heights, flatness(voxels.keys))
+        refined = scores + calibration.of_geometry(heights, lie)
     return refined, _step("heights", voxels, scores, refined)
 
 

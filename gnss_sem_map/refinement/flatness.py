@@ -14,18 +14,19 @@ LEAST_SPREAD = 0.01
 """Middle eigenvalue, voxels squared, below which the voxels are a line and have no normal."""
 
 
-def flatness(keys: NDArray[np.int64]) -> NDArray[np.float32]:
+def flatness(keys: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
     """|z| of the normal of sorted packed voxels (v,): 1 on level ground, 0 on a wall, NaN where it cannot be known.
 
     The normal is the eigenvector of the smallest eigenvalue of the covariance of the occupied voxels among 3 x 3 x 3;
-    fewer than five, or a line of them, have none.
+    fewer than five, or a line of them, have none. Only of the `wanted` voxels (v,), where that is said; others are NaN.
     """
     result = np.full(len(keys), np.nan, np.float32)
     moments = np.zeros((len(keys), 10))
     moments[:, 0] = 1
     origin = pack(np.zeros((1, 3), np.int64))[0]
     _gather(keys, HALF_STENCIL, unpack(HALF_STENCIL + origin).astype(np.float64), moments)
-    enough = np.flatnonzero(moments[:, 0] >= LEAST_VOXELS)
+    has_normal = moments[:, 0] >= LEAST_VOXELS
+    enough = np.flatnonzero(has_normal if wanted is None else has_normal & wanted)
     means = moments[enough, 1:] / moments[enough, :1]
     covariances = means[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3)
     covariances -= means[:, :3, None] * means[:, None, :3]

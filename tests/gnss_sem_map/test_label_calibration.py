@@ -155,6 +155,10 @@ def test_flatness_is_that_of_the_covariance_of_the_occupied_neighbours() -> None
     rng = np.random.default_rng(0)
     indices = np.unique(rng.integers(0, 8, (250, 3)), axis=0)
     found = flatness(pack(indices))
+    wanted = rng.random(len(indices)) < 0.5
+    np.testing.assert_array_equal(
+        flatness(pack(indices), wanted), np.where(wanted, found, np.float32(np.nan))
+    )
     for i, index in enumerate(indices):
         near = indices[(np.abs(indices - index) <= 1).all(axis=1)]
         if len(near) < 5:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.labels import label_set
-from gnss_sem_map.refinement.geometry import GeometrySettings, against_by_height
+from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
 
 URBAN = label_set("urban")
@@ -54,10 +54,18 @@ def test_no_voxels_have_no_heights():
 def test_each_rule_counts_against_its_class_alone():
     settings = GeometrySettings(against_nat=2.0)
     road, sidewalk, vehicle, building, vegetation = range(5)
-    against = against_by_height(np.array([0.0, 0.4, 1.0, 4.0], np.float32), URBAN, settings)
-    expected = np.zeros((4, 5))
-    expected[0, [building, vegetation]] = -2.0, -1.0
-    expected[1, road] = -2.0
-    expected[2, [road, sidewalk]] = -2.0
-    expected[3, [road, sidewalk, vehicle]] = -2.0, -2.0, -4.0
-    np.testing.assert_array_equal(against, expected)
+    unknown, level, steep = np.nan, 1.0, 0.5
+    for height, lie, expected in (
+        (0.0, unknown, {building: -2, vegetation: -1}),
+        (0.0, level, {building: -4, vegetation: -1}),
+        (0.2, level, {building: -2}),
+        (0.2, 0.9, {}),
+        (0.2, steep, {road: -2, sidewalk: -2}),
+        (0.4, level, {road: -2}),
+        (1.0, unknown, {road: -2, sidewalk: -2}),
+        (1.0, steep, {road: -2, sidewalk: -2}),
+        (4.0, level, {road: -2, sidewalk: -2, vehicle: -4}),
+    ):
+        row = [expected.get(c, 0) for c in range(5)]
+        found = against(np.array([height], np.float32), np.array([lie], np.float32), URBAN, settings)
+        np.testing.assert_array_equal(found, [row])

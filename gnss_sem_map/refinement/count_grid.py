@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int64, njit
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import gammaln
@@ -60,58 +60,59 @@ def count_grid(
     `keys` (v,) sorted packed voxels, `labels` (v,). A column is a square of `cell_voxels`, whole or, with
     `layer_voxels`, the layers within `reach_layers` of the voxel's own.
     """
-    counts = np.zeros((len(keys), 2), np.int32)
-    if len(keys):
-        low_y, high_y, low_z, high_z = _reach_of(keys)
-        _count(
-            keys, labels, classes[0], classes[1], cell_voxels, layer_voxels, reach_layers,
-            low_y, high_y, low_z, high_z, counts,
-        )  # fmt: skip
+    counts = np.empty((len(keys), 2), np.int32)
+    _count(keys, labels, classes[0], classes[1], cell_voxels, layer_voxels, reach_layers, counts)
     return counts
 
 
 @njit(cache=True, nogil=True)
-def _reach_of(keys):
-    """Lowest and highest y, and z, of packed voxels."""
-    low_y, high_y, low_z, high_z = AXIS_MASK, 0, AXIS_MASK, 0
-    for key in keys:
-        y, z = (key >> AXIS_BITS) & AXIS_MASK, key & AXIS_MASK
-        low_y, high_y, low_z, high_z = min(low_y, y), max(high_y, y), min(low_z, z), max(high_z, z)
-    return low_y, high_y, low_z, high_z
+def _runs(keys, cell, layer):
+    """Runs of sorted voxels that share a column and a layer: cell in y and layer, (r, 2), and ends (r + 1,)."""
+    cells, ends = np.empty((len(keys), 2), np.int64), np.zeros(len(keys) + 1, np.int64)
+    count, i = 0, 0
+    while i < len(keys):
+        z = keys[i] & AXIS_MASK
+        cells[count] = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell, z // layer
+        past = keys[i] - z + (z // layer + 1) * layer
+        while i + 4 <= len(keys) and keys[i + 3] < past:  # keys are sorted: the fourth decides for four
+            i += 4
+        while i < len(keys) and keys[i] < past:
+            i += 1
+        count += 1
+        ends[count] = i
+    return cells[:count], ends[: count + 1]
 
 
 @njit(cache=True, nogil=True)
-def _count(keys, labels, a, b, cell, layer, reach, low_y, high_y, low_z, high_z, counts):
-    """One slab of cells at a time: sorted keys keep its voxels together, and the grid (y, z) small.
-
-    A column's voxels follow each other, so that its cell is found once: divisions are what costs here.
-    """
-    first_y, first_z = low_y // cell, low_z // layer
-    nz = high_z // layer - first_z + 1
-    grid = np.zeros((high_y // cell - first_y + 1, nz, 2), np.int32)
+def _count(keys, labels, a, b, cell, layer, reach, counts):
+    """One slab of cells at a time, run by run, on a grid of its cells (y, z) with room for the reach."""
     start = 0
     while start < len(keys):
-        slab_end = ((keys[start] >> (2 * AXIS_BITS)) // cell + 1) * cell
-        end, column, y = start, int64(-1), int64(0)
-        while end < len(keys) and (keys[end] >> (2 * AXIS_BITS)) < slab_end:
-            if keys[end] >> AXIS_BITS != column:
-                column = keys[end] >> AXIS_BITS
-                y = (column & AXIS_MASK) // cell - first_y
-            if labels[end] == a or labels[end] == b:
-                z = (keys[end] & AXIS_MASK) // layer - first_z if nz > 1 else int64(0)
-                grid[y, z, int64(labels[end] == b)] += 1
-            end += 1
-        column = int64(-1)
-        for i in range(start, end):
-            if keys[i] >> AXIS_BITS != column:
-                column = keys[i] >> AXIS_BITS
-                y = (column & AXIS_MASK) // cell - first_y
-            z = (keys[i] & AXIS_MASK) // layer - first_z if nz > 1 else int64(0)
-            for k in range(max(z - reach, 0), min(z + reach + 1, nz)):
-                counts[i, 0] += grid[y, k, 0]
-                counts[i, 1] += grid[y, k, 1]
-        grid[:] = 0
-        start = end
+        past = ((keys[start] >> (2 * AXIS_BITS)) // cell + 1) * cell << (2 * AXIS_BITS)
+        slab = slice(start, start + np.searchsorted(keys[start:], past))
+        start = slab.stop
+        cells, ends = _runs(keys[slab], cell, layer)
+        _count_slab(labels[slab], a, b, cells, ends, reach, counts[slab])
+
+
+@njit(cache=True, nogil=True)
+def _count_slab(labels, a, b, cells, ends, reach, counts):
+    low_y, low_z = cells[:, 0].min(), cells[:, 1].min() - reach
+    grid = np.zeros((cells[:, 0].max() - low_y + 1, cells[:, 1].max() + reach - low_z + 1, 2), np.int32)
+    for run in range(len(cells)):
+        first, second = 0, 0
+        for label in labels[ends[run] : ends[run + 1]]:
+            first += label == a
+            second += label == b
+        grid[cells[run, 0] - low_y, cells[run, 1] - low_z, 0] += first
+        grid[cells[run, 0] - low_y, cells[run, 1] - low_z, 1] += second
+    for run in range(len(cells)):
+        first, second = 0, 0
+        for z in range(cells[run, 1] - low_z - reach, cells[run, 1] - low_z + reach + 1):
+            first += grid[cells[run, 0] - low_y, z, 0]
+            second += grid[cells[run, 0] - low_y, z, 1]
+        for i in range(ends[run], ends[run + 1]):
+            counts[i, 0], counts[i, 1] = first, second
 
 
 def paper_log_odds(

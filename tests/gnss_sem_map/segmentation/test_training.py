@@ -17,7 +17,14 @@ from safetensors.torch import load_file
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.segmentation.training import NETWORK, STATE, TrainingSettings, learning_rate, train
+from gnss_sem_map.segmentation.training import (
+    NETWORK,
+    STATE,
+    TrainingSettings,
+    learning_rate,
+    precision_on,
+    train,
+)
 from gnss_sem_map.segmentation.training_data import (
     IGNORE,
     LabelledFolder,
@@ -94,6 +101,24 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_others(streets: A
     assert (tmp_path / "1" / NETWORK).read_bytes() == (tmp_path / "2" / NETWORK).read_bytes()
     other = run(streets, tmp_path / "3", CALM.model_copy(update={"seed": 1}))
     assert not torch.equal(first["segm.weight"], other["segm.weight"])
+
+
+def test_half_precision_gives_other_weights_but_the_same_for_the_same_seed(
+    streets: Any, tmp_path: Path
+) -> None:
+    half = CALM.model_copy(update={"precision": "bfloat16"})
+    first = run(streets, tmp_path / "1", half)
+    assert_same(first, run(streets, tmp_path / "2", half))
+    assert not torch.equal(first["segm.weight"], run(streets, tmp_path / "3")["segm.weight"])
+    assert all(weight.dtype != torch.bfloat16 for weight in first.values())
+
+
+@pytest.mark.parametrize(
+    ("device", "asked", "found"),
+    [("cpu", "auto", torch.float32), ("cuda", "auto", torch.float16), ("cuda", "bfloat16", torch.bfloat16)],
+)
+def test_layers_calculate_in_what_the_device_is_fast_at(device: str, asked: str, found: torch.dtype) -> None:
+    assert precision_on(torch.device(device), TrainingSettings(precision=asked)) is found
 
 
 def test_an_interrupted_training_ends_as_if_it_had_not_been(streets: Any, tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -23,7 +24,8 @@ class NetworkSegmenter:
     """Runs a network at `scale` times the image's size, and answers at the image's size divided by `shrink`.
 
     What the integer division cuts off at the right and lower border (less than `shrink` pixels) the network does not
-    see. Raises DataError for an image that is not (h, w, 3) uint8, or probabilities that are not finite.
+    see. Raises DataError for an image that is not (h, w, 3) uint8, for probabilities that are not finite, or when the
+    device's memory is full.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class NetworkSegmenter:
             return [seen for image in images for seen in self.segment_many([image])]
         height, width = (side // self._shrink for side in pixels[0].shape[:2])
         inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
-        with torch.inference_mode():
+        with torch.inference_mode(), enough_memory(self._device, "fewer images at once, or ?scale=0.5"):
             batch = torch.from_numpy(inputs).to(self._device).permute(0, 3, 1, 2).float() / 255
             seen = self._probabilities((batch - self._mean) / self._std, (height, width))
             result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()
@@ -89,6 +91,17 @@ def find_device(name: str) -> torch.device:
             f"device {name!r}: {reason}; expected auto, cpu, cuda or another torch device"
         ) from None
     return device
+
+
+@contextmanager
+def enough_memory(device: torch.device, advice: str) -> Iterator[None]:
+    """Turns the end of a GPU's memory into a DataError that gives `advice`."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError:
+        raise DataError(
+            f"device {str(device)!r}: its memory is full; try {advice}, or another device"
+        ) from None
 
 
 def placed(network: nn.Module, device: torch.device) -> nn.Module:

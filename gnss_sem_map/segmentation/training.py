@@ -10,6 +10,7 @@ import csv
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, interpolate
 
@@ -31,7 +33,7 @@ from gnss_sem_map.segmentation.checkpoints import (
     read_checkpoint,
     write_network,
 )
-from gnss_sem_map.segmentation.networks import find_device, placed
+from gnss_sem_map.segmentation.networks import enough_memory, find_device, placed
 from gnss_sem_map.segmentation.pixels import scaled
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 from gnss_sem_map.segmentation.training_data import (
@@ -112,16 +114,17 @@ def train(
 
     `taxonomy` and `ids` say what the ids in the PNGs mean; `initial` is a checkpoint to begin with, whose last layer is
     kept if it has the same class names. `out` gets NETWORK, STATE and LOG; with `resume`, a training that was
-    interrupted there goes on. Raises DataError for images, labels or checkpoints that are not right, ConfigError when
-    `out` already holds a training, or one with other settings.
+    interrupted there goes on. Raises DataError for images, labels or checkpoints that are not right and when the
+    device's memory is full, ConfigError when `out` already holds a training, or one with other settings.
     """
     settings = settings or TrainingSettings()
     learnt = labelled_images(training, label_set, taxonomy, ids)
     checked = labelled_images(validation, label_set, taxonomy, ids)
     run = _Run(learnt, settings, initial, find_device(device), out, resume)
-    for step, loss in run.steps(progress):
-        if step % settings.validate_every == 0 or step == settings.steps:
-            run.checkpoint(step, loss, mean_iou(run.network, checked, settings.image_scale, run.device))
+    with enough_memory(run.device, "a smaller crop_px, batch_size or image_scale"):
+        for step, loss in run.steps(progress):
+            if step % settings.validate_every == 0 or step == settings.steps:
+                run.checkpoint(step, loss, mean_iou(run.network, checked, settings.image_scale, run.device))
     return TrainingReport(out / NETWORK, run.best[0], run.best[1], settings.steps)
 
 
@@ -176,7 +179,8 @@ class _Run:
             raise ConfigError(f"{out}: holds a training; go on with it (resume), or choose another folder")
         if (out / STATE).exists():
             self._load()
-        out.mkdir(parents=True, exist_ok=True)
+        with _writing(out):
+            out.mkdir(parents=True, exist_ok=True)
 
     def steps(self, progress: Progress) -> Iterator[tuple[int, float]]:
         """Train step by step; after each, its number and the mean loss since the last validation."""
@@ -201,7 +205,9 @@ class _Run:
         target = torch.from_numpy(truth).to(self.device).long()
         loss = cross_entropy(enlarged, target, self._weights, ignore_index=IGNORE)
         if not torch.isfinite(loss):
-            raise DataError(f"{self._out}: the loss of step {step} is not finite; lower the learning rate")
+            raise DataError(
+                f"{self._out}: the loss of step {step} is not finite; lower the learning rate, or raise the precision"
+            )
         self._scaler.scale(loss).backward()
         self._scaler.unscale_(self._optimiser)
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -220,7 +226,10 @@ class _Run:
 
     def checkpoint(self, step: int, loss: float, validation: tuple[float, NDArray[np.float64]]) -> None:
         """Keep the network if it is the best so far, then everything that resuming needs, then a row of the log."""
-        score, iou = validation
+        with _writing(self._out):
+            self._write(step, loss, *validation)
+
+    def _write(self, step: int, loss: float, score: float, iou: NDArray[np.float64]) -> None:
         if score > self.best[0]:
             self.best = score, step
             write_network(
@@ -324,6 +333,19 @@ def _to_input(pixels: NDArray[np.uint8], device: torch.device) -> Tensor:
     batch = torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2).float() / 255
     mean, std = (torch.tensor(v, device=device).reshape(3, 1, 1) for v in (MEAN, STD))
     return (batch - mean) / std
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except (
+        OSError,
+        RuntimeError,
+        SafetensorError,
+    ) as error:  # the last two are torch's and safetensors' words for it
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{out}: cannot be written ({reason}); free some space there, then resume") from None
 
 
 def _append_row(path: Path, header: list[str], row: list[object]) -> None:

@@ -15,6 +15,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.checkpoints import write_network
+from gnss_sem_map.segmentation.networks import NetworkSegmenter
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet
 from gnss_sem_map.sensor_log import Image
 
@@ -198,6 +199,15 @@ def test_grey_deep_and_empty_images_are_refused(tmp_path: Path, pixels: np.ndarr
     segment = open_segmenter(f"refinenet:{tmp_path / 'net.safetensors'}", URBAN)
     with pytest.raises(DataError, match="image 5: found"):
         segment(camera(pixels, number=5))
+
+
+def test_a_device_whose_memory_is_full_is_our_error() -> None:
+    def full(*_: Any) -> Any:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    segment = NetworkSegmenter(full, ("road",), torch.device("cpu"), (0, 0, 0), (1, 1, 1))
+    with pytest.raises(DataError, match="memory is full; try fewer images at once"):
+        segment(camera())
 
 
 def test_a_device_that_is_not_there_is_a_wrong_setting(tmp_path: Path) -> None:

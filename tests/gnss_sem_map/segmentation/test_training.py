@@ -304,3 +304,35 @@ def test_a_damaged_state_is_not_resumed(streets: Any, tmp_path: Path) -> None:
     (tmp_path / STATE).write_bytes(b"nonsense")
     with pytest.raises(DataError, match=r"state\.pt: damaged"):
         run(streets, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("in_the_way", ["", "network.safetensors.part", "state.pt.part", "log.csv"])
+def test_a_folder_that_cannot_be_written_is_named(streets: Any, tmp_path: Path, in_the_way: str) -> None:
+    out = tmp_path / "out"
+    if in_the_way:
+        (out / in_the_way).mkdir(parents=True)
+    else:
+        out.write_text("a file where the folder should be")
+    with pytest.raises(DataError, match=r"out: cannot be written"):
+        run(streets, out)
+
+
+def test_a_full_memory_is_our_error_and_says_what_helps(
+    streets: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> Any:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    monkeypatch.setattr("gnss_sem_map.segmentation.training.cross_entropy", full)
+    with pytest.raises(DataError, match="memory is full; try a smaller crop_px"):
+        run(streets, tmp_path)
+
+
+def test_a_loss_that_is_not_finite_ends_the_training(
+    streets: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = lambda logits, *_, **__: logits.sum() * torch.nan  # noqa: E731
+    monkeypatch.setattr("gnss_sem_map.segmentation.training.cross_entropy", nothing)
+    with pytest.raises(DataError, match="loss of step 1 is not finite"):
+        run(streets, tmp_path)
+    assert not (tmp_path / NETWORK).exists()

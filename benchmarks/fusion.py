@@ -131,9 +131,9 @@ def learn(drives: list[tuple[Excerpt, Drive]]) -> LabelCalibration:
     for excerpt, drive in drives:
         raw = pipeline.run(drive.log, drive.segmenter, drive.settings).raw
         counted.append(measure(drive, raw.voxels, label_files(excerpt.truth)))
-    true, scores = (np.concatenate(parts) for parts in zip(*(points for _, points in counted), strict=True))
-    streets = tuple(street for street, _ in counted)
-    return LabelCalibration(URBAN.name, URBAN.names, streets, fit_temperature(true, scores))
+    points = zip(*(points for _, points in counted), strict=True)
+    temperature = fit_temperature(*(np.concatenate(parts) for parts in points))
+    return LabelCalibration(URBAN.name, URBAN.names, tuple(street for street, _ in counted), temperature)
 
 
 def compare(excerpts: list[Excerpt], folder: Path) -> dict[str, dict[str, Score]]:

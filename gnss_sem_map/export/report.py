@@ -192,7 +192,10 @@ def _refinement(refinement: Mapping[str, Any]) -> str:
     motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
     vehicles = {f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))}
     table = _table(("step", "voxels changed", "of these"), changed) if changed else ""
-    return table + _pairs(vehicles)
+    errors = {
+        "looks that err in all views, estimated without truth": _percent(refinement.get("systematic_errors"))
+    }
+    return table + _pairs(vehicles | (errors if "systematic_errors" in refinement else {}))
 
 
 def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:

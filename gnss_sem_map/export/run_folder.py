@@ -225,6 +225,7 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
             }
             for step in report.steps
         ],
+        "systematic_errors": round(report.systematic_errors, 4),
         "objects": [asdict(thing) | {"centre": thing.centre.round(3).tolist()} for thing in report.objects],
         "tracked": [
             {

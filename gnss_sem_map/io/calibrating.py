@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
-from scipy.special import log_softmax
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, labels, tiles
@@ -22,13 +21,15 @@ from gnss_sem_map.label_calibration import CELLS, LabelCalibration, Street, cell
 from gnss_sem_map.refinement import weigh
 from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.recapture import doubted
+from gnss_sem_map.refinement.smoothing import LEAST_PROBABILITY
 from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.voxel_map import VoxelMap, keys_of
+from gnss_sem_map.voxel_map import VoxelMap, keys_of, softmax
 
 LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE = 0.5, 20.0
-Counted = tuple[NDArray[np.int64], NDArray[np.float32]]
-"""True class, and scores of its voxel, of every point that counts."""
+Counted = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
+"""Of the n points that count: true class (n,), scores of the voxel (n, c), systematic errors of its map (n,)."""
 
 
 def calibrate(
@@ -40,9 +41,9 @@ def calibrate(
     """Measure what the network's answers were worth in run folders, each given with its folder of true `.label` files.
 
     Drive and segmenter are those of the run unless given. Counted are the points that an image shows and that have a
-    true class of the map. The temperature is the one under which the untrained map's confidence fits the truth best
-    (maximum likelihood; Guo et al., "On calibration of modern neural networks", 2017). Raises DataError where
-    something is missing, or runs have different classes.
+    true class of the map. The temperature is the one under which the untrained map's confidence, with its doubt that
+    all views err alike, fits the truth best (maximum likelihood; Guo et al., "On calibration of modern neural
+    networks", 2017). Raises DataError where something is missing, or runs have different classes.
     """
     streets, counted, label_set = [], [], None
     for out, truth in runs:
@@ -59,19 +60,19 @@ def calibrate(
         counted.append(points)
     if label_set is None:
         raise DataError("calibrate: found no run folder, expected at least one")
-    true, scores = (np.concatenate(parts) for parts in zip(*counted, strict=True))
-    return LabelCalibration(label_set.name, label_set.names, tuple(streets), fit_temperature(true, scores))
+    temperature = fit_temperature(*(np.concatenate(parts) for parts in zip(*counted, strict=True)))
+    return LabelCalibration(label_set.name, label_set.names, tuple(streets), temperature)
 
 
 def measure(
     drive: Drive, voxels: VoxelMap, truths: Mapping[str, Path], progress: Progress = silent
 ) -> tuple[Street, Counted]:
-    """What one drive's labelled points say, and their scores in its untrained map.
+    """What one drive's labelled points say, and what its untrained map says of them.
 
     `voxels` is the map that the drive made; `truths` are its `.label` files by scan name.
     """
     tables, c = Tables.of(voxels.label_set), len(voxels.label_set.names)
-    scores = weigh(voxels, drive.settings.refinement).scores
+    weighed = weigh(voxels, drive.settings.refinement)
     cells = cells_of(height_over_ground(voxels.centres), flatness(voxels.keys))
     answers, found = np.zeros((c, c + 1), np.int64), np.zeros((c, CELLS[0] * CELLS[1]), np.int64)
     true_classes, rows = [], []
@@ -88,7 +89,8 @@ def measure(
             f"{drive.log.name}: no point has both a pixel and a true class; is the truth of this drive?"
         )
     row = np.concatenate(rows)
-    return Street(drive.log.name, answers, found.reshape(c, *CELLS)), (true, scores[row])
+    doubts = np.full(len(true), weighed.systematic_errors, np.float32)
+    return Street(drive.log.name, answers, found.reshape(c, *CELLS)), (true, weighed.scores[row], doubts)
 
 
 def _points(
@@ -110,12 +112,15 @@ def _points(
     return true[use], seen.labels[use].astype(np.int64), row[use]
 
 
-def fit_temperature(true: NDArray[np.int64], scores: NDArray[np.float32]) -> float:
-    """The temperature under which softmax(scores / temperature) (n, c) makes the true classes (n,) most probable."""
+def fit_temperature(
+    true: NDArray[np.int64], scores: NDArray[np.float32], doubts: NDArray[np.float32]
+) -> float:
+    """The temperature under which scores (n, c), doubted by as much (n,), make the true classes (n,) most probable."""
 
     def surprise(log_temperature: float) -> float:
-        logs = log_softmax(scores / np.float32(np.exp(log_temperature)), axis=1)
-        return -float(logs[np.arange(len(true)), true].mean(dtype=np.float64))
+        probabilities = doubted(softmax(scores / np.float32(np.exp(log_temperature))), doubts[:, None])
+        of_truth = probabilities[np.arange(len(true)), true]
+        return -float(np.log(np.maximum(of_truth, LEAST_PROBABILITY)).mean(dtype=np.float64))
 
     bounds = tuple(np.log([LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE]))
     return float(np.exp(minimize_scalar(surprise, bounds=bounds, method="bounded").x))

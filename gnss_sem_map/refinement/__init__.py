@@ -20,6 +20,7 @@ from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.recapture import doubted, systematic_errors
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
 from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
@@ -49,12 +50,19 @@ class RefinementSettings(BaseModel):
         default="evidence",
         description="Vehicles (section 3.3.2): support by object and motion by evidence, or eq. 12 and 13.",
     )
+    systematic_errors: float | None = Field(
+        default=None,
+        ge=0,
+        le=0.5,
+        description="Share of looks that err in all views alike, so that looking again makes no voxel surer;"
+        " default: estimated from the map itself, by how often geometry and neighbours overrule the images.",
+    )
     confidence_temperature: float = Field(
-        default=2.4,
+        default=1.0,
         gt=0,
         le=100,
-        description="Log scores are divided by this before confidence is read off them: networks err alike in all"
-        " views. 2.4 fits five labelled streets (research); a calibration file brings its own.",
+        description="Log scores are divided by this before confidence is read off them; a calibration file brings its"
+        " own.",
     )
     infer_unobserved: bool = Field(
         default=False,
@@ -107,6 +115,8 @@ class RefinementReport:
     objects: tuple[VehicleObject, ...] = ()
     tracked: tuple[TrackedObject, ...] = ()
     """Objects through time, with the evidence of their motion."""
+    systematic_errors: float = 0.0
+    """Share of looks that err in all views alike, as far as the map can tell."""
 
 
 def refine(
@@ -126,12 +136,12 @@ def refine(
     weighed = weigh(voxels, settings, calibration)
     scores, inferred, spread = _infer(voxels, weighed.scores, settings)
     temperature = settings.confidence_temperature if calibration is None else calibration.temperature
-    refined = _decide(voxels, scores, weighed.moving, inferred, temperature)
-    steps, objects = [*weighed.steps, spread], weighed.objects
+    refined = _decide(voxels, scores, weighed.moving, inferred, temperature, weighed.systematic_errors)
+    steps = [*weighed.steps, spread]
     if removed is not None:
         refined, layered = _with_layer(refined, removed)
         steps.append(layered)
-    return refined, RefinementReport(tuple(steps), objects, tracked)
+    return refined, RefinementReport(tuple(steps), weighed.objects, tracked, weighed.systematic_errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,19 +152,22 @@ class Weighed:
     moving: NDArray[np.bool_]
     objects: tuple[VehicleObject, ...]
     steps: tuple[Step, ...]
+    systematic_errors: float
 
 
 def weigh(
     voxels: VoxelMap, settings: RefinementSettings, calibration: LabelCalibration | None = None
 ) -> Weighed:
     """What images, heights, columns, objects and neighbours say of every voxel together."""
-    scores = _discounted(voxels, settings.count_exponent)
+    looks = _looks(voxels)
+    images = _discounted(voxels, looks, settings.count_exponent)
     heights = height_over_ground(voxels.centres)
-    scores, geometry = _weigh_heights(voxels, scores, heights, settings, calibration)
+    scores, geometry = _weigh_heights(voxels, images, heights, settings, calibration)
+    systematic = _systematic_errors(voxels, looks, images, scores, settings)
     scores, columns = _correct_columns(voxels, scores, settings)
     scores, moving, objects, judged = _judge_vehicles(voxels, scores, heights, settings)
     scores, smoothed = _smooth(voxels, scores, settings)
-    return Weighed(scores, moving, objects, (geometry, columns, judged, smoothed))
+    return Weighed(scores, moving, objects, (geometry, columns, judged, smoothed), systematic)
 
 
 def _with_layer(static: SemanticMap, removed: VoxelMap) -> tuple[SemanticMap, Step]:
@@ -164,16 +177,39 @@ def _with_layer(static: SemanticMap, removed: VoxelMap) -> tuple[SemanticMap, St
     return with_removed(static, removed), Step("moving objects", changes)
 
 
-def _discounted(voxels: VoxelMap, exponent: float) -> Scores:
-    """Evidence in nat; n looks at a voxel count as n^exponent.
+def _looks(voxels: VoxelMap) -> NDArray[np.float32]:
+    """How often every voxel was looked at (v,), about, and at least once.
 
-    A row does not say how often it was looked at (hits count the points of scans that no image shows, too), but every
-    look lowers the sum over the c classes by at least c ln c, and by little more than half as much again.
+    A row does not say (hits count the points of scans that no image shows, too), but every look lowers the sum over the
+    c classes by at least c ln c, and by little more than half as much again.
     """
-    evidence = voxels.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
     count = len(voxels.label_set.names)
-    looks = np.maximum(-evidence.sum(axis=1) / (NAT_PER_LOOK * count * np.log(count)), 1.0)
+    nats = -voxels.evidence.sum(axis=1, dtype=np.float32) / np.float32(UNITS_PER_NAT)
+    return np.asarray(np.maximum(nats / np.float32(NAT_PER_LOOK * count * np.log(count)), 1), np.float32)
+
+
+def _discounted(voxels: VoxelMap, looks: NDArray[np.float32], exponent: float) -> Scores:
+    """Evidence in nat; n looks at a voxel count as n^exponent."""
+    evidence = voxels.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
     return np.asarray(evidence * (looks ** (exponent - 1))[:, None], np.float32)
+
+
+def _systematic_errors(
+    voxels: VoxelMap,
+    looks: NDArray[np.float32],
+    images: Scores,
+    with_geometry: Scores,
+    settings: RefinementSettings,
+) -> float:
+    """What is set, or what geometry and neighbours, each for itself, say of the images."""
+    if settings.systematic_errors is not None:
+        return settings.systematic_errors
+    with_neighbours, _ = _smooth(voxels, images, settings)
+    seen = voxels.observed
+    called, by_geometry, by_neighbours = (
+        scores[seen].argmax(axis=1) for scores in (images, with_geometry, with_neighbours)
+    )
+    return systematic_errors(by_geometry != called, by_neighbours != called, looks[seen])
 
 
 def _labels(voxels: VoxelMap, scores: Scores) -> NDArray[np.int8]:
@@ -281,15 +317,16 @@ def _decide(
     moving: NDArray[np.bool_],
     inferred: NDArray[np.bool_],
     temperature: float,
+    systematic: float,
 ) -> SemanticMap:
-    """The most probable class of every voxel, and how probable it is: softmax of the scores over the temperature."""
+    """The most probable class of every voxel, and how probable it is, unless the images err in all views alike."""
     known = voxels.observed | inferred
     labels = np.where(known, scores.argmax(axis=1), UNLABELLED).astype(np.int8)
     states = np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8)
     states[labels != voxels.labels] = State.REFINED
     states[inferred] = State.INFERRED
     states[moving] = State.REMOVED
-    probabilities = softmax(scores / np.float32(temperature))
+    probabilities = doubted(softmax(scores / np.float32(temperature)), systematic)
     confidence = np.where(known, probabilities.max(axis=1, initial=0.0), 0).astype(np.float32)
     entropy = np.where(known, entropy_of(probabilities), np.log(scores.shape[1])).astype(np.float32)
     return SemanticMap(voxels, labels, confidence, states, entropy)

@@ -173,6 +173,7 @@ def test_eq_6_to_the_letter_is_one_setting_that_others_beside_it_overrule() -> N
     paper = load(None, ["fusion=paper"])
     assert paper.labelling.probability_floor == 0.01
     assert paper.refinement.count_exponent == paper.refinement.confidence_temperature == 1
+    assert paper.refinement.systematic_errors == 0
     assert paper.refinement.geometry == paper.refinement.smoothing == "off"
     assert paper.refinement.vehicles == Settings().refinement.vehicles
     both = load(None, ["refinement.smoothing=mean_field", "fusion=paper", "labelling.abstain=true"])

@@ -31,6 +31,7 @@ RUN: dict[str, Any] = {
                 {"name": "vehicles", "voxels_changed": 12, "changes": {"vehicle to road": 12}, "skipped": ""}
             ],
             "objects": [{"motion": "moving"}, {"motion": "static"}, {"motion": "moving"}],
+            "systematic_errors": 0.1042,
         },
     },
     "versions": {"numpy": "2.4.6", "numba": None},
@@ -106,6 +107,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
         ["all", "31,102", "29,724", "90.0 %", "81.2 %", "90.0 %", "85.7 %"],
         ["vehicles", "12", "vehicle to road: 12"],
         ["vehicles, moving", "2"],
+        ["looks that err in all views, estimated without truth", "10.4 %"],
         ["chi2 per dof", "1.031"],
         ["p imu antenna (m)", "0, -0.32, 0.5"],
         ["absolute trajectory error (m)", "0.1235"],

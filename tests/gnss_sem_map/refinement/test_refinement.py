@@ -81,7 +81,6 @@ def test_refinement_with_everything_off_is_the_map_as_fusion_left_it():
         vehicles="off",
         smoothing="off",
         count_exponent=1.0,
-        confidence_temperature=1.0,
     )
     refined, report = refine(voxels, off)
     plain = SemanticMap.of(voxels)

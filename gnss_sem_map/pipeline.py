@@ -23,7 +23,7 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
-from gnss_sem_map.camera_check import check_projection
+from gnss_sem_map.camera_check import check_projection, check_stamps
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import build_maps
@@ -102,10 +102,11 @@ def run(
 
 
 def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
-    """Say before hours are spent what cannot end well: a calibration file of other classes, a camera turned away."""
+    """Say before hours are spent what cannot end well: calibrated for other classes, a camera or a clock elsewhere."""
     label_calibration.opened(settings.calibration, labels.label_set(settings.classes))
     if segmenter is not None and log.images and log.calibration.has_camera:
         check_projection(log)
+        check_stamps(log, settings.labelling.image_within_s)
 
 
 def _without_moving(

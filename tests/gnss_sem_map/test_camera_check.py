@@ -109,10 +109,13 @@ def test_a_drive_without_images_or_with_too_few_says_so(town: Case) -> None:
         check_camera(replace(log, images=log.images[:3]), trajectory)
 
 
-def test_stamps_that_do_not_overlap_say_so(town: Case, tmp_path: Path) -> None:
+def test_stamps_that_do_not_overlap_say_so(town: Case) -> None:
     log, trajectory = town
     with pytest.raises(DataError, match="no image near its stamp"):
         check_camera(late(log, 1000.0), trajectory)
+    for by_s in (1000.0, -1000.0):
+        with pytest.raises(DataError, match="Are their clocks the same"):
+            pipeline.run(late(log, by_s), lambda image: None, Settings())
 
 
 @pytest.mark.slow

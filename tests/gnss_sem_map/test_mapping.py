@@ -50,6 +50,23 @@ def assert_same(a: VoxelMap, b: VoxelMap) -> None:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
+def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
+    drive: Drive, at_once: tuple[Maps, Account]
+) -> None:
+    """All images but two: the map is that of the others' labels, with every point in it."""
+    kept, account = drive.log.images[3:5], Account()
+    found = build_maps(replace(drive, log=replace(drive.log, images=kept)), account).static
+    np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
+    np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
+    shown = [scan for scan in drive.log.scans if scan.number in [image.number for image in kept]]
+    few = build_maps(replace(drive, log=replace(drive.log, scans=tuple(shown))), Account()).static
+    places = found.places(few.keys)
+    np.testing.assert_array_equal(found.evidence[places], few.evidence)
+    assert found.observed.sum() == few.observed.sum() > 0
+    reasons = [(skip.what, skip.reason) for skip in account.skips]
+    assert reasons == [("labels", "no image near its stamp")] * (len(drive.log.scans) - 2)
+
+
 @pytest.mark.parametrize(("chunk", "workers"), [(1, 1), (5, 1), (100, 1), (5, 2)])
 def test_chunks_and_processes_give_the_same_map_and_account(
     drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, chunk: int, workers: int

@@ -41,9 +41,10 @@ from gnss_sem_map.labelling import ClassImage, class_image
 from gnss_sem_map.mapping import STATIC, Drive, fuse_scans, map_chunks
 from gnss_sem_map.seen_scans import SeenScan
 from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.segmentation.probabilities import KeepsLabels
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.voxel_kernels import _prefetch
-from gnss_sem_map.voxel_map import SemanticMap, VoxelTable, keys_of
+from gnss_sem_map.voxel_map import SemanticMap, VoxelTable
 
 SETTINGS = Settings()
 SIZE = SETTINGS.mapping.voxel_size_m
@@ -90,7 +91,8 @@ def image_of(job: Drive, scan: Scan) -> tuple[Image, ClassImage]:
     assert image is not None
     assert job.segmenter is not None
     assert job.log.calibration.image_size is not None
-    seen = job.segmenter(image)
+    look = job.segmenter.kept if isinstance(job.segmenter, KeepsLabels) else job.segmenter
+    seen = look(image)
     return image, class_image(seen, job.segmenter.class_names, URBAN, job.log.calibration.image_size, "")
 
 
@@ -103,21 +105,21 @@ def whole_chain(job: Drive) -> Figures:
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
         seen = seen_scans._see(job, scan, scan.read(), (image, classes), Account())
         assert seen is not None
-        table.add(table.keys_of(seen.p_map), seen.pixels, seen.classes)
+        table.add(seen.keys, seen.pixels, seen.classes)
 
-    def in_numpy(scan: Scan, image: Image, classes: ClassImage) -> None:
+    def in_numpy(scan: Scan, image: Image, classes: ClassImage, rows: NDArray[np.uint8]) -> None:
         p_map = numpy_chain.points_in_map(
             scan.read(), scan.stamp, job.trajectory, log.calibration.T_imu_lidar, SETTINGS.mapping
         )
         pixels = numpy_chain.pixels_seen(
             p_map, image, job.trajectory, log.calibration, classes, SETTINGS.labelling
         )
-        plain.add(numpy_chain.keys_of(p_map, SIZE), pixels, classes.rows)
+        plain.add(numpy_chain.keys_of(p_map, SIZE), pixels, rows)
 
     for scan in log.scans:
         image, classes = race.run("decode", lambda scan=scan: image_of(job, scan))
         race.run("ours", lambda a=(scan, image, classes): compiled(*a))
-        race.run("numpy", lambda a=(scan, image, classes): in_numpy(*a))
+        race.run("numpy", lambda a=(scan, image, classes, classes.rows): in_numpy(*a))
         points += len(scan.read().xyz)
     fused, oracle = table.to_map(), plain.to_map()
     same = all(np.array_equal(getattr(fused, n), getattr(oracle, n)) for n in ("keys", "evidence", "hits"))
@@ -150,8 +152,8 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
     race, missing = Race(), []
     table, bare = VoxelTable(SIZE, URBAN), VoxelTable(SIZE, URBAN)
     contestants: dict[str, Callable[[SeenScan, Points], Any]] = {
-        "ours, classes": lambda s, p: table.add(keys_of(_moved(job, s, p), SIZE), s.pixels, s.classes),
-        "ours, no classes": lambda s, p: bare.add(keys_of(_moved(job, s, p), SIZE)),
+        "ours, classes": lambda s, p: table.add(_keys(job, s, p), s.pixels, s.classes),
+        "ours, no classes": lambda s, p: bare.add(_keys(job, s, p)),
     }
     for name, build in (("open3d HashSet + numpy", _open3d), ("kiss-icp VoxelHashMap", _kiss_icp)):
         try:
@@ -173,8 +175,10 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
     }, missing  # fmt: skip
 
 
-def _moved(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.float64]:
-    return seen_scans.map_points(points, seen.scan, job.trajectory, job.log, SETTINGS.mapping)[0]
+def _keys(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.int64]:
+    placed = seen_scans._see(job, seen.scan, points, None, Account())
+    assert placed is not None
+    return placed.keys
 
 
 def _pose(job: Drive, seen: SeenScan) -> NDArray[np.float64]:
@@ -221,7 +225,7 @@ def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
     """Ten scans at once, all in memory, keys and log-likelihoods ready: who groups fastest."""
     race, missing, seen = Race(), [], seen[:10]
     logs = numpy_chain.log_table(5, 5)
-    keys = np.concatenate([keys_of(s.p_map, SIZE) for s in seen])
+    keys = np.concatenate([s.keys for s in seen])
     looks = np.zeros((len(keys), 5), np.int32)
     pixels = np.concatenate([s.pixels for s in seen])
     looks[pixels >= 0] = np.concatenate([numpy_chain.log_likelihoods(s.classes, logs, 5) for s in seen])
@@ -230,7 +234,7 @@ def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
         **{f"e{c}": looks[:, c].copy() for c in range(5)},
         "hits": np.ones(len(keys), np.uint32),
     }
-    parts = [(keys_of(s.p_map, SIZE), s.pixels, s.classes) for s in seen]
+    parts = [(s.keys, s.pixels, s.classes) for s in seen]
 
     def ours() -> int:
         table = VoxelTable(SIZE, URBAN)
@@ -280,12 +284,13 @@ def _polars(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
 
 
 @njit(cache=True, nogil=True)
-def _touch(rows: Any, ints: Any, places: Any) -> None:
-    """The least that fusing a point can cost: fetch a row, add to it."""
+def _touch(rows: Any, ints: Any, places: Any, nothing: Any) -> None:
+    """The least that fusing a point into any voxel can cost: fetch its row, add to all of its 32 bytes."""
     for i in range(len(places)):
         if i + 16 < len(places):
             _prefetch(rows, places[i + 16])
-        ints[places[i], 7] += 1
+        for c in range(8):
+            ints[places[i], c] += nothing[c]
 
 
 def over_the_floor(seen: list[SeenScan], voxels: int) -> Figures:
@@ -294,17 +299,17 @@ def over_the_floor(seen: list[SeenScan], voxels: int) -> Figures:
     while len(table) < voxels:  # surface voxels far from the scans
         indices = rng.integers(-(1 << 19), 1 << 19, (min(1_000_000, voxels - len(table)), 3))
         table.add(numpy_chain.pack(indices * (1, 1, 0) + (1 << 19, 0, 0)))
-    keys = [keys_of(s.p_map, SIZE) for s in seen]
+    keys = [s.keys for s in seen]
     for part, s in zip(keys, seen, strict=True):
         table.add(part, s.pixels, s.classes)
     shuffled = [rng.permutation(part) for part in keys]
     places = [rng.integers(0, len(table._rows), len(part)) for part in keys]
-    race = Race()
+    race, nothing = Race(), np.zeros(8, np.int32)
     for i, s in enumerate(seen):
         race.run("drive order, looks", lambda i=i, s=s: table.add(keys[i], s.pixels, s.classes))
         race.run("drive order", lambda i=i: table.add(keys[i]))
         race.run("random order", lambda i=i: table.add(shuffled[i]))
-        race.run("floor", lambda i=i: _touch(table._rows, table._rows.view(np.int32), places[i]))
+        race.run("floor", lambda i=i: _touch(table._rows, table._rows.view(np.int32), places[i], nothing))
     n = np.median([len(part) for part in keys])
     s_ = {name: 1e9 * value / n for name, value in race.medians().items()}
     return {

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import voxel_kernels
+from gnss_sem_map import scan_kernels
 from gnss_sem_map.deskew import EXTRAPOLATE_S
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.segmentation.probabilities import LabelImage
 from gnss_sem_map.sensor_log import Calibration, Image
 
 NEAREST_DEPTH_M = 0.5
@@ -55,28 +56,61 @@ class LabellingSettings(BaseModel):
 class ClassImage:
     """What a network saw in one image, in the map's classes."""
 
-    probabilities: NDArray[np.uint8]
-    """(h, w, c + 1), round(255 p); `other` last."""
+    seen: NDArray[np.uint8] | LabelImage
+    """(h, w, c + 1), round(255 p); `other` last. Or a label image of the same classes."""
     shrink: int
     """Camera pixels per pixel of this image, along each axis."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        image = self.seen.ids if isinstance(self.seen, LabelImage) else self.seen
+        return image.shape[0], image.shape[1]
+
+    @property
+    def probabilities(self) -> NDArray[np.uint8]:
+        """(h, w, c + 1) of every pixel."""
+        return self.seen.probabilities if isinstance(self.seen, LabelImage) else self.seen
 
     @property
     def rows(self) -> NDArray[np.uint8]:
         """The same pixels as one list, (h w, c + 1)."""
         return self.probabilities.reshape(-1, self.probabilities.shape[2])
 
-    def seen(self, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The probabilities (m, c + 1) of the pixels that some point saw; renumbers `pixels` (n,) to rows of these.
-
-        However the image lies in memory, only what is needed is touched.
-        """
-        classes = np.empty((np.count_nonzero(pixels >= 0), self.probabilities.shape[2]), np.uint8)
-        voxel_kernels.gather(self.probabilities, pixels, classes)
+    def at(self, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The probabilities (m, c + 1) of some pixels of that list: however the image lies in memory, only these."""
+        if isinstance(self.seen, LabelImage):
+            return np.take(self.seen.table, np.take(self.seen.ids, pixels), axis=0)
+        classes = np.empty((len(pixels), self.seen.shape[2]), np.uint8)
+        scan_kernels.gather(self.seen, pixels, classes)
         return classes
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """The image's camera at the moment of exposure, and room for what falls into it: see `scan_kernels.project`."""
+
+    P: NDArray[np.float64]
+    """(3, 4), from the map to pixels."""
+    inside: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]
+    """Points, columns, lines, depths: (n,) each, of which the first few are filled."""
+    nearest: NDArray[np.float32]
+    """(h, w) m; empty where there is no image."""
+
+
+def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int) -> View:
+    """Room for the `n` points of a scan in an image of (width, height)."""
+    points, columns, lines = (np.empty(n, np.int32) for _ in range(3))
+    nearest = np.full(size[::-1], np.inf, np.float32)
+    return View(P, (points, columns, lines, np.empty(n, np.float32)), nearest)
+
+
+NO_VIEW = view_of(np.zeros((3, 4)), (0, 0), 0)
+"""Where there is no image."""
+
+
 def class_image(
-    probabilities: NDArray[np.uint8] | NDArray[np.floating],
+    probabilities: NDArray[np.uint8] | NDArray[np.floating] | LabelImage,
     class_names: tuple[str, ...],
     label_set: LabelSet,
     image_size: tuple[int, int],
@@ -87,6 +121,8 @@ def class_image(
     `probabilities` (h, w, s): uint8 as round(255 p), or floating in 0..1; (h, w) the camera image's size or that size
     divided by an integer and rounded down. Raises DataError for another size, ConfigError for an unknown class name.
     """
+    if isinstance(probabilities, LabelImage):
+        return ClassImage(probabilities, _shrink(probabilities.ids.shape, image_size, where))
     if probabilities.ndim != 3 or probabilities.shape[2] != len(class_names):
         raise DataError(
             f"{where}: found shape {probabilities.shape}, expected (h, w, {len(class_names)}) for {list(class_names)}"
@@ -120,6 +156,36 @@ def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSe
     return image.stamp + (calibration.camera_time_offset_s if offset is None else offset)
 
 
+def view_at(stamp: float, trajectory: Trajectory, calibration: Calibration, n: int) -> View:
+    """The camera at the moment `stamp`, with room for `n` points; raises DataError when the drive has none."""
+    if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
+        raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
+    T_map_imu = trajectory.at(np.array([stamp]), EXTRAPOLATE_S)[0]
+    T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
+    return view_of(np.ascontiguousarray(calibration.K @ T_camera_map[:3]), calibration.image_size, n)
+
+
+def visible(
+    view: View, inside: int, classes: ClassImage, settings: LabellingSettings
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Of the `inside` points in the image those that are not hidden (p,), and the pixel of `classes` that each saw.
+
+    A point is hidden when another one of the same scan, in a window around its pixel that fits the LiDAR's spacing, is
+    nearer by more than the tolerance (real data: 7 x 5 px, 5 % + 0.3 m; the exact pixel alone hides nothing, for the
+    LiDAR is sparser than the image).
+    """
+    (height, width), (class_height, class_width) = view.nearest.shape, classes.size
+    points, columns, lines, depths = (part[:inside] for part in view.inside)
+    pixels = np.empty(inside, np.int32)
+    kept = scan_kernels.visible(
+        points, columns, lines, depths, view.nearest,
+        settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
+        np.minimum(np.arange(height) // classes.shrink, class_height - 1),
+        np.minimum(np.arange(width) // classes.shrink, class_width - 1), class_width, pixels,
+    )  # fmt: skip
+    return points[:kept], pixels[:kept]
+
+
 def pixels_seen(
     p_map: NDArray[np.float64],
     stamp: float,
@@ -128,29 +194,13 @@ def pixels_seen(
     classes: ClassImage,
     settings: LabellingSettings,
 ) -> NDArray[np.int32]:
-    """For every map point (n, 3) the row of `classes.rows` that it was seen in at `stamp`, or -1.
-
-    A point is hidden when another one of the same scan, in a window around its pixel that fits the LiDAR's spacing, is
-    nearer by more than the tolerance (real data: 7 x 5 px, 5 % + 0.3 m; the exact pixel alone hides nothing, for the
-    LiDAR is sparser than the image).
-    """
-    if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
-        raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
-    T_map_imu = trajectory.at(np.array([stamp]), EXTRAPOLATE_S)[0]
-    T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
-    width, height = calibration.image_size
-    n = len(p_map)
-    u, v = np.empty(n, np.int32), np.empty(n, np.int32)
-    depth, nearest = np.empty(n, np.float32), np.empty((height, width), np.float32)
-    voxel_kernels.project(
-        p_map, np.ascontiguousarray(calibration.K @ T_camera_map[:3]), NEAREST_DEPTH_M,
-        settings.occlusion_columns_px // 2, u, v, depth, nearest,
-    )  # fmt: skip
-    pixels = np.empty(n, np.int32)
-    class_height, class_width = classes.probabilities.shape[:2]
-    voxel_kernels.visible(
-        u, v, depth, nearest, settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
-        np.minimum(np.arange(height) // classes.shrink, class_height - 1),
-        np.minimum(np.arange(width) // classes.shrink, class_width - 1), class_width, pixels,
-    )  # fmt: skip
+    """For every map point (n, 3) the row of `classes.rows` that it was seen in at `stamp`, or -1: see `visible`."""
+    view = view_at(stamp, trajectory, calibration, len(p_map))
+    x, y, z = np.ascontiguousarray(p_map.T)
+    inside = scan_kernels.project(
+        x, y, z, 0, view.P, NEAREST_DEPTH_M, settings.occlusion_columns_px // 2, *view.inside, 0, view.nearest
+    )
+    points, seen = visible(view, inside, classes, settings)
+    pixels = np.full(len(p_map), -1, np.int32)
+    pixels[points] = seen
     return pixels

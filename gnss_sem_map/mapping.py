@@ -135,7 +135,7 @@ def fuse_scans(
     static, removed = _table(settings), _table(settings)
     for done, seen in enumerate(look_at(drive, scans, account)):
         if seen is not None:
-            keys = static.keys_of(seen.p_map)
+            keys = seen.keys
             moved = np.zeros(len(keys), np.bool_)
             if drive.moving is not None:
                 moved[drive.moving.get(seen.scan.number, [])] = True

@@ -16,15 +16,24 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import labels
+from gnss_sem_map import labels, scan_kernels
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.deskew import usable_points_in_map
+from gnss_sem_map.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labelling import ClassImage, class_image, exposure_stamp, pixels_seen
+from gnss_sem_map.labelling import (
+    NEAREST_DEPTH_M,
+    NO_VIEW,
+    ClassImage,
+    class_image,
+    exposure_stamp,
+    view_at,
+    visible,
+)
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
+from gnss_sem_map.segmentation.probabilities import KeepsLabels
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
-from gnss_sem_map.voxel_map import MappingSettings
+from gnss_sem_map.voxel_map import MappingSettings, keys_of
 
 READ_AHEAD = 4
 
@@ -50,15 +59,24 @@ class Drive:
 class SeenScan:
     """The usable points of one scan (m of n), in the map, with what its image shows of them."""
 
+    drive: Drive
     scan: Scan
-    p_map: NDArray[np.float64]
-    """(m, 3) m."""
+    points: Points
+    """All n."""
     valid: NDArray[np.bool_]
-    """(n,) which of the scan's points those are."""
+    """(n,) which of them are used."""
+    keys: NDArray[np.int64]
+    """(m,) the voxel of each."""
     pixels: NDArray[np.int32]
     """(m,) row of `classes` that each point saw, -1 for none."""
     classes: NDArray[np.uint8]
     """(p, c + 1) class probabilities, `other` last."""
+
+    @cached_property
+    def p_map(self) -> NDArray[np.float64]:
+        """(m, 3) m, where each is: found when it is asked for, for the map needs no more than the voxel."""
+        drive = self.drive
+        return map_points(self.points, self.scan, drive.trajectory, drive.log, drive.settings.mapping)[0]
 
     @property
     def labels(self) -> NDArray[np.int8]:
@@ -83,26 +101,42 @@ def look_at(drive: Drive, scans: Sequence[Scan], account: Account) -> Iterator[S
 def _see(
     drive: Drive, scan: Scan, points: Points, image: tuple[Image, ClassImage] | None, account: Account
 ) -> SeenScan | None:
-    log, settings = drive.log, drive.settings
+    """Everything between reading a scan and fusing it, in one pass over its points."""
+    log, n = drive.log, len(points.xyz)
+    mapping, labelling = drive.settings.mapping, drive.settings.labelling
+    view, valid, keys = NO_VIEW, np.zeros(n, np.bool_), np.empty(n, np.int64)
     try:
-        p_map, valid = map_points(points, scan, drive.trajectory, log, settings.mapping)
+        stamps, knots = knots_of(
+            points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
+        )  # fmt: skip
+        if image is not None:
+            exposed = exposure_stamp(image[0], log.calibration, labelling)
+            view = view_at(exposed, drive.trajectory, log.calibration, n)
     except MeasurementError as error:
         account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         return None
-    if len(p_map) == 0:
-        account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {len(valid)}"))
+    count, inside = scan_kernels.place(
+        points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
+        mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
+        valid, keys, *view.inside, view.nearest,
+    )  # fmt: skip
+    if count == 0:
+        account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
         return None
-    pixels = np.full(len(p_map), -1, np.int32)
+    pixels = np.full(count, -1, np.int32)
     classes = np.empty((0, len(drive.label_set.names) + 1), np.uint8)
     if image is not None:
-        stamp = exposure_stamp(image[0], log.calibration, settings.labelling)
-        pixels = pixels_seen(p_map, stamp, drive.trajectory, log.calibration, image[1], settings.labelling)
-        classes = image[1].seen(pixels)
+        looking, seen = visible(view, inside, image[1], labelling)
+        classes = image[1].at(seen)
+        pixels[looking] = np.arange(len(looking))
     account.counts["scans"] += 1
-    account.counts["points"] += len(valid)
-    account.counts["points left out"] += len(valid) - len(p_map)
+    account.counts["points"] += n
+    account.counts["points left out"] += n - count
     account.counts["points labelled"] += len(classes)
-    return SeenScan(scan, p_map, valid, pixels, classes)
+    seen_scan = SeenScan(drive, scan, points, valid, keys[:count], pixels, classes)
+    if not seen_scan.keys.all():
+        keys_of(seen_scan.p_map, mapping.voxel_size_m)  # says which point it is
+    return seen_scan
 
 
 def map_points(
@@ -139,11 +173,9 @@ class _Look:
             return points, None
         try:
             where = f"labels of image {image.number}"
-            seen = self._segmenter(image)
-            return points, (
-                image,
-                class_image(seen, self._segmenter.class_names, self._label_set, size, where),
-            )
+            look = self._segmenter.kept if isinstance(self._segmenter, KeepsLabels) else self._segmenter
+            names = self._segmenter.class_names
+            return points, (image, class_image(look(image), names, self._label_set, size, where))
         except MissingLabels as error:
             self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None

@@ -42,6 +42,19 @@ class Points:
         if self.stamps is not None and self.stamps.shape != (n,):
             raise DataError(f"points: found {self.stamps.shape} stamps for {n} points, expected one each")
 
+    @cached_property
+    def rows(self) -> NDArray[np.float32]:
+        """(4 n,) x, y, z in m and intensity, point after point: the file's own memory where it was read like that."""
+        base = self.xyz.base
+        if (
+            base is not None
+            and base.shape == (len(self.xyz), 4)
+            and base.flags.c_contiguous
+            and base.ctypes.data == self.xyz.ctypes.data
+        ):
+            return base.reshape(-1)
+        return np.column_stack([self.xyz, self.intensity]).astype(np.float32, copy=False).reshape(-1)
+
     def __getitem__(self, selection: NDArray[np.bool_]) -> Points:
         """The points where a boolean mask (n,) holds."""
         stamps = None if self.stamps is None else self.stamps[selection]

@@ -1,4 +1,4 @@
-"""The few compiled loops that carry the load: every point of every scan passes through them.
+"""The compiled loops over voxels: every point of every scan passes through them.
 
 All are module-level (numba caches those only), release the GIL, and are exact: sums are integers, minima do not
 depend on order, so any order of scans and any number of threads give the same bits. The readable twin of each is
@@ -74,20 +74,21 @@ def _find_or_insert(rows, key):
     return slot
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def pack_key(x, y, z, voxel_size_m):
+    """Key of the voxel that holds a point, or 0 for one that is NaN or beyond the addressable volume."""
+    i = np.floor(x / voxel_size_m) + AXIS_OFFSET
+    j = np.floor(y / voxel_size_m) + AXIS_OFFSET
+    k = np.floor(z / voxel_size_m) + AXIS_OFFSET
+    inside = (i >= 0) & (j >= 0) & (k >= 0) & (i <= AXIS_MASK) & (j <= AXIS_MASK) & (k <= AXIS_MASK)
+    return int64(i) << 2 * AXIS_BITS | int64(j) << AXIS_BITS | int64(k) if inside else int64(0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def pack_keys(p_map, voxel_size_m, keys):
-    """Voxel key of every point; returns the first point that is NaN or beyond the addressable volume, or -1."""
+    """Key of every point (n, 3)."""
     for i in range(len(p_map)):
-        key = int64(0)
-        for axis in range(3):
-            index = np.floor(p_map[i, axis] / voxel_size_m)
-            if not (-AXIS_OFFSET <= index < AXIS_OFFSET):
-                return i
-            key = key << AXIS_BITS | (int64(index) + AXIS_OFFSET)
-        if key == 0:
-            return i
-        keys[i] = key
-    return -1
+        keys[i] = pack_key(p_map[i, 0], p_map[i, 1], p_map[i, 2], voxel_size_m)
 
 
 @njit(cache=True, nogil=True)
@@ -96,56 +97,86 @@ def fuse(
 ):  # fmt: skip
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
-    `pixels[i]` is the row of `classes` (p, c + 1; uint8 probabilities, `other` last) that point i saw, or -1. The
-    classes of the map are renormalised without `other`, floored, and renormalised again, all in integers:
-    q = max(100 p, floor sum(p)); ln(q / sum(q)) by table. `answers` (c + 1, c), or (0, c) for none, is added for what
-    is most probable in the pixel, `other` included; with `abstain` a pixel that is most probably `other` says nothing.
-    Returns the number of voxels and the first point that is not in yet, or -1 - i for a point i whose voxel overflows.
+    `pixels[i]` is the row of `classes` (p, c + 1; uint8 probabilities, `other` last) that point i saw, or -1; for the
+    rest see `_add_look`. Returns the number of voxels and the first point that is not in yet, or -1 - i for a point i
+    whose voxel overflows.
     """
-    n, number_of_classes, size = len(keys), classes.shape[1] - 1, len(rows)
-    hits_column = FIRST_SUM + number_of_classes
-    for i in range(start, n):
-        if i + PREFETCH_AHEAD < n:
-            _prefetch(rows, _home(keys[i + PREFETCH_AHEAD], size))
-        slot = _find_or_insert(rows, keys[i])
+    hits = FIRST_SUM + classes.shape[1] - 1
+    starts = _run_starts(keys, start)
+    runs = len(starts) - 1
+    for run in range(runs):
+        if run + PREFETCH_AHEAD < runs:
+            _prefetch(rows, _home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
+        first, end = starts[run], starts[run + 1]
+        slot = _find_or_insert(rows, keys[first])
         if rows[slot, 0] == 0:
             if count == capacity:
-                return count, i
-            rows[slot, 0] = keys[i]
+                return count, first
+            rows[slot, 0] = keys[first]
             count += 1
-        if ints[slot, hits_column] == HITS_LIMIT:
-            return count, -1 - i
-        ints[slot, hits_column] += 1
-        pixel = pixels[i]
-        if pixel < 0:
-            continue
-        total = int64(0)
-        for c in range(number_of_classes):
-            total += classes[pixel, c]
-        if len(answers) > 0 or abstain:
-            answer = 0
-            for c in range(1, number_of_classes + 1):
-                if classes[pixel, c] > classes[pixel, answer]:
-                    answer = c
-            if classes[pixel, answer] == 0 or (abstain and answer == number_of_classes):
-                continue
-            if len(answers) > 0:
-                for c in range(number_of_classes):
-                    ints[slot, FIRST_SUM + c] += answers[answer, c]
-                    if ints[slot, FIRST_SUM + c] < -EVIDENCE_LIMIT:
-                        return count, -1 - i
-        if total == 0:
-            continue
+        if ints[slot, hits] > HITS_LIMIT - (end - first):
+            return count, -1 - first
+        ints[slot, hits] += end - first
+        for i in range(first, end):
+            if pixels[i] >= 0 and not _add_look(
+                ints[slot], classes[pixels[i]], log_table, log_percent, floor_percent, answers, abstain
+            ):
+                return count, -1 - i
+    return count, len(keys)
+
+
+@njit(cache=True, nogil=True)
+def _run_starts(keys, start):
+    """Where each run of points in one voxel starts, and where the last one ends.
+
+    Neighbours in a scan are neighbours in the world: a run is three points long, so a scan asks the table for a third
+    of its points.
+    """
+    starts = np.empty(len(keys) - start + 1, np.int64)
+    runs, previous = 0, int64(0)
+    for i in range(start, len(keys)):
+        starts[runs] = i  # kept only if a run starts here: cheaper than a branch that cannot be foreseen
+        runs += keys[i] != previous
+        previous = keys[i]
+    starts[runs] = len(keys)
+    return starts[: runs + 1]
+
+
+@njit(cache=True, nogil=True)
+def _add_look(ints, seen, log_table, log_percent, floor_percent, answers, abstain):
+    """Add to a voxel's sums what one point saw there; returns whether they are still inside their bounds.
+
+    `seen` (c + 1,): the classes of the map are renormalised without `other`, floored, and renormalised again, all in
+    integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table. `answers` (c + 1, c), or (0, c) for none, is added
+    for what is most probable in the pixel, `other` included; with `abstain` a pixel that is most probably `other` says
+    nothing.
+    """
+    number_of_classes = len(seen) - 1
+    total = int64(0)
+    for c in range(number_of_classes):
+        total += seen[c]
+    lowest = int64(0)
+    if len(answers) > 0 or abstain:
+        answer = 0
+        for c in range(1, number_of_classes + 1):
+            if seen[c] > seen[answer]:
+                answer = c
+        if seen[answer] == 0 or (abstain and answer == number_of_classes):
+            return True
+        if len(answers) > 0:
+            for c in range(number_of_classes):
+                ints[FIRST_SUM + c] += answers[answer, c]
+                lowest = min(lowest, int64(ints[FIRST_SUM + c]))
+    if total > 0:
         floor = floor_percent * total
         denominator = int64(0)
         for c in range(number_of_classes):
-            denominator += max(100 * int64(classes[pixel, c]), floor)
+            denominator += max(100 * int64(seen[c]), floor)
         log_floor, log_sum = log_table[floor], log_table[denominator]
         for c in range(number_of_classes):
-            ints[slot, FIRST_SUM + c] += max(log_percent[classes[pixel, c]], log_floor) - log_sum
-            if ints[slot, FIRST_SUM + c] < -EVIDENCE_LIMIT:
-                return count, -1 - i
-    return count, n
+            ints[FIRST_SUM + c] += max(log_percent[seen[c]], log_floor) - log_sum
+            lowest = min(lowest, int64(ints[FIRST_SUM + c]))
+    return lowest >= -EVIDENCE_LIMIT
 
 
 @njit(cache=True, nogil=True)
@@ -179,106 +210,6 @@ def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence
             evidence[to, c] = nats
         a, b, to = a + from_a, b + from_b, to + 1
     return to
-
-
-@njit(cache=True, nogil=True)
-def usable(xyz, stamps, nearest_m, farthest_m, valid):
-    """Mark the points that are finite and in range; returns how many, and their first and last stamp."""
-    nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
-    count, first, last = 0, np.inf, -np.inf
-    for i in range(len(xyz)):
-        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        square = x * x + y * y + z * z
-        valid[i] = nearest <= square <= farthest
-        count += valid[i]
-    for i in range(len(stamps)):
-        if valid[i]:
-            first, last = min(first, stamps[i]), max(last, stamps[i])
-    return count, first, last
-
-
-@njit(cache=True, nogil=True)
-def transform_along(xyz, stamps, valid, first_stamp, step_s, poses, p_map):
-    """Move every valid point with the pose at its own stamp, blended linearly between close poses.
-
-    `poses` (k, 3, 8) are transforms (3, 4) and, beside each, what the next one adds. Without stamps (empty) every
-    point moves with the first. `p_map` takes the valid points one after another.
-    """
-    last, per_step = len(poses) - 1, 1.0 / step_s
-    k, part, to = uint64(0), 0.0, 0
-    for i in range(len(xyz)):
-        if not valid[i]:
-            continue
-        if len(stamps) > 0:
-            place = (stamps[i] - first_stamp) * per_step
-            k = uint64(min(max(int64(place), 0), last))
-            part = place - k
-        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        for r in range(3):
-            here = poses[k, r, 0] * x + poses[k, r, 1] * y + poses[k, r, 2] * z + poses[k, r, 3]
-            ahead = poses[k, r, 4] * x + poses[k, r, 5] * y + poses[k, r, 6] * z + poses[k, r, 7]
-            p_map[to, r] = here + part * ahead
-        to += 1
-
-
-@njit(cache=True, nogil=True)
-def project(p_map, P, nearest_m, half_columns, u, v, depth, nearest):
-    """Pixel and depth of every point (eq. 3, 4), u = -1 outside; `nearest` (h, w) keeps the nearest depth beside it.
-
-    A pixel reaches from its number to the next. That numbers are centres in KITTI's calibration would move points by
-    half a pixel, which a real network's labels do not tell apart (accuracy 80.22 and 80.20 %).
-    A point writes into its own row only, `half_columns` to either side; `visible` looks along the columns. Together
-    they are a window, at the price of its edges.
-    """
-    height, width = nearest.shape
-    nearest[:, :] = np.inf
-    for i in range(len(p_map)):
-        u[i] = -1
-        w = P[2, 0] * p_map[i, 0] + P[2, 1] * p_map[i, 1] + P[2, 2] * p_map[i, 2] + P[2, 3]
-        if not w > nearest_m:
-            continue
-        x = (P[0, 0] * p_map[i, 0] + P[0, 1] * p_map[i, 1] + P[0, 2] * p_map[i, 2] + P[0, 3]) / w
-        y = (P[1, 0] * p_map[i, 0] + P[1, 1] * p_map[i, 1] + P[1, 2] * p_map[i, 2] + P[1, 3]) / w
-        column, row = int64(np.floor(x)), int64(np.floor(y))
-        if column < 0 or column >= width or row < 0 or row >= height:
-            continue
-        u[i], v[i], depth[i] = column, row, w
-        for c in range(max(column - half_columns, 0), min(column + half_columns + 1, width)):
-            nearest[row, c] = min(nearest[row, c], depth[i])
-
-
-@njit(cache=True, nogil=True)
-def visible(u, v, depth, nearest, half_rows, ratio, slack_m, row_of, column_of, class_width, pixels):
-    """Row of the class image that each point sees, -1 outside or where something nearer hides it; returns how many.
-
-    `row_of` (h,) and `column_of` (w,) say where a camera pixel lies in the class image: a division costs more.
-    """
-    height, count = len(nearest), 0
-    for i in range(len(u)):
-        pixels[i] = -1
-        if u[i] < 0:
-            continue
-        closest = depth[i]
-        for r in range(max(v[i] - half_rows, 0), min(v[i] + half_rows + 1, height)):
-            closest = min(closest, nearest[r, u[i]])
-        if depth[i] <= (1.0 + ratio) * closest + slack_m:
-            pixels[i] = row_of[v[i]] * class_width + column_of[u[i]]
-            count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
-def gather(probabilities, pixels, classes):
-    """Copy the class probabilities (h, w, c + 1) of the pixels that are seen, and number those points by their copy."""
-    width, to = np.uint32(probabilities.shape[1]), 0
-    for i in range(len(pixels)):
-        if pixels[i] >= 0:
-            row = np.uint32(pixels[i]) // width
-            column = np.uint32(pixels[i]) - row * width
-            for c in range(probabilities.shape[2]):
-                classes[to, c] = probabilities[row, column, c]
-            pixels[i] = to
-            to += 1
 
 
 @njit(cache=True, nogil=True)

@@ -302,8 +302,9 @@ def _empty_table(size: int, words: int) -> NDArray[np.int64]:
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:
     """Voxel key of every point (n, 3) m; raises DataError for a point that is NaN or beyond +-2^20 voxels."""
     keys = np.empty(len(p_map), np.int64)
-    bad = voxel_kernels.pack_keys(p_map, voxel_size_m, keys)
-    if bad >= 0:
+    voxel_kernels.pack_keys(p_map, voxel_size_m, keys)
+    if not keys.all():
+        bad = int(np.flatnonzero(keys == 0)[0])
         raise DataError(
             f"point {bad} of {len(p_map)} at {p_map[bad].tolist()} m is not inside the map, which reaches"
             f" {AXIS_OFFSET * voxel_size_m / 1000:.0f} km from its origin; check the poses"

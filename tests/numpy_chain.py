@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.deskew import EXTRAPOLATE_S, KNOT_STEP_S
+from gnss_sem_map.deskew import EXTRAPOLATE_S, KNOTS_PER_S
 from gnss_sem_map.labelling import NEAREST_DEPTH_M, ClassImage, LabellingSettings, exposure_stamp
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.sensor_log import Calibration, Image, Points
@@ -29,11 +29,13 @@ def points_in_map(
     valid = (squares >= settings.nearest_m**2) & (squares <= settings.farthest_m**2)
     x, y, z = x[valid, None], y[valid, None], z[valid, None]
     stamps = np.full(len(x), stamp) if points.stamps is None else points.stamps[valid]
-    first, last = stamps.min(), stamps.max()
-    steps = max(1, int(np.ceil((last - first) / KNOT_STEP_S)))
-    knots = trajectory.at(np.linspace(first, last, steps + 1), EXTRAPOLATE_S) @ T_imu_lidar
-    place = (stamps - first) * (1.0 / ((last - first) / steps or 1.0))
-    k = np.clip(place.astype(np.int64), 0, steps - 1)
+    numbers = np.arange(np.floor(stamps.min() * KNOTS_PER_S), np.floor(stamps.max() * KNOTS_PER_S) + 2)
+    if points.stamps is None:
+        knots = np.repeat(trajectory.at([stamp], EXTRAPOLATE_S) @ T_imu_lidar, len(numbers), axis=0)
+    else:
+        knots = trajectory.at(numbers / KNOTS_PER_S, EXTRAPOLATE_S + 1 / KNOTS_PER_S) @ T_imu_lidar
+    place = stamps * KNOTS_PER_S - numbers[0]
+    k = place.astype(np.int64)
     here, ahead = knots[:-1, :3][k], np.diff(knots[:, :3], axis=0)[k]
     p = here[:, :, 0] * x + here[:, :, 1] * y + here[:, :, 2] * z + here[:, :, 3]
     q = ahead[:, :, 0] * x + ahead[:, :, 1] * y + ahead[:, :, 2] * z + ahead[:, :, 3]
@@ -73,7 +75,7 @@ def pixels_seen(
         nearest = _window_minimum(nearest, axis, half)
     closest = nearest[v, u].astype(np.float64)
     seen = depth <= (1.0 + settings.occlusion_ratio) * closest + settings.occlusion_m
-    h, w_ = classes.probabilities.shape[:2]
+    h, w_ = classes.size
     pixels = np.full(len(p_map), -1, np.int32)
     rows, columns = (
         np.minimum(v[seen] // classes.shrink, h - 1),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,14 @@ def numbered(folder: Path, suffix: str) -> dict[int, Path]:
 def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:
     """Rows of little-endian float32 (n, columns); raises DataError for a file that is cut short or empty."""
     try:
-        size = path.stat().st_size
-        if size == 0 or size % (4 * columns):
-            raise DataError(
-                f"{path}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more than 0"
-            )
-        return np.fromfile(path, "<f4").reshape(-1, columns)
+        with path.open("rb", buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+            rows = np.empty((size // (4 * columns), columns), "<f4")
+            if size == 0 or size != rows.nbytes or file.readinto(rows) != size:  # type: ignore[arg-type]
+                raise DataError(
+                    f"{path}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more than 0"
+                )
+        return rows
     except OSError as error:
         raise DataError(f"{path}: cannot read the scan ({error.strerror})") from None
 

@@ -190,8 +190,13 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
 def _read_sweep(path: Path, start: float, end: float) -> Points:
     """A sweep with the stamp of every point, from its azimuth: rear, left, front, right, rear."""
     rows = frames.read_points(path)
-    turned = np.float32(0.5) - np.arctan2(rows[:, 1], rows[:, 0]) / np.float32(2 * np.pi)
-    return Points(rows[:, :3], rows[:, 3], start + turned.astype(np.float64) * (end - start))
+    turned = np.arctan2(rows[:, 1], rows[:, 0])
+    turned /= np.float32(-2 * np.pi)
+    turned += np.float32(0.5)
+    stamps = turned.astype(np.float64)
+    stamps *= end - start
+    stamps += start
+    return Points(rows[:, :3], rows[:, 3], stamps)
 
 
 def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:

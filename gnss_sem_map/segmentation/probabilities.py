@@ -2,12 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.sensor_log import Image
+
+
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """A label image as it is: an id for every pixel, and what each id says of the classes."""
+
+    ids: NDArray[np.uint8]
+    """(h, w)."""
+    table: NDArray[np.uint8]
+    """(256, c) round(255 p), one row per id."""
+
+    @property
+    def probabilities(self) -> NDArray[np.uint8]:
+        """The same for every pixel, (h, w, c)."""
+        return np.take(self.table, self.ids, axis=0)
+
+
+@runtime_checkable
+class KeepsLabels(Protocol):
+    """A segmenter that has label images: most of their pixels are never asked for."""
+
+    def kept(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
+        """What `Segmenter.__call__` gives, but a label image as it is."""
+        ...
+
 
 LARGEST_SHRINK = 16
 """Probabilities may be this many times smaller than the image."""

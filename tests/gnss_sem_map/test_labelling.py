@@ -14,6 +14,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labelling import ClassImage, LabellingSettings, class_image, exposure_stamp, pixels_seen
 from gnss_sem_map.labels import label_set
+from gnss_sem_map.segmentation.probabilities import LabelImage
 from gnss_sem_map.sensor_log import Calibration, Image
 
 URBAN = label_set()
@@ -130,6 +131,20 @@ def test_class_probabilities_are_summed_by_name(make: Callable[[NDArray[np.float
     expected[:, :, 0] = p[:, :, 3]
     expected[:, :, 5] = p[:, :, 0] + p[:, :, 4]
     np.testing.assert_allclose(image.probabilities / 255, expected, atol=1.1 / 255)
+
+
+def test_a_label_image_says_the_same_as_the_probabilities_of_its_ids() -> None:
+    rng = np.random.default_rng(2)
+    labels = LabelImage(
+        rng.integers(0, 256, (48, 150)).astype(np.uint8), rng.integers(0, 256, (256, 6), np.uint8)
+    )
+    as_ids = class_image(labels, (*URBAN.names, "other"), URBAN, (300, 96), "here")
+    as_probabilities = ClassImage(labels.probabilities.transpose(2, 0, 1).copy().transpose(1, 2, 0), 2)
+    pixels = rng.integers(0, 48 * 150, 1000).astype(np.int32)
+    assert as_ids.shrink == 2
+    assert as_ids.size == as_probabilities.size == (48, 150)
+    np.testing.assert_array_equal(as_ids.at(pixels), as_ids.rows[pixels])
+    np.testing.assert_array_equal(as_ids.at(pixels), as_probabilities.at(pixels))
 
 
 def test_a_label_map_of_another_size_is_refused() -> None:

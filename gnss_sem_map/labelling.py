@@ -175,10 +175,10 @@ def visible(
     LiDAR is sparser than the image).
     """
     (height, width), (class_height, class_width) = view.nearest.shape, classes.size
-    points, columns, lines, depths = (part[:inside] for part in view.inside)
+    points, columns, lines, depths = view.inside
     pixels = np.empty(inside, np.int32)
     kept = scan_kernels.visible(
-        points, columns, lines, depths, view.nearest,
+        points[:inside], columns, lines, depths, view.nearest,
         settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
         np.minimum(np.arange(height) // classes.shrink, class_height - 1),
         np.minimum(np.arange(width) // classes.shrink, class_width - 1), class_width, pixels,

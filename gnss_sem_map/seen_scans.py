@@ -173,9 +173,13 @@ class _Look:
             return points, None
         try:
             where = f"labels of image {image.number}"
-            look = self._segmenter.kept if isinstance(self._segmenter, KeepsLabels) else self._segmenter
+            seen = (
+                self._segmenter.kept(image)
+                if isinstance(self._segmenter, KeepsLabels)
+                else self._segmenter(image)
+            )
             names = self._segmenter.class_names
-            return points, (image, class_image(look(image), names, self._label_set, size, where))
+            return points, (image, class_image(seen, names, self._label_set, size, where))
         except MissingLabels as error:
             self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None

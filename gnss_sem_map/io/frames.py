@@ -25,7 +25,7 @@ def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:
         with path.open("rb", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
             rows = np.empty((size // (4 * columns), columns), "<f4")
-            if size == 0 or size != rows.nbytes or file.readinto(rows) != size:  # type: ignore[arg-type]
+            if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
                 raise DataError(
                     f"{path}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more than 0"
                 )

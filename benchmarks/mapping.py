@@ -407,16 +407,23 @@ def main() -> None:
     missing: list[str] = []
     for drive, spec in zip(given.drives[::2], given.drives[1::2], strict=True):
         results["drives"][Path(drive).name], missing = measure(Path(drive), spec, given.scans)
+        results["not installed"] = missing
+        write(results)
     short, long = _child("peak_of(277)"), _child("peak_of(2769)")
     results["peak memory"] = {
         "277 scans": short, "2769 scans": long, "ratio": long["peak_mb"] / short["peak_mb"]
     }  # fmt: skip
+    write(results)
     if given.large:
         job = open_job(Path(given.drives[0]), given.drives[1], 20)
         results["floor, 5e7 voxels"] = over_the_floor(seen_of(job), 50_000_000)
-    results["not installed"] = missing
+        write(results)
+
+
+def write(results: Figures) -> None:
+    """Print and keep what was measured so far."""
     text = json.dumps(results, indent=1, default=float)
-    print(text)
+    print(text, flush=True)
     folder = Path(__file__).parent / "results"
     folder.mkdir(exist_ok=True)
     (folder / "mapping.json").write_text(text + "\n", "utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
@@ -34,7 +34,12 @@ Format = Annotated[
     str | None, typer.Option("--format", help="kitti-raw, kitti-odometry or table; default: what is there.")
 ]
 Frames = Annotated[
-    str | None, typer.Option("--frames", help="Only frames A to B - 1, as A:B, by frame number.")
+    str | None,
+    typer.Option(
+        "--frames",
+        help="Only frames A to B - 1, as A:B, by frame number; LiDAR odometry sees only these too, GNSS and IMU all"
+        " of the drive.",
+    ),
 ]
 Segmenter = Annotated[
     str | None,
@@ -347,9 +352,13 @@ def demo(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the results.")] = Path("demo"),
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
     seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
-    network: Annotated[
-        bool, typer.Option("--network", help="Segment the images with the small network made for this town.")
-    ] = False,
+    labels: Annotated[
+        Literal["network", "corrupted"],
+        typer.Option(
+            help="Class probabilities: from the small network made for this simulator, or the true class images,"
+            " corrupted as a network would."
+        ),
+    ] = "network",
 ) -> None:
     """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
     import shutil
@@ -357,26 +366,24 @@ def demo(
 
     from gnss_sem_map.export.run_folder import check_replaceable
     from gnss_sem_map.simulation import simulate as write_drive
-    from gnss_sem_map.simulation import write_corrupted_labels
 
     check_replaceable(out)
+    if labels == "network":
+        _open_demo_network()  # what is missing is said now, not after the simulation
     world = out.with_name(f"{out.name}_drive")
     shutil.rmtree(world, ignore_errors=True)
     start = time.perf_counter()
     with progress_bars() as progress:
         drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
-        simulated, labels = time.perf_counter(), world / "probabilities"
-        if not network:
-            write_corrupted_labels(drive, labels, seed, lambda done, total: progress("segment", done, total))
-    if network:
-        segment(drive, labels, "demo")
+    simulated = time.perf_counter()
+    if labels == "network":
+        segment(drive, world / "probabilities", "demo")
     else:
-        typer.echo(
-            "Labels: the true class images, corrupted as a network would: blurred borders, confused classes."
-        )
+        _corrupt_labels(drive, world / "probabilities", seed)
     segmented = time.perf_counter()
-    run(drive, out, segmenter=f"labels:{labels}", write_labels=True)
+    run(drive, out, segmenter=f"labels:{world / 'probabilities'}", write_labels=True)
     evaluate(out, drive / "truth")
+    typer.echo(f"Labels          {_DEMO_LABELS[labels]}")
     about = json.loads((out / "run.json").read_text("utf-8"))
     seconds_of = {"simulate": simulated - start, "segment": segmented - simulated} | about["seconds"]
     typer.echo(
@@ -385,6 +392,26 @@ def demo(
     for name in ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html"):
         if (out / name).is_file():
             typer.echo(f"Look at         {out / name}")
+
+
+_DEMO_LABELS = {
+    "network": "of the small network that was trained on simulated streets of seeds 1 to 60; no use on real images",
+    "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
+}
+
+
+def _open_demo_network() -> None:
+    from gnss_sem_map import labels
+    from gnss_sem_map.segmentation import open_segmenter
+
+    open_segmenter("demo", labels.label_set())
+
+
+def _corrupt_labels(drive: Path, folder: Path, seed: int) -> None:
+    from gnss_sem_map.simulation import write_corrupted_labels
+
+    with progress_bars() as progress:
+        write_corrupted_labels(drive, folder, seed, lambda done, total: progress("segment", done, total))
 
 
 @app.command()

@@ -47,11 +47,30 @@ def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
 
 def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, Path, str]) -> None:
     out, _, printed = demo
-    for says in ("sidewalk", "moving vehicles removed", "trajectory", "refinement", "mapping"):
+    for says in (
+        "sidewalk",
+        "moving vehicles removed",
+        "trajectory",
+        "refinement",
+        "mapping",
+        "small network",
+    ):
         assert says in printed, says
     for name in ("perspective.png", "topview.png", "report.html", "viewer.html"):
         assert str(out / name) in printed
         assert (out / name).stat().st_size > 10_000
+
+
+def test_the_corrupted_truth_can_stand_in_for_the_network(
+    demo: tuple[Path, Path, str], tmp_path: Path
+) -> None:
+    out = tmp_path / "demo"
+    done = gnss_sem_map("demo", "-o", out, "--seconds", "3", "--seed", "1", "--labels", "corrupted")
+    assert done.returncode == 0, done.stderr
+    assert "true class images, corrupted" in done.stdout
+    ours, theirs = (json.loads((run / "metrics.json").read_text()) for run in (out, demo[0]))
+    assert ours["trajectory"] == theirs["trajectory"]  # the same drive
+    assert ours["semantics"] != theirs["semantics"]
 
 
 def test_scores_agree_with_the_independent_scorer(

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement import range_images
-from gnss_sem_map.refinement.segments import VOXEL_M, find_segments, height_over_ground, near
+from gnss_sem_map.refinement.segments import VOXEL_M, find_segments, height_over_ground, near, take_apart
 from gnss_sem_map.refinement.tracks import Segment
 from gnss_sem_map.refinement.vehicles import groups
 from gnss_sem_map.refinement.verdicts import GONE, MotionSettings, TrackedObject, judge
@@ -109,9 +109,12 @@ class MovingObjectDetector:
         """Decide about the oldest scans, by the testimony of all, and let go of their points."""
         if count == 0:
             return MovingObjects({}, ())
-        segments, of_point = _all_segments(self._observations)
-        hits, throughs = self._testimony(np.concatenate(of_point), len(segments))
-        objects = judge(segments, hits, throughs, self._settings)
+        hits, throughs = self._testimony()
+        of_point = _apart(self._observations, hits, throughs, self._settings)
+        segments = _all_segments(self._observations, of_point)
+        numbers = np.concatenate(of_point)
+        hit, through = (_sums(numbers, looks, len(segments)) for looks in (hits, throughs))
+        objects = judge(segments, hit, through, self._settings)
         gone = np.zeros(len(segments) + 1, np.bool_)  # the last one: points of no segment
         for one in objects:
             gone[list(one.segments)] = one.motion in GONE
@@ -125,12 +128,11 @@ class MovingObjectDetector:
         begun = tuple(one for one in objects if segments[one.segments[0]].scan < count)
         return MovingObjects(points, begun)
 
-    def _testimony(
-        self, of_point: NDArray[np.int64], count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How often the points of every segment were hit and seen through by other scans: (s,) each."""
+    def _testimony(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """How often the place of every kept point in a segment was hit and seen through by other scans: (n,) each."""
         settings, observations = self._settings, self._observations
-        p_map = np.concatenate([seen.p_map for seen in observations])[of_point >= 0]
+        inside = np.concatenate([seen.segments for seen in observations]) >= 0
+        p_map = np.concatenate([seen.p_map for seen in observations])[inside]
         voxel = np.unique(keys_of(p_map, VOXEL_M), return_inverse=True)[1]
         points = np.bincount(voxel)
         centroids = np.stack([np.bincount(voxel, p_map[:, axis]) / points for axis in range(3)], axis=1)
@@ -144,13 +146,37 @@ class MovingObjectDetector:
             settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
             hits, throughs,
         )  # fmt: skip
-        hits = np.maximum(hits - 1, 0)  # the scan that found it
-        numbers = of_point[of_point >= 0]
-        return _sums(numbers, hits[voxel], count), _sums(numbers, throughs[voxel], count)
+        of_point = np.zeros((2, len(inside)), np.int32)
+        of_point[:, inside] = np.maximum(hits - 1, 0)[voxel], throughs[voxel]  # less the scan that found it
+        return of_point[0], of_point[1]
 
 
-def _sums(numbers: NDArray[np.int64], values: NDArray[np.int32], count: int) -> NDArray[np.float64]:
-    return np.asarray(np.bincount(numbers, values, count), np.float64)
+def _sums(numbers: NDArray[np.int64], looks: NDArray[np.int32], count: int) -> NDArray[np.float64]:
+    """What the points of every segment sum up to: (s,)."""
+    inside = numbers >= 0
+    return np.asarray(np.bincount(numbers[inside], looks[inside], count), np.float64)
+
+
+def _apart(
+    observations: list[_Observation],
+    hits: NDArray[np.int32],
+    throughs: NDArray[np.int32],
+    settings: MotionSettings,
+) -> list[NDArray[np.int64]]:
+    """Segment of every kept point of each scan, -1 for none, counted over all scans.
+
+    A mover beside something that stands may have been found as one segment with it.
+    """
+    of_point, start, count = [], 0, 0
+    for seen in observations:
+        looks = slice(start, start := start + len(seen.segments))
+        numbers = take_apart(
+            seen.p_map, seen.segments, hits[looks], throughs[looks],
+            settings.segment_eps_m, settings.least_through_per_hit,
+        )  # fmt: skip
+        of_point.append(np.where(numbers >= 0, numbers + np.int64(count), -1))
+        count += int(numbers.max(initial=-1)) + 1
+    return of_point
 
 
 def _observe(
@@ -196,13 +222,11 @@ def _within(
     return np.asarray(east * east + north * north <= reach_m**2)
 
 
-def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list[NDArray[np.int64]]]:
-    """The segments of all scans in time order, and for each scan that of every kept point, -1 for none."""
+def _all_segments(observations: list[_Observation], of_point: list[NDArray[np.int64]]) -> list[Segment]:
+    """The segments of all scans in time order."""
     segments: list[Segment] = []
-    of_point = []
-    for scan, seen in enumerate(observations):
-        of_point.append(np.where(seen.segments >= 0, seen.segments + np.int64(len(segments)), -1))
-        for number, part in enumerate(groups(seen.segments)):
+    for scan, (seen, numbers) in enumerate(zip(observations, of_point, strict=True)):
+        for part in groups(np.where(numbers >= 0, numbers - len(segments), -1)):
             xy = seen.p_map[part, :2]
             segments.append(
                 Segment(
@@ -213,10 +237,10 @@ def _all_segments(observations: list[_Observation]) -> tuple[list[Segment], list
                     highest=xy.max(axis=0),
                     points=len(part),
                     shown=bool(seen.is_object[part].any()),
-                    cut=bool(seen.cut[number]),
+                    cut=bool(seen.cut[seen.segments[part[0]]]),
                 )
             )
-    return segments, of_point
+    return segments
 
 
 def _grown(seen: _Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:

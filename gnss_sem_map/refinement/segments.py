@@ -12,14 +12,18 @@ from gnss_sem_map.voxel_map import keys_of, unpack
 
 VOXEL_M = 0.2
 CLOSER = 0.5
-"""What is larger than a vehicle is taken apart at this share of the distance."""
+"""What may be two vehicles is taken apart at this share of the distance."""
 PART_M = 0.2
 """A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
 GROUND_CELL_M = 1.0
-LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 4.0, 0.6
-"""A segment that reaches beyond what the image shows is no larger than this, and one that no image shows no lower."""
+LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.6
+"""What is longer than the first is perhaps two vehicles. A segment that reaches beyond what the image shows is no
+larger than the next two, a lorry or a bus, and one that no image shows no lower than the last."""
 LEAST_POINTS = 20
 """A segment that no image shows has at least so many points."""
+MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200
+"""A segment is two objects only when each has at least this share of its points, and so many: fewer are sparse, so
+that one object comes apart as well."""
 
 
 @njit(cache=True, nogil=True)
@@ -38,7 +42,7 @@ def _whole(low, high):
     """The cluster that each one is part of: its own, or the first of vehicle size whose box (s, 2) holds its box."""
     owners = np.arange(len(low))
     for j in range(len(low)):
-        if np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) > LONGEST_M or owners[j] != j:
+        if np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) > LARGE_M or owners[j] != j:
             continue
         west, south = low[j, 0] - PART_M, low[j, 1] - PART_M
         east, north = high[j, 0] + PART_M, high[j, 1] + PART_M
@@ -114,10 +118,41 @@ def _objects(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int64]:
     """Cluster of every point (n, 3): what is too large comes apart, and what is a part of another is joined to it."""
     clusters = _cluster(p_map, eps_m).astype(np.int64)
     low, high = _boxes(p_map[:, :2], clusters, clusters.max() + 1)
-    large = np.hypot(*(high - low).T)[clusters] > LONGEST_M
+    large = np.hypot(*(high - low).T)[clusters] > LARGE_M
     clusters[large] = _cluster(p_map[large], CLOSER * eps_m) + clusters.max() + 1
     clusters = np.unique(clusters, return_inverse=True)[1]
     return np.asarray(_whole(*_boxes(p_map[:, :2], clusters, clusters.max() + 1))[clusters])
+
+
+def take_apart(
+    p_map: NDArray[np.float64],
+    segments: NDArray[np.int32],
+    hits: NDArray[np.int32],
+    throughs: NDArray[np.int32],
+    eps_m: float,
+    least_through_per_hit: float,
+) -> NDArray[np.int32]:
+    """Segments (n,) of points (n, 3), where what once was empty is apart from what always stood beside it.
+
+    A mover that passes something closely is one segment with it. If a good part of a segment was seen through, by
+    `throughs` (n,) and `hits` (n,), and a good part was not, it is clustered again, more closely, and its clusters
+    that were seen through become a new segment.
+    """
+    once_empty = throughs > least_through_per_hit * hits
+    counts = np.bincount(segments[segments >= 0])
+    emptied = np.bincount(segments[once_empty & (segments >= 0)], minlength=len(counts))
+    stood = np.bincount(segments[(hits > 0) & (throughs == 0) & (segments >= 0)], minlength=len(counts))
+    least = np.maximum(MIXED_SHARE * counts, LEAST_DENSE_POINTS)
+    apart, count = segments.copy(), len(counts)
+    for number in np.flatnonzero((emptied >= least) & (stood >= least)):
+        part = np.flatnonzero(segments == number)
+        clusters = _cluster(p_map[part], CLOSER * eps_m)
+        hit, through = np.bincount(clusters, hits[part]), np.bincount(clusters, throughs[part])
+        left = (through > least_through_per_hit * hit)[clusters]
+        if min(left.sum(), (~left).sum()) >= least[number]:
+            apart[part[left]] = count
+            count += 1
+    return apart
 
 
 def _cluster(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int32]:

@@ -17,6 +17,8 @@ LEAST_ENDS = 4
 SMOOTHED = 5
 """Segments in the running median of a track's boxes."""
 SPEED_OVER_S = 0.5
+FASTEST_M_S = 45.0
+"""Of what was seen once, and whose place was found empty: next it may be as far away as this speed takes it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,8 @@ class Segment:
     """An image calls some of it a vehicle."""
     cut: bool
     """The edge of the view cuts it: its ends are not its own."""
+    fleeting: bool = False
+    """Its place was found empty by other scans, more often than not."""
 
 
 @dataclass(eq=False)
@@ -54,18 +58,22 @@ class Track:
             raise ValueError("a track without segments is nowhere")
         return np.asarray(self.last.centroid + self.velocity * (stamp - self.last.stamp))
 
-    def extend(self, number: int, segment: Segment) -> None:
+    def extend(self, number: int, segment: Segment, first_share: float = 0.5) -> None:
         """Take the next segment; the first step counts half, for its two centroids saw different parts."""
         if self.last is not None:
             step = (segment.centroid - self.last.centroid) / (segment.stamp - self.last.stamp)
-            share = NEW_SHARE if len(self.segments) > 1 else 0.5
+            share = NEW_SHARE if len(self.segments) > 1 else first_share
             self.velocity = (1 - share) * self.velocity + share * step
         self.segments.append(number)
         self.last = segment
 
 
 def track(segments: list[Segment], gate_m: float) -> list[Track]:
-    """Tracks of the segments, which come in time order: each scan's are joined to the nearest prediction, greedily."""
+    """Tracks of the segments, which come in time order: each scan's are joined to the nearest prediction, greedily.
+
+    What drives fast is nowhere near where it was: among what is left, fleeting segments are joined to fleeting ones of
+    the scan before, as far as the fastest could have come. What stands is not fleeting, and is never joined so.
+    """
     tracks: list[Track] = []
     by_scan: dict[int, list[int]] = {}
     for number, segment in enumerate(segments):
@@ -79,12 +87,30 @@ def track(segments: list[Segment], gate_m: float) -> list[Track]:
                 free.remove(number)
                 taken.add(place)
                 alive[place].extend(number, segments[number])
+        for number, t in _fast_ones(segments, sorted(free), alive, scan):
+            if number in free and len(t.segments) == 1:
+                free.remove(number)
+                t.extend(number, segments[number], first_share=1.0)
         for number in sorted(free):
             started = Track()
             started.extend(number, segments[number])
             tracks.append(started)
             alive.append(started)
     return tracks
+
+
+def _fast_ones(
+    segments: list[Segment], numbers: list[int], alive: list[Track], scan: int
+) -> list[tuple[int, Track]]:
+    """Pairs of a fleeting segment and a track of one fleeting segment of the scan before, nearest first."""
+    begun = [
+        t for t in alive if len(t.segments) == 1 and t.last and t.last.fleeting and t.last.scan == scan - 1
+    ]
+    fleeting = [n for n in numbers if segments[n].fleeting]
+    if not begun or not fleeting or begun[0].last is None:
+        return []
+    reach_m = FASTEST_M_S * (segments[fleeting[0]].stamp - begun[0].last.stamp)
+    return [(n, begun[place]) for n, place in _nearest_first(segments, fleeting, begun, reach_m)]
 
 
 def _nearest_first(

@@ -8,9 +8,9 @@ from gnss_sem_map.refinement.vehicles import Motion
 from gnss_sem_map.refinement.verdicts import MotionSettings, judge
 
 
-def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False):
+def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False, fleeting=False):
     centre, half = np.array([x, y]), np.array([length / 2, 0.9])
-    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut)
+    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut, fleeting)
 
 
 def test_two_cars_that_pass_each_other_keep_their_tracks():
@@ -26,6 +26,27 @@ def test_a_track_survives_five_scans_out_of_sight_and_not_six():
     for gap, count in ((5, 1), (6, 2)):
         scans = [*range(10), *range(10 + gap, 20 + gap)]
         assert len(track([segment(scan, scan * 0.5) for scan in scans], gate_m=1.5)) == count
+
+
+def test_on_a_highway_a_fleeting_segment_is_followed_as_far_as_it_drives_and_a_standing_one_is_not():
+    for speed, fleeting, count in ((33.0, True, 1), (33.0, False, 8), (60.0, True, 8)):
+        segments = [segment(scan, scan * 0.1 * speed, fleeting=fleeting) for scan in range(8)]
+        assert len(track(segments, gate_m=1.5)) == count
+
+
+def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
+    segments = [
+        s
+        for scan in range(10)
+        for s in (
+            segment(scan, scan * 2.5, fleeting=True),
+            segment(scan, 20 + scan * 2.5, fleeting=True),
+            segment(scan, 40 - scan * 3.3, 4.0, fleeting=True),
+        )
+    ]
+    tracks = track(segments, gate_m=1.5)
+    assert [t.segments for t in tracks] == [list(range(k, 30, 3)) for k in range(3)]
+    np.testing.assert_allclose(tracks[2].velocity, [-33.0, 0.0], atol=0.5)
 
 
 def test_a_mover_is_displaced_by_the_way_of_both_its_ends():
@@ -74,6 +95,13 @@ def test_what_no_image_shows_needs_both_motion_and_free_space():
     assert verdict(going, few, many) == [(Motion.MOVING, 10)]
     assert verdict(going, many, few) == []
     assert verdict(parked, few, many) == []
+
+
+def test_the_last_scan_of_a_fast_car_goes_with_it_though_nobody_saw_its_place_empty():
+    going = [segment(scan, scan * 2.8) for scan in range(10)]
+    throughs = np.full(10, 50.0)
+    throughs[-1] = 0.0
+    assert verdict(going, np.full(10, 5.0), throughs) == [(Motion.MOVING, 10)]
 
 
 def test_probability_grows_with_the_evidence():

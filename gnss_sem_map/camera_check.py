@@ -151,7 +151,8 @@ def check_stamps(log: SensorLog, within_s: float) -> None:
     """Raise DataError when all images are earlier, or all later, than every scan by more than `within_s`."""
     if not log.scans or not log.images:
         return
-    start, end, first, last = (at.stamp for of in (log.scans, log.images) for at in (of[0], of[-1]))
+    start, end = log.scans[0].stamp, log.scans[-1].stamp
+    first, last = log.images[0].stamp, log.images[-1].stamp
     if first > end + within_s or last < start - within_s:
         raise DataError(
             f"{log.name}: images are of {first:.1f} to {last:.1f} s, scans of {start:.1f} to {end:.1f} s; expected the"

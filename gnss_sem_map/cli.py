@@ -365,6 +365,7 @@ def demo(
     import time
 
     from gnss_sem_map.export.run_folder import check_replaceable
+    from gnss_sem_map.segmentation import DEMO_CALIBRATION
     from gnss_sem_map.simulation import simulate as write_drive
 
     check_replaceable(out)
@@ -376,12 +377,14 @@ def demo(
     with progress_bars() as progress:
         drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
     simulated = time.perf_counter()
+    settings: list[str] = []
     if labels == "network":
         segment(drive, world / "probabilities", "demo")
+        settings = [f"calibration={DEMO_CALIBRATION}"]
     else:
         _corrupt_labels(drive, world / "probabilities", seed)
     segmented = time.perf_counter()
-    run(drive, out, segmenter=f"labels:{world / 'probabilities'}", write_labels=True)
+    run(drive, out, segmenter=f"labels:{world / 'probabilities'}", set_=settings, write_labels=True)
     evaluate(out, drive / "truth")
     typer.echo(f"Labels          {_DEMO_LABELS[labels]}")
     about = json.loads((out / "run.json").read_text("utf-8"))

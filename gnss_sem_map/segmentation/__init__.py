@@ -53,6 +53,9 @@ SCHEMES = {
 DEMO_NETWORK = Path(__file__).parent / "demo_network" / "network.safetensors"
 """Trained on simulated streets; its README says how, and how well."""
 
+DEMO_CALIBRATION = DEMO_NETWORK.with_name("calibration.yaml")
+"""What that network's answers were worth on two other simulated streets: for `--set calibration=FILE`."""
+
 
 def no_segmenter_message(drive: str) -> str:
     """What to do for a drive of real streets that has no labels: three networks, how to get them, their licences."""

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
+from gnss_sem_map import label_calibration
 from gnss_sem_map.labels import label_set, taxonomy
-from gnss_sem_map.segmentation import DEMO_NETWORK, open_segmenter
+from gnss_sem_map.segmentation import DEMO_CALIBRATION, DEMO_NETWORK, open_segmenter
 from gnss_sem_map.segmentation.training import TrainingSettings, train
 from gnss_sem_map.segmentation.training_data import LabelledFolder
 from gnss_sem_map.sensor_log import Image
@@ -45,6 +46,13 @@ def test_it_knows_the_classes_of_the_map_in_streets_it_has_not_seen(
         np.add.at(confusion, (truth[truth >= 0], seen[truth >= 0]), 1)
     iou = confusion.diagonal() / (confusion.sum(0) + confusion.sum(1) - confusion.diagonal())
     assert iou[:5].mean() > 0.7, dict(zip(segment.class_names, iou.round(3), strict=True))
+
+
+def test_its_calibration_is_of_other_streets_than_the_demos_and_trusts_its_answers() -> None:
+    found = label_calibration.read(DEMO_CALIBRATION, URBAN)
+    seeds = {int(street.name.split("_drive_")[1].split("_")[0]) for street in found.streets}
+    assert seeds == {101, 102}
+    assert found.log_likelihoods[:5].argmax(axis=1).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_the_trainer_that_made_it_learns_from_simulated_streets(

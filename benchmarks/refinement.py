@@ -1,17 +1,18 @@
 """What refinement does, on real and simulated drives, and how fast its kernels are beside what others use.
 
-    python benchmarks/refinement.py [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large]
+    python benchmarks/refinement.py [kernels] [raw] [semantics] [simulated]
+        [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large]
 
-prints the figures and writes benchmarks/results/refinement.json. Removal: share of moving vehicle points removed (DA),
-of static vehicle points kept (SA_vehicle) and of all static points kept (SA), AA = sqrt(SA DA); the paper's rule
-beside ours. Semantics: strict IoU on the points that their own image labels, before and after. Times are CPU time of
-this process; what counts is their ratio.
+prints the figures and writes them into benchmarks/results/refinement.json; parts that were not asked for stay as they
+are there. Removal: share of moving vehicle points removed (DA), of static vehicle points kept (SA_vehicle) and of all
+static points kept (SA), AA = sqrt(SA DA); on real data and with `semantics` the paper's rule beside ours. Simulated:
+what every mover does, and how much of it was removed. Semantics: strict IoU on the points that their own image labels,
+before and after. Times are CPU time of this process; what counts is their ratio.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import sys
 import tempfile
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from gnss_sem_map import labels
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.evaluation import Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.evaluation import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.mapping import build_maps
 from gnss_sem_map.motion import find_moving
@@ -45,6 +46,8 @@ from gnss_sem_map.voxel_map import SemanticMap, State, keys_of, pack
 URBAN = labels.label_set()
 TABLES = Tables.of(URBAN)
 RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
+RESULTS = Path(__file__).parent / "results" / "refinement.json"
+PARTS = ["kernels", "raw", "semantics", "simulated"]
 Figures = dict[str, Any]
 Points = Mapping[int, NDArray[np.int64]]
 PAPER = RefinementSettings(
@@ -55,6 +58,7 @@ PAPER = RefinementSettings(
 def main() -> None:
     """Measure what was asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("parts", nargs="*", metavar="PART", help="what to measure (default: all)")
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument(
         "--simulated", type=Path, nargs="*", default=[], help="drives that are already simulated"
@@ -65,22 +69,29 @@ def main() -> None:
         "--large", action="store_true", help="a million voxels for DBSCAN, fifty for the count grid"
     )
     options = parser.parse_args()
-    figures: Figures = {
-        "dbscan": dbscan_beside_sklearn(options.large),
-        "count_grid": count_grid_beside_bincount(options.large),
-    }
-    if (options.data / RAW_0005).is_dir():
-        figures["removal, raw drive 0005, excerpt"] = on_raw_drive(options.data)
-        figures["semantics, SemanticKITTI 00 and 08"] = on_semantic_kitti(options.data)
+    parts = options.parts or PARTS
+    if unknown := set(parts) - set(PARTS):
+        parser.error(f"found parts {sorted(unknown)}, expected some of {PARTS}")
+    if "kernels" in parts:
+        keep("dbscan", dbscan_beside_sklearn(options.large))
+        keep("count_grid", count_grid_beside_bincount(options.large))
+    if "raw" in parts and (options.data / RAW_0005).is_dir():
+        keep("removal, raw drive 0005, excerpt", on_raw_drive(options.data))
+    if "semantics" in parts and (options.data / RAW_0005).is_dir():
+        keep("semantics, SemanticKITTI 00 and 08", on_semantic_kitti(options.data))
     with tempfile.TemporaryDirectory() as folder:
-        drives = {f"simulated, {drive.name}": drive for drive in options.simulated}
-        drives |= simulated(Path(folder), options.seeds, options.seconds)
-        for name, drive in drives.items():
-            figures[name] = on_simulated_drive(drive)
-    print(json.dumps(figures, indent=1))
-    results = Path(__file__).parent / "results" / "refinement.json"
-    results.parent.mkdir(exist_ok=True)
-    results.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+        drives = [*options.simulated, *simulated(Path(folder), options.seeds, options.seconds)]
+        for drive in drives if "simulated" in parts else []:
+            keep(f"removal, simulated, {drive.name}", on_simulated_drive(drive))
+        for drive in drives if "semantics" in parts else []:
+            keep(f"semantics, simulated, {drive.name}", semantics_of_simulated_drive(drive))
+
+
+def keep(name: str, figures: Figures) -> None:
+    """Print them, and write them among those of the parts that were measured before."""
+    print(json.dumps({name: figures}, indent=1), flush=True)
+    known = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
+    RESULTS.write_text(json.dumps(known | {name: figures}, indent=1) + "\n", "utf-8")
 
 
 def cpu(work: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
@@ -100,7 +111,7 @@ def dbscan_beside_sklearn(large: bool) -> Figures:
     rng = np.random.default_rng(0)
     dbscan(np.array([(0, 0, 0)]), 2.5, 10)
     figures = {}
-    for count in (100_000, 1_000_000)[: 2 if large else 1]:
+    for count in (200_000, 2_000_000)[: 2 if large else 1]:  # every other block of them is left empty
         side = int((count / 3) ** 0.5)
         voxels = np.unique(rng.integers((0, 0, 0), (side, side, 12), (2 * count, 3)), axis=0)
         voxels = voxels[np.sort(rng.permutation(len(voxels))[:count])]
@@ -177,53 +188,63 @@ def on_raw_drive(data: Path) -> Figures:
     return figures
 
 
-def simulated(folder: Path, seeds: int, seconds: float) -> dict[str, Path]:
+def simulated(folder: Path, seeds: int, seconds: float) -> list[Path]:
     """Drives of other seeds than the demo's, simulated here."""
     from gnss_sem_map.simulation import simulate
 
-    return {
-        f"simulated, seed {seed}, {seconds:g} s": simulate(folder / f"seed_{seed}", seconds, seed)
-        for seed in range(101, 101 + seeds)
-    }
+    return [simulate(folder / f"seed_{seed}", seconds, seed) for seed in range(101, 101 + seeds)]
+
+
+def perfectly_seen(folder: Path) -> Drive:
+    """A simulated drive with the poses of its own navigation unit and perfect class images."""
+    log = open_drive(folder)
+    segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
+    return Drive(log, log.given or log.reference, segmenter, Settings())
 
 
 def on_simulated_drive(folder: Path) -> Figures:
-    """Removal all around, case by case, with perfect class images and the drive's own poses."""
-    log = open_drive(folder)
-    segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
-    drive = Drive(log, log.given or log.reference, segmenter, Settings())
-    points, ms = timed_find_moving(drive)
-    names = instance_names(folder / "truth" / "vehicles.csv")
-    figures: Figures = {}
-    for name, chosen in (("evidence", points), ("paper's rule", by_the_paper(drive))):
-        counts, cases = np.zeros((3, 2), np.int64), {}
-        for seen in seen_scans(drive):
-            truth = np.fromfile(folder / "truth" / "labels" / f"{seen.scan.name}.label", "<u4")[seen.valid]
-            removed = np.zeros(len(truth), np.uint32)
-            removed[chosen.get(seen.scan.number, [])] = 1
-            counts += dynamic_counts(removed, truth, TABLES, seen.scan.name)
-            moving = np.isin(truth & 0xFFFF, (252, 256, 257, 258, 259))
-            for instance in np.unique(truth[moving] >> 16):
-                of_it = moving & (truth >> 16 == instance)
-                case = names[int(instance)]
-                before, gone = cases.get(case, (0, 0))
-                cases[case] = (before + int(of_it.sum()), gone + int(removed[of_it].sum()))
-        figures[name] = dynamic(counts) | {
-            "movers": {
-                case: {"points": n, "removed": round(k / n, 4)} for case, (n, k) in sorted(cases.items())
-            }
-        }
-    figures["evidence"]["ms_per_scan"] = ms
-    figures["semantics"] = before_and_after(
-        drive, points, folder / "truth" / "labels", folder / "truth" / "single_frame"
+    """Removal all around, mover by mover."""
+    drive = perfectly_seen(folder)
+    points = find_moving(drive).points
+    cases = what_they_do(folder)
+    counts = np.zeros((3, 2), np.int64)
+    movers: dict[str, NDArray[np.int64]] = {}
+    for seen in seen_scans(Drive(drive.log, drive.trajectory, None, drive.settings)):
+        truth = np.fromfile(folder / "truth" / "labels" / f"{seen.scan.name}.label", "<u4")[seen.valid]
+        removed = np.zeros(len(truth), np.uint32)
+        removed[points.get(seen.scan.number, [])] = 1
+        counts += dynamic_counts(removed, truth, TABLES, seen.scan.name)
+        moving = np.isin(truth & 0xFFFF, list(MOVING_IDS))
+        for instance in np.unique(truth[moving] >> 16):
+            of_it = moving & (truth >> 16 == instance)
+            found = np.array([of_it.sum(), removed[of_it].sum()])
+            movers[cases[int(instance)]] = movers.get(cases[int(instance)], 0) + found
+    return dynamic(counts) | {
+        "scans": len(drive.log.scans),
+        "movers": {
+            case: {"points": int(n), "removed": round(float(k / n), 4)}
+            for case, (n, k) in sorted(movers.items())
+        },
+    }
+
+
+def what_they_do(folder: Path) -> dict[int, str]:
+    """What the mover of every instance number does in this drive: the traffic of its seed, once more."""
+    from gnss_sem_map.simulation.drive import prepare
+
+    seed = json.loads((folder / "truth" / "world.json").read_text("utf-8"))["seed"]
+    scans = len(list((folder / "velodyne_points" / "data").glob("*.bin")))
+    world = prepare(scans / 10, seed).world
+    return dict(
+        zip(world.instances[len(world.town.things) :].tolist(), (m.name for m in world.movers), strict=True)
     )
-    return figures
 
 
-def instance_names(file: Path) -> dict[int, str]:
-    """What the vehicle of every instance number is called, or does."""
-    with file.open(newline="") as rows:
-        return {int(row["instance"]): row["name"] for row in csv.DictReader(rows)}
+def semantics_of_simulated_drive(folder: Path) -> Figures:
+    """Strict figures of every stage, and what the paper's rule removes."""
+    drive = perfectly_seen(folder)
+    truth, alone = folder / "truth" / "labels", folder / "truth" / "single_frame"
+    return before_and_after(drive, find_moving(drive).points, truth, alone)
 
 
 def on_semantic_kitti(data: Path) -> Figures:

@@ -12,16 +12,18 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, kernel
+from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
+from gnss_sem_map.simulation.fan import SECTOR, Sweep, Work, list_near, look, room_for
 from gnss_sem_map.simulation.ground import FAR
 from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, uniform
-from gnss_sem_map.simulation.raycast import Scene, cast_ray
+from gnss_sem_map.simulation.raycast import Scene
 from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
 from gnss_sem_map.simulation.textures import window_at
 from gnss_sem_map.simulation.world import World
 
 _CABIN, _FACADE = int(Surface.CABIN), int(Surface.FACADE)
+_NOTHING = 255  # the kind of a ray that brought nothing back
 
 
 def _hdl_64e() -> Floats:
@@ -54,10 +56,17 @@ class Lidar:
 
     @cached_property
     def directions(self) -> Floats:
-        """Unit vectors of all rays in the LiDAR's axes, (rings, columns, 3)."""
-        a, e = self.azimuths[None, :], self.elevations[:, None]
+        """Unit vectors of all rays in the LiDAR's axes, (columns, rings, 3)."""
+        a, e = self.azimuths[:, None], self.elevations[None, :]
         parts = np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
         return np.stack(parts, axis=-1)
+
+    @cached_property
+    def planes(self) -> Floats:
+        """Across, ahead and up of the vertical plane of every column in the LiDAR's axes, (columns, 3, 3)."""
+        c, s, zero = np.cos(self.azimuths), np.sin(self.azimuths), np.zeros(self.columns)
+        rows = [[s, -c, zero], [c, s, zero], [zero, zero, zero + 1.0]]
+        return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,36 +82,35 @@ class SimulatedScan:
 @kernel
 def _sweep(
     scene: Scene,
-    T: Floats,
-    directions: Floats,
-    fractions: Floats,
+    sweep: Sweep,
+    work: Work,
     reflectances: Floats,
-    lidar: tuple[float, float, float, float],
+    lidar: Triple,
     key: int,
     points: Singles,
-    columns: Integers,
     kinds: Bytes,
     things: Integers,
-) -> int:
-    """Cast all rays of a sweep, ring after ring; returns how many came back, whose rows are filled in this order.
+) -> None:
+    """Cast all rays of a sweep, column after column; what comes back fills the ray's row, ring after ring.
 
-    `lidar`: reach, blind range, range noise, dropout. Coordinates are whole millimetres.
+    `lidar`: blind range, range noise, dropout. Coordinates are whole millimetres; `kinds` of the others stay.
     """
-    reach, blind, noise, dropout = lidar
-    count = 0
-    for ring in range(directions.shape[0]):
-        for column in range(directions.shape[1]):
-            if uniform(key, ring, column, 1) < dropout:
+    blind, noise, dropout = lidar
+    directions, rays, listed = sweep.directions, work.rays, 0
+    count = directions.shape[0]
+    for column in range(count):
+        if column % SECTOR == 0:
+            listed = list_near(sweep, column, min(column + SECTOR, count), work)
+        look(scene, sweep, column, listed, work)
+        ox, oy, oz = sweep.T[column, 0, 3], sweep.T[column, 1, 3], sweep.T[column, 2, 3]
+        for ring in range(directions.shape[1]):
+            t, thing, shape = work.distance[ring], work.things[ring], work.shapes[ring]
+            if t >= FAR or t < blind or uniform(key, ring, column, 1) < dropout:
                 continue
-            x, y, z = directions[ring, column, 0], directions[ring, column, 1], directions[ring, column, 2]
-            dx = T[column, 0, 0] * x + T[column, 0, 1] * y + T[column, 0, 2] * z
-            dy = T[column, 1, 0] * x + T[column, 1, 1] * y + T[column, 1, 2] * z
-            dz = T[column, 2, 0] * x + T[column, 2, 1] * y + T[column, 2, 2] * z
-            ox, oy, oz, f = T[column, 0, 3], T[column, 1, 3], T[column, 2, 3], fractions[column]
-            t, thing, shape = cast_ray(scene, reach, False, f, ox, oy, oz, dx, dy, dz)
-            if t >= FAR or t < blind:
-                continue
-            surface, kind, n, p, _ = surface_at(scene, thing, shape, f, ox, oy, oz, dx, dy, dz, t)
+            dx, dy, dz = rays[ring, 0], rays[ring, 1], rays[ring, 2]
+            surface, kind, n, p, _ = surface_at(
+                scene, thing, shape, sweep.fractions[column], ox, oy, oz, dx, dy, dz, t
+            )
             slant = abs(n[0] * dx + n[1] * dy + n[2] * dz)
             chance = uniform(key, ring, column, 2)
             # glass mirrors the beam away, and little comes back from dark ground at a grazing angle
@@ -115,11 +123,23 @@ def _sweep(
                 continue
             measured = 1000.0 * (t + noise * gaussian(key, ring, column, 3))
             bright = min(0.99, max(0.0, echo + 0.05 * gaussian(key, ring, column, 4)))
-            points[count, 0] = np.float32(np.rint(measured * x) / 1000.0)
-            points[count, 1] = np.float32(np.rint(measured * y) / 1000.0)
-            points[count, 2] = np.float32(np.rint(measured * z) / 1000.0)
-            points[count, 3] = np.float32(np.rint(100.0 * bright) / 100.0)
-            columns[count], kinds[count], things[count] = column, kind, thing
+            row = ring * count + column
+            for axis in range(3):
+                points[row, axis] = np.float32(np.rint(measured * directions[column, ring, axis]) / 1000.0)
+            points[row, 3] = np.float32(np.rint(100.0 * bright) / 100.0)
+            kinds[row], things[row] = kind, thing
+
+
+@kernel
+def _close_up(fractions: Floats, points: Singles, kinds: Bytes, things: Integers, measured: Floats) -> int:
+    """Move the rows that came back to the front, in order, and say when each was `measured`; returns how many."""
+    count = 0
+    for row in range(len(kinds)):
+        if kinds[row] != _NOTHING:
+            for axis in range(4):
+                points[count, axis] = points[row, axis]
+            kinds[count], things[count] = kinds[row], things[row]
+            measured[count] = fractions[row % len(fractions)]
             count += 1
     return count
 
@@ -141,23 +161,27 @@ def render_scan(
     lidar = lidar or Lidar()
     scene, fractions = world.scene(start, end), lidar.fractions
     T = world.ego.poses(start + fractions * (end - start)) @ T_imu_lidar
-    rays = len(lidar.elevations) * lidar.columns
-    points, columns = np.zeros((rays, 4), np.float32), np.zeros(rays, np.int32)
-    kinds, things = np.zeros(rays, np.uint8), np.zeros(rays, np.int32)
-    count = _sweep(
-        scene, T, lidar.directions, fractions, REFLECTANCES,
-        (lidar.range_m, lidar.blind_m, lidar.range_stddev_m, lidar.dropout),
-        seed * 1_000_003 + frame, points, columns, kinds, things,
+    fans = lidar.planes @ T[:, :3, :3].transpose(0, 2, 1)
+    sweep = Sweep(T, fans, fractions, lidar.directions, np.tan(lidar.elevations), lidar.range_m)
+    rays = lidar.columns * len(lidar.elevations)
+    points, measured = np.empty((rays, 4), np.float32), np.empty(rays)
+    kinds, things = np.full(rays, _NOTHING, np.uint8), np.empty(rays, np.int32)
+    _sweep(
+        scene, sweep, room_for(scene, sweep), REFLECTANCES, (lidar.blind_m, lidar.range_stddev_m, lidar.dropout),
+        seed * 1_000_003 + frame, points, kinds, things,
     )  # fmt: skip
+    count = _close_up(fractions, points, kinds, things, measured)
     labels = hit_labels(world, kinds[:count], things[:count])
-    return SimulatedScan(points[:count].copy(), labels, fractions[columns[:count]])
+    return SimulatedScan(points[:count].copy(), labels, measured[:count].copy())
 
 
 def hit_labels(
     world: World, kinds: npt.NDArray[np.uint8], things: npt.NDArray[np.int32]
 ) -> npt.NDArray[np.uint32]:
     """SemanticKITTI labels of hits: the kind, moving or not, and the instance in the high 16 bits."""
-    moving = things >= len(world.town.things)
-    instances = np.where(things >= 0, world.instances[things], 0).astype(np.uint32)
-    labels: npt.NDArray[np.uint32] = RAW_IDS[moving.astype(np.int64), kinds] | (instances << np.uint32(16))
+    n = len(world.town.things)
+    # GROUND and KERB are negative, and so count from the end: two more rows for them
+    ids = np.concatenate([world.instances, [0, 0]]).astype(np.uint32) << np.uint32(16)
+    moving = (things >= n).view(np.uint8)
+    labels: npt.NDArray[np.uint32] = RAW_IDS[moving, kinds] | ids[things]
     return labels

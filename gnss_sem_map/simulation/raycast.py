@@ -14,7 +14,7 @@ from gnss_sem_map.simulation.ground import FAR, Ground, hit_ground
 from gnss_sem_map.simulation.shapes import hit_shape
 
 CELL_M = 4.0
-_STEEPEST = 0.1  # no street is as steep as this
+STEEPEST = 0.1  # no street is as steep as this
 GROUND, KERB = -1, -2  # what a ray hit, when it is no thing
 
 # 0 x, y, z; 3 yaw, its cosine and sine; 6 shear along, across; 8 change per sweep of x, y, z, yaw; 12 whether it moves;
@@ -38,20 +38,40 @@ class Scene(NamedTuple):
 
 
 @inlined
-def into_thing(
-    things: Floats, k: int, fraction: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
-) -> tuple[float, float, float, float, float, float]:
-    """A ray in a thing's own axes, at this fraction of the sweep (0.5 is the frame's stamp)."""
-    px, py, pz, c, s = ox - things[k, 0], oy - things[k, 1], oz - things[k, 2], things[k, 4], things[k, 5]
+def from_thing(
+    things: Floats, k: int, fraction: float, x: float, y: float, z: float
+) -> tuple[float, float, float, float, float]:
+    """A point as seen from a thing's origin, in the map's axes, and the cosine and sine of the thing's heading.
+
+    Both at this fraction of the sweep (0.5 is the frame's stamp).
+    """
+    px, py, pz, c, s = x - things[k, 0], y - things[k, 1], z - things[k, 2], things[k, 4], things[k, 5]
     if things[k, 12] != 0.0:
         late = fraction - 0.5
         px, py, pz = px - late * things[k, 8], py - late * things[k, 9], pz - late * things[k, 10]
         yaw = things[k, 3] + late * things[k, 11]
         c, s = np.cos(yaw), np.sin(yaw)
-    ax, ay = c * px + s * py, c * py - s * px
-    bx, by = c * dx + s * dy, c * dy - s * dx
-    along, across = things[k, 6], things[k, 7]
-    return ax, ay, pz - along * ax - across * ay, bx, by, dz - along * bx - across * by
+    return px, py, pz, c, s
+
+
+@inlined
+def turned(
+    things: Floats, k: int, c: float, s: float, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """A vector in the axes of a thing of this heading."""
+    ax, ay = c * x + s * y, c * y - s * x
+    return ax, ay, z - things[k, 6] * ax - things[k, 7] * ay
+
+
+@inlined
+def into_thing(
+    things: Floats, k: int, fraction: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
+) -> tuple[float, float, float, float, float, float]:
+    """A ray in a thing's own axes, at this fraction of the sweep."""
+    px, py, pz, c, s = from_thing(things, k, fraction, ox, oy, oz)
+    ax, ay, az = turned(things, k, c, s, px, py, pz)
+    bx, by, bz = turned(things, k, c, s, dx, dy, dz)
+    return ax, ay, az, bx, by, bz
 
 
 @inlined
@@ -89,7 +109,7 @@ def hit_thing(
         low, high = oz + dz * enter - things[k, 2], oz + dz * leave - things[k, 2]
         if low > high:
             low, high = high, low
-        lean = _STEEPEST * reach
+        lean = STEEPEST * reach
         if enter > leave or high < things[k, 15] - lean or low > things[k, 18] + lean:
             return best, which
     ox, oy, oz, dx, dy, dz = into_thing(things, k, fraction, ox, oy, oz, dx, dy, dz)
@@ -133,7 +153,7 @@ def cast_ray(
     """
     things, shapes, top, chain = scene.things, scene.shapes, scene.top, scene.chain
     start, members, links = scene.start, scene.members, scene.links
-    best, kerb = (FAR, False) if shadow else hit_ground(scene.ground, ox, oy, oz, dx, dy, dz)
+    best, kerb = (FAR, False) if shadow else hit_ground(scene.ground, reach, ox, oy, oz, dx, dy, dz)
     thing, shape = (KERB if kerb else GROUND), -1
     found = best < reach
     best = min(best, reach)

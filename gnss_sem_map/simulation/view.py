@@ -29,7 +29,7 @@ def _on_same(
 ) -> tuple[float, int]:
     """Distance to one known shape, or to the ground; FAR where the ray misses it or may pass through it."""
     if thing in (GROUND, KERB):
-        t, kerb = hit_ground(scene.ground, ox, oy, oz, dx, dy, dz)
+        t, kerb = hit_ground(scene.ground, FAR, ox, oy, oz, dx, dy, dz)
         return (t if t < _REACH_M else FAR), (KERB if kerb else GROUND)
     surface = int(scene.shapes[shape, 12])
     if surface in (_LEAVES, _FENCE):

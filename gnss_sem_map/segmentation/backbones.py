@@ -78,9 +78,13 @@ class InvertedResidual(nn.Module):
         wide = expansion * channels
         self.shortcut = stride == 1 and channels == out
         self.output = nn.Sequential(
-            nn.Sequential(nn.Conv2d(channels, wide, 1, bias=False), nn.BatchNorm2d(wide), nn.ReLU6()),
             nn.Sequential(
-                nn.Conv2d(wide, wide, 3, stride, 1, groups=wide, bias=False), nn.BatchNorm2d(wide), nn.ReLU6()
+                nn.Conv2d(channels, wide, 1, bias=False), nn.BatchNorm2d(wide), nn.ReLU6(inplace=True)
+            ),
+            nn.Sequential(
+                nn.Conv2d(wide, wide, 3, stride, 1, groups=wide, bias=False),
+                nn.BatchNorm2d(wide),
+                nn.ReLU6(inplace=True),
             ),
             nn.Sequential(nn.Conv2d(wide, out, 1, bias=False), nn.BatchNorm2d(out)),
         )
@@ -99,7 +103,9 @@ class MobileNetV2(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layer1 = nn.Sequential(nn.Conv2d(3, 32, 3, 2, 1, bias=False), nn.BatchNorm2d(32), nn.ReLU6())
+        self.layer1 = nn.Sequential(
+            nn.Conv2d(3, 32, 3, 2, 1, bias=False), nn.BatchNorm2d(32), nn.ReLU6(inplace=True)
+        )
         channels = 32
         for number, (expansion, out, count, stride) in enumerate(INVERTED_RESIDUALS, start=2):
             widths = (channels, *([out] * count))

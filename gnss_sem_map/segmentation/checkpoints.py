@@ -17,7 +17,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
 from gnss_sem_map.segmentation.classes import VOID, named_classes
-from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, from_logits, placed
+from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, for_inference, from_logits
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 
@@ -58,7 +58,7 @@ def open_refinenet(
     load_strictly(network, checkpoint)
     names = named_classes(classes, class_count(checkpoint), label_set, str(path), checkpoint.class_names)
     where = find_device(device)
-    network = placed(network, where).eval()
+    network = for_inference(network, where)
     as_scale, as_shrink = scale_and_shrink(scale, shrink, str(path), checkpoint.scale)
     kept = [name for name in names if name != VOID]
     return NetworkSegmenter(from_logits(network, names), kept, where, MEAN, STD, as_scale, as_shrink)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.segmentation.networks import for_inference
 from gnss_sem_map.segmentation.refinenet import ChannelGains, LightWeightRefineNet, RefineNet
 
 
@@ -195,3 +196,22 @@ def test_gains_per_channel_are_the_grouped_convolution_of_the_checkpoints() -> N
     gains.load_state_dict(grouped.state_dict())
     x = torch.randn(2, 7, 5, 3)
     torch.testing.assert_close(gains(x), grouped(x))
+
+
+@pytest.mark.parametrize(
+    ("backbone", "layout"), [("resnet50", {}), ("mobilenet_v2", {"width": 32, "depth_head": False})]
+)
+def test_a_network_ready_for_inference_says_the_same_and_normalises_nowhere(
+    backbone: str, layout: dict[str, Any]
+) -> None:
+    torch.manual_seed(0)
+    network = LightWeightRefineNet(5, backbone, **layout)
+    images = torch.rand(2, 3, 70, 90)
+    network.train()(images)  # so that the running means and variances are not those of the beginning
+    network.eval()
+    with torch.inference_mode():
+        expected = network(images)
+        found = for_inference(network, torch.device("cpu"))(images)
+    assert not [m for m in network.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+    assert expected.std() > 1e-3
+    assert torch.allclose(found, expected, atol=1e-4 * float(expected.abs().max()))

@@ -3,7 +3,7 @@
     python examples/training_images.py streets 1 100
 
 writes streets/images and streets/labels (Cityscapes train ids), some images from along each of the streets 1 to 100:
-many streets teach more than many images of one. The bytes are those that `gnss-sem-map simulate` writes.
+many streets teach more than many images of one. The pixels are those that `gnss-sem-map simulate` writes.
 """
 
 import argparse

@@ -25,6 +25,7 @@ from gnss_sem_map.labelling import (
     NEAREST_DEPTH_M,
     NO_VIEW,
     ClassImage,
+    View,
     class_image,
     exposure_stamp,
     view_at,
@@ -104,17 +105,15 @@ def _see(
     """Everything between reading a scan and fusing it, in one pass over its points."""
     log, n = drive.log, len(points.xyz)
     mapping, labelling = drive.settings.mapping, drive.settings.labelling
-    view, valid, keys = NO_VIEW, np.zeros(n, np.bool_), np.empty(n, np.int64)
+    valid, keys = np.zeros(n, np.bool_), np.empty(n, np.int64)
     try:
         stamps, knots = knots_of(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
         )  # fmt: skip
-        if image is not None:
-            exposed = exposure_stamp(image[0], log.calibration, labelling)
-            view = view_at(exposed, drive.trajectory, log.calibration, n)
     except MeasurementError as error:
         account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         return None
+    view = _view_of(drive, image, n, account)
     count, inside = scan_kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
@@ -125,7 +124,7 @@ def _see(
         return None
     pixels = np.full(count, -1, np.int32)
     classes = np.empty((0, len(drive.label_set.names) + 1), np.uint8)
-    if image is not None:
+    if image is not None and view is not NO_VIEW:
         looking, seen = visible(view, inside, image[1], labelling)
         classes = image[1].at(seen)
         pixels[looking] = np.arange(len(looking))
@@ -137,6 +136,18 @@ def _see(
     if not seen_scan.keys.all():
         keys_of(seen_scan.p_map, mapping.voxel_size_m)  # says which point it is
     return seen_scan
+
+
+def _view_of(drive: Drive, image: tuple[Image, ClassImage] | None, n: int, account: Account) -> View:
+    """From where an image looked at n points; NO_VIEW without one, or where the trajectory does not reach."""
+    if image is None:
+        return NO_VIEW
+    exposed = exposure_stamp(image[0], drive.log.calibration, drive.settings.labelling)
+    try:
+        return view_at(exposed, drive.trajectory, drive.log.calibration, n)
+    except MeasurementError as error:
+        account.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
+        return NO_VIEW
 
 
 def map_points(

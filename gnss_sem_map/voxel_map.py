@@ -247,10 +247,6 @@ class VoxelTable:
     def __len__(self) -> int:
         return self._count
 
-    def keys_of(self, p_map: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Voxel key of every point (n, 3); raises DataError for a point that no key can hold."""
-        return keys_of(p_map, self.voxel_size_m)
-
     def add(
         self,
         keys: NDArray[np.int64],

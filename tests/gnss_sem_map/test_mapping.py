@@ -67,6 +67,21 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
     assert reasons == [("labels", "no image near its stamp")] * (len(drive.log.scans) - 2)
 
 
+def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_scans(
+    drive: Drive, at_once: tuple[Maps, Account]
+) -> None:
+    settings, account = drive.settings, Account()
+    late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0})
+    found = build_maps(
+        replace(drive, settings=settings.model_copy(update={"labelling": late})), account
+    ).static
+    np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
+    np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
+    assert not found.observed.any()
+    assert [skip.what for skip in account.skips] == ["labels"] * len(drive.log.scans)
+    assert all("trajectory" in skip.reason for skip in account.skips)
+
+
 @pytest.mark.parametrize(("chunk", "workers"), [(1, 1), (5, 1), (100, 1), (5, 2)])
 def test_chunks_and_processes_give_the_same_map_and_account(
     drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, chunk: int, workers: int

@@ -12,7 +12,7 @@ from gnss_sem_map import tiles
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.merging import into_frame, merge, merge_runs
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
 
 URBAN = label_set()
 HERE, THERE = LocalFrame(49.011, 8.423, 112.0), LocalFrame(49.0135, 8.4275, 120.0)
@@ -26,7 +26,7 @@ def street(frame: LocalFrame, seed: int = 0, size: float = 0.2) -> VoxelMap:
     p_map = frame.to_map(*HERE.to_geodetic(np.vstack([ground, wall])))
     classes = np.array([[250, 1, 1, 1, 1, 1], [1, 1, 1, 250, 1, 1]], np.uint8)
     table = VoxelTable(size, URBAN)
-    table.add(table.keys_of(p_map), np.repeat([0, 1], [40_000, 20_000]).astype(np.int32), classes)
+    table.add(keys_of(p_map, size), np.repeat([0, 1], [40_000, 20_000]).astype(np.int32), classes)
     return table.to_map()
 
 

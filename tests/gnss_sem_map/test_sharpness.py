@@ -43,7 +43,11 @@ def test_thickness_is_the_standard_deviation_across_the_surface(stddev: float) -
     assert wall.wall_thickness_m == pytest.approx(stddev, rel=0.03)
 
 
-def test_cubes_agree_with_numpy() -> None:
+@pytest.mark.parametrize("slots", [1 << 14, 4])
+def test_cubes_agree_with_numpy_in_a_large_table_and_in_one_that_grows(
+    slots: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sharpness, "SMALLEST_TABLE", slots)
     rng = np.random.default_rng(1)
     clouds = [rng.normal((70.0, -30.0, 4.0), 0.4, (3000, 3)) for _ in range(5)]
     found = sharpness.of_clouds(clouds, 10.0, FEW)

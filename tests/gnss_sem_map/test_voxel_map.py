@@ -44,7 +44,7 @@ def batches(seed: int, count: int = 6, points: int = 4000, spread: float = 4.0) 
 def by_table(parts: list[Batch], floor: float = 0.05) -> VoxelMap:
     table = VoxelTable(0.2, URBAN, floor)
     for p_map, pixels, classes in parts:
-        table.add(table.keys_of(p_map), pixels, classes)
+        table.add(keys_of(p_map, 0.2), pixels, classes)
     return table.to_map()
 
 
@@ -163,7 +163,7 @@ def test_a_point_that_no_key_can_hold_is_an_error_and_never_wraps(bad: float) ->
 
 def test_evidence_that_would_overflow_is_an_error() -> None:
     table = VoxelTable(0.2, URBAN, 0.01)
-    keys = table.keys_of(np.zeros((60_000, 3)))
+    keys = keys_of(np.zeros((60_000, 3)), 0.2)
     pixels, classes = np.zeros(60_000, np.int32), np.array([[255, 0, 0, 0, 0, 0]], np.uint8)
     for _ in range(3):
         table.add(keys, pixels, classes)
@@ -175,7 +175,7 @@ def test_a_voxel_without_a_look_has_no_label() -> None:
     table = VoxelTable(0.2, URBAN)
     p_map = np.array([[0.1, 0.1, 0.1], [1.1, 0.1, 0.1], [2.1, 0.1, 0.1]])
     classes = np.array([[0, 0, 200, 0, 0, 55], [0, 0, 0, 0, 0, 255]], np.uint8)
-    table.add(table.keys_of(p_map), np.array([0, -1, 1], np.int32), classes)
+    table.add(keys_of(p_map, 0.2), np.array([0, -1, 1], np.int32), classes)
     semantic = SemanticMap.of(table.to_map())
     assert semantic.labels.tolist() == [URBAN.index("vehicle"), -1, -1]
     assert semantic.states.tolist() == [State.OBSERVED, State.UNOBSERVED, State.UNOBSERVED]
@@ -218,9 +218,7 @@ def test_rows_hold_any_number_of_classes(names: int) -> None:
     rng = np.random.default_rng(7)
     table = VoxelTable(0.2, some)
     classes = rng.integers(0, 256, (50, names + 1)).astype(np.uint8)
-    table.add(
-        table.keys_of(rng.normal(0, 3, (2000, 3))), rng.integers(-1, 50, 2000).astype(np.int32), classes
-    )
+    table.add(keys_of(rng.normal(0, 3, (2000, 3)), 0.2), rng.integers(-1, 50, 2000).astype(np.int32), classes)
     fused = table.to_map()
     assert_same(VoxelMap.of_rows(rng.permutation(fused.to_rows()), 0.2, some), fused)
 

@@ -61,6 +61,30 @@ def usable_points_in_map(
     return p_map[: 3 * count].reshape(-1, 3), valid
 
 
+def usable_points_at_stamp(
+    points: Points,
+    stamp: float,
+    trajectory: Trajectory,
+    T_imu_lidar: NDArray[np.float64],
+    nearest_m: float = 0.0,
+    farthest_m: float = np.inf,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The usable points of one sweep as if all were seen at its stamp, (m, 3) m in the lidar frame, and T_map_lidar.
+
+    Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
+    """
+    T_map_lidar = trajectory.at([stamp], EXTRAPOLATE_S)[0] @ T_imu_lidar
+    stamps, knots = knots_of(points, stamp, trajectory, T_imu_lidar, nearest_m, farthest_m)
+    from_here = knots.poses.copy()
+    from_here[:, :, 3] -= T_map_lidar[:3, 3]
+    from_here = T_map_lidar[:3, :3].T @ from_here
+    valid, p_lidar = np.zeros(len(points.xyz), np.bool_), np.empty(3 * len(points.xyz))
+    count = scan_kernels.to_map(
+        points.rows, stamps, nearest_m, farthest_m, KNOTS_PER_S, knots.first, from_here, valid, p_lidar
+    )
+    return p_lidar[: 3 * count].reshape(-1, 3), T_map_lidar
+
+
 def knots_of(
     points: Points,
     stamp: float,

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import small_gicp
@@ -22,7 +24,7 @@ from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.account import Progress, silent
-from gnss_sem_map.deskew import EXTRAPOLATE_S, points_in_map
+from gnss_sem_map.deskew import usable_points_at_stamp
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
@@ -115,15 +117,14 @@ def match_scans(
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips = []
-    for done, scan in enumerate(log.scans):
+    for done, (scan, sweep) in enumerate(_prepared(log, trajectory, settings), 1):
         try:
-            cloud, T_map_lidar = _deskewed(scan, trajectory, log.calibration.T_imu_lidar, settings)
-            matches.append(odometry.match(scan, cloud, T_map_lidar))
+            matches.append(odometry.match(scan, sweep.result()))
         except (DataError, MeasurementError) as error:
             skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         except _NoMatch as error:
             skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
-        progress("scan matching", done + 1, len(log.scans))
+        progress("scan matching", done, len(log.scans))
     counts = Counter(
         {
             "scans matched": len(matches),
@@ -136,20 +137,50 @@ def match_scans(
     return ScanMatches(_relative_poses(pairs, log.calibration.T_imu_lidar, settings), tuple(skips), counts)
 
 
-def _deskewed(
+@dataclass(frozen=True, eq=False)
+class _Sweep:
+    """A sweep ready to be matched: its points, downsampled, each with its plane, and T_map_lidar by the trajectory."""
+
+    points: small_gicp.PointCloud
+    T_map_lidar: Array
+
+
+def _prepared(
+    log: SensorLog, trajectory: Trajectory, settings: ScanMatchingSettings
+) -> Iterator[tuple[Scan, Future[_Sweep]]]:
+    """Every scan of a drive, and what becomes of it: the next is prepared on a second core while one is matched."""
+    prepare = partial(
+        _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
+    )
+    with ThreadPoolExecutor(1, "sweeps") as worker:
+        ahead = [worker.submit(prepare, scan) for scan in log.scans[:1]]
+        for scan, following in zip(log.scans, (*log.scans[1:], None), strict=False):
+            sweep = ahead.pop()
+            if following is not None:
+                ahead.append(worker.submit(prepare, following))
+            yield scan, sweep
+
+
+def _prepare(
     scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
-) -> tuple[Array, Array]:
-    """The sweep's points as if all were seen at its stamp (n, 3), lidar frame, and where that is in the map."""
-    points = scan.read()
-    ranges = np.sqrt(np.einsum("ij,ij->i", points.xyz, points.xyz))
-    points = points[(ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)]  # False for NaN
-    if not len(points.xyz):
-        raise DataError(
-            f"no point between {settings.nearest_m:g} and {settings.farthest_m:g} m of {len(ranges)}"
+) -> _Sweep:
+    """Deskew a sweep, keep one point per cube, and fit a plane to each.
+
+    By one thread: two keep other points every time.
+    """
+    raw, nearest_m, farthest_m = scan.read(), settings.nearest_m, settings.farthest_m
+    cloud, T_map_lidar = usable_points_at_stamp(
+        raw, scan.stamp, trajectory, T_imu_lidar, nearest_m, farthest_m
+    )
+    if not len(cloud):
+        raise DataError(f"no point between {nearest_m:g} and {farthest_m:g} m of {len(raw.xyz)}")
+    points = small_gicp.voxelgrid_sampling(cloud, settings.downsampling_m)
+    if points.size() < settings.min_points:
+        raise _NoMatch(
+            f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
         )
-    T_map_lidar = trajectory.at([scan.stamp], EXTRAPOLATE_S)[0] @ T_imu_lidar
-    p_map = points_in_map(points, scan.stamp, trajectory, T_imu_lidar)
-    return (p_map - T_map_lidar[:3, 3]) @ T_map_lidar[:3, :3], T_map_lidar
+    small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS)
+    return _Sweep(points, T_map_lidar)
 
 
 class _Odometry:
@@ -160,9 +191,8 @@ class _Odometry:
         self._settings = settings
         self._last: tuple[Scan, Array, Array] | None = None
 
-    def match(self, scan: Scan, cloud: Array, T_map_lidar: Array) -> _Match:
+    def match(self, scan: Scan, sweep: _Sweep) -> _Match:
         """Register a sweep and add it to the local map; raises _NoMatch, and leaves the map as it was."""
-        points = self._downsampled(cloud)
         if self._last is None or scan.stamp - self._last[0].stamp > self._settings.max_gap_s:
             self._map = small_gicp.GaussianVoxelMap(self._settings.voxel_size_m)
             self._map.set_lru(horizon=self._settings.map_scans)
@@ -170,23 +200,11 @@ class _Odometry:
             T, covariance, is_open = np.eye(4), np.zeros((6, 6)), False
         else:
             _, T_last, T_map_last = self._last
-            guess = T_last @ np.linalg.inv(T_map_last) @ T_map_lidar
-            T, covariance, is_open = self._register(points, guess)
-        self._map.insert(points, T)
-        self._last = scan, T, T_map_lidar
+            guess = T_last @ np.linalg.inv(T_map_last) @ sweep.T_map_lidar
+            T, covariance, is_open = self._register(sweep.points, guess)
+        self._map.insert(sweep.points, T)
+        self._last = scan, T, sweep.T_map_lidar
         return _Match(scan, self.local_maps, T, covariance, is_open)
-
-    def _downsampled(self, cloud: Array) -> small_gicp.PointCloud:
-        """One point per cube, each with its plane. By one thread: two keep other points every time."""
-        settings = self._settings
-        points = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(cloud), settings.downsampling_m)
-        if points.size() < settings.min_points:
-            raise _NoMatch(
-                f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
-            )
-        tree = small_gicp.KdTree(points)
-        small_gicp.estimate_covariances(points, tree, NEIGHBOURS)
-        return points
 
     def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:
         settings = self._settings

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.deskew import points_in_map, usable_points_in_map
+from gnss_sem_map.deskew import points_in_map, usable_points_at_stamp, usable_points_in_map
 from gnss_sem_map.sensor_log import Points
 
 T_IMU_LIDAR = np.eye(4)
@@ -41,6 +41,17 @@ def test_every_point_moves_with_the_pose_of_its_own_stamp() -> None:
     exact = np.einsum("nij,nj->ni", T[:, :3, :3], points.xyz.astype(np.float64)) + T[:, :3, 3]
     moved = points_in_map(points, 0.45, trajectory, T_IMU_LIDAR)
     assert np.abs(moved - exact).max() < 5e-4
+
+
+def test_seen_from_the_stamp_of_the_sweep_the_points_are_the_same() -> None:
+    points, trajectory = sweep(), turning()
+    p_map, valid = usable_points_in_map(points, 0.45, trajectory, T_IMU_LIDAR, 5.0, 70.0)
+    p_lidar, T_map_lidar = usable_points_at_stamp(points, 0.45, trajectory, T_IMU_LIDAR, 5.0, 70.0)
+    assert 0 < valid.sum() < len(valid)
+    np.testing.assert_allclose(p_lidar @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3], p_map, atol=1e-9)
+    still = Points(points.xyz, points.intensity, None)
+    as_read, _ = usable_points_at_stamp(still, 0.45, trajectory, T_IMU_LIDAR, 5.0, 70.0)
+    np.testing.assert_allclose(as_read, points.xyz[valid], atol=1e-9)
 
 
 def test_a_point_does_not_move_for_what_else_the_sweep_holds() -> None:

@@ -11,18 +11,21 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import voxel_kernels
 from gnss_sem_map.account import Progress, silent
-from gnss_sem_map.deskew import EXTRAPOLATE_S, points_in_map
+from gnss_sem_map.deskew import EXTRAPOLATE_S, usable_points_in_map
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 from gnss_sem_map.voxel_map import keys_of
 
 Array = NDArray[np.float64]
+Keys = NDArray[np.int64]
 
 UPPER = np.triu_indices(3)
 GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
@@ -30,6 +33,11 @@ GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
 LENGTH_STEP_S = 1.0
 THINNEST_M = 1e-4
 """No LiDAR measures finer: keeps the logarithm of the entropy finite."""
+SCANS, LAST_SCAN, SUMS = 1, 2, 3
+"""Words of a cube's row behind its key: sweeps that saw it, the last of them, and ten sums (float64): the number of
+points, first and second moments about the cube's middle."""
+CUBE_WORDS = SUMS + 10
+SMALLEST_TABLE = 1 << 14
 
 
 class SharpnessSettings(BaseModel):
@@ -76,8 +84,10 @@ def of_clouds(
 ) -> Sharpness:
     """Sharpness of sweeps whose points (n, 3) are in the map; `length_m` is how far the vehicle drove."""
     settings = settings or SharpnessSettings()
-    blocks = [_block(p_map, settings) for p_map in clouds]
-    return _merge([blocks], length_m, settings)
+    stretch = _Stretch(settings)
+    for p_map in clouds:
+        stretch.add(p_map)
+    return _sharpness([stretch], length_m)
 
 
 def of_drive(
@@ -92,30 +102,26 @@ def of_drive(
     out: it blurs alike for every trajectory.
     """
     settings = settings or SharpnessSettings()
-    stretches: list[list[list[_Block]]] = []
-    lengths = np.zeros(len(trajectories))
     chosen = _stretches(log.scans, settings)
+    gathered: list[list[_Stretch]] = [[] for _ in trajectories]
+    lengths = np.zeros(len(trajectories))
     total, done = sum(len(stretch) for stretch in chosen), 0
-    for stretch in chosen:
-        seen: list[tuple[float, list[_Block]]] = []
-        for scan in stretch:
+    for scans in chosen:
+        stretches, stamps = [_Stretch(settings) for _ in trajectories], []
+        for scan in scans:
             done += 1
             progress("sharpness", done, total)
             try:
-                points = _in_range(scan.read(), settings)
-                clouds = [
-                    points_in_map(points, scan.stamp, t, log.calibration.T_imu_lidar) for t in trajectories
-                ]
-                seen.append((scan.stamp, [_block(p_map, settings) for p_map in clouds]))
+                clouds = _clouds(scan, trajectories, log.calibration.T_imu_lidar, settings)
             except (DataError, MeasurementError):
                 continue  # counted when the map is built
-        stamps = np.array([stamp for stamp, _ in seen])
-        lengths += [_length(t, stamps) for t in trajectories]
-        stretches.append([blocks for _, blocks in seen])
-    return [
-        _merge([[blocks[k] for blocks in stretch] for stretch in stretches], float(lengths[k]), settings)
-        for k in range(len(trajectories))
-    ]
+            stamps.append(scan.stamp)
+            for stretch, p_map in zip(stretches, clouds, strict=True):
+                stretch.add(p_map)
+        lengths += [_length(t, np.array(stamps)) for t in trajectories]
+        for of_one, stretch in zip(gathered, stretches, strict=True):
+            of_one.append(stretch)
+    return [_sharpness(of_one, length) for of_one, length in zip(gathered, lengths.tolist(), strict=True)]
 
 
 def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tuple[Scan, ...]]:
@@ -127,11 +133,19 @@ def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tup
     return [scans[start : start + settings.stretch_scans] for start in starts.tolist()]
 
 
-def _in_range(points: Points, settings: SharpnessSettings) -> Points:
-    ranges = np.sqrt(np.einsum("ij,ij->i", points.xyz, points.xyz))
-    use = (ranges >= settings.nearest_m) & (ranges <= settings.farthest_m)  # False for NaN
-    use[np.arange(len(use)) % settings.every_nth_point > 0] = False
-    return points[use]
+def _clouds(
+    scan: Scan, trajectories: Sequence[Trajectory], T_imu_lidar: Array, settings: SharpnessSettings
+) -> list[Array]:
+    """The points of a sweep in the map (n, 3) by each trajectory."""
+    every, points = settings.every_nth_point, scan.read()
+    stamps = None if points.stamps is None else points.stamps[::every]
+    some = Points(points.xyz[::every], points.intensity[::every], stamps)
+    return [
+        usable_points_in_map(
+            some, scan.stamp, trajectory, T_imu_lidar, settings.nearest_m, settings.farthest_m
+        )[0]
+        for trajectory in trajectories
+    ]
 
 
 def _length(trajectory: Trajectory, stamps: Array) -> float:
@@ -142,41 +156,114 @@ def _length(trajectory: Trajectory, stamps: Array) -> float:
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """One sweep as sums per cube; they add up over sweeps."""
+class _Stretch:
+    """The points of neighbouring sweeps, as sums per cube and as occupied voxels; it grows with the place only."""
 
-    keys: NDArray[np.int64]
-    sums: Array
-    """(c, 10): number of points, first and second moments about the cube's middle."""
-    voxels: NDArray[np.int64]
+    def __init__(self, settings: SharpnessSettings) -> None:
+        self.scans = 0
+        self._settings = settings
+        self._cubes, self._voxels = _empty(SMALLEST_TABLE, CUBE_WORDS), _empty(SMALLEST_TABLE, 1)
+        self._cube_count = self.voxels = 0
+
+    def add(self, p_map: Array) -> None:
+        """The points (n, 3) of one more sweep; raises DataError for a point that is not inside the map."""
+        cubes = keys_of(p_map, self._settings.cell_size_m)
+        voxels = keys_of(p_map, self._settings.voxel_size_m)
+        self.scans += 1
+        done = 0
+        while done < len(cubes):
+            self._cubes = _with_room(self._cubes, self._cube_count)
+            self._cube_count, done = _gather(
+                self._cubes, self._cubes.view(np.float64), self._cube_count, done, cubes, p_map,
+                self._settings.cell_size_m, self.scans,
+            )  # fmt: skip
+        done = 0
+        while done < len(voxels):
+            self._voxels = _with_room(self._voxels, self.voxels)
+            self.voxels, done = _occupy(self._voxels, self.voxels, done, voxels)
+
+    def surfaces(self) -> tuple[Array, Array]:
+        """Variances (c, 3), smallest first, of the cubes seen often enough, and the |z| of their normals (c,)."""
+        seen = self._cubes[:, SCANS] >= self._settings.min_scans
+        sums = self._cubes.view(np.float64)[seen, SUMS:]
+        sums = sums[sums[:, 0] >= self._settings.min_points]
+        mean = sums[:, 1:4] / sums[:, :1]
+        covariances = np.empty((len(sums), 3, 3))
+        i, j = UPPER
+        covariances[:, i, j] = covariances[:, j, i] = sums[:, 4:] / sums[:, :1] - mean[:, i] * mean[:, j]
+        variances, axes = np.linalg.eigh(covariances)
+        return np.maximum(variances, THINNEST_M**2), np.abs(axes[:, 2, 0])
 
 
-def _block(p_map: Array, settings: SharpnessSettings) -> _Block:
-    keys, place = np.unique(keys_of(p_map, settings.cell_size_m), return_inverse=True)
-    from_middle = p_map - (np.floor(p_map / settings.cell_size_m) + 0.5) * settings.cell_size_m
-    columns = np.column_stack(
-        [
-            np.ones(len(p_map)),
-            from_middle,
-            *(from_middle[:, i] * from_middle[:, j] for i, j in zip(*UPPER, strict=True)),
-        ]
-    )
-    return _Block(keys, _sum_by(place, columns, len(keys)), np.unique(keys_of(p_map, settings.voxel_size_m)))
+def _empty(slots: int, words: int) -> Keys:
+    return np.zeros((slots, words), np.int64)
 
 
-def _sum_by(place: NDArray[np.intp], columns: Array, n: int) -> Array:
-    return np.column_stack([np.bincount(place, column, n) for column in columns.T])
+def _with_room(rows: Keys, count: int) -> Keys:
+    """The table itself, or when it is half full one twice as large."""
+    if 2 * count < len(rows):
+        return rows
+    larger = _empty(2 * len(rows), rows.shape[1])
+    voxel_kernels.rehash(rows, larger)
+    return larger
 
 
-def _merge(stretches: list[list[_Block]], length_m: float, settings: SharpnessSettings) -> Sharpness:
-    scans = sum(len(stretch) for stretch in stretches)
-    parts = [_surfaces(stretch, settings) for stretch in stretches if stretch]
-    variances = np.concatenate([np.empty((0, 3)), *(part[0] for part in parts)])
-    steepness = np.concatenate([np.empty(0), *(part[1] for part in parts)])
-    voxels = sum(
-        len(np.unique(np.concatenate([b.voxels for b in stretch]))) for stretch in stretches if stretch
-    )
+@njit(cache=True, nogil=True)
+def _gather(
+    rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
+) -> tuple[int, int]:
+    """Add points from `start` on to their cubes, moments about the cube's middle, until the table is half full.
+
+    `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
+    """
+    for i in range(start, len(keys)):
+        row = voxel_kernels.find_or_insert(rows, keys[i])
+        if rows[row, 0] == 0:
+            if 2 * count >= len(rows):
+                return count, i
+            rows[row, 0] = keys[i]
+            count += 1
+        if rows[row, LAST_SCAN] != scan:
+            rows[row, LAST_SCAN] = scan
+            rows[row, SCANS] += 1
+        x, y, z = p_map[i, 0] / size_m, p_map[i, 1] / size_m, p_map[i, 2] / size_m
+        x, y, z = (
+            (x - np.floor(x) - 0.5) * size_m,
+            (y - np.floor(y) - 0.5) * size_m,
+            (z - np.floor(z) - 0.5) * size_m,
+        )
+        here = sums[row, SUMS:]
+        here[0] += 1.0
+        here[1] += x
+        here[2] += y
+        here[3] += z
+        here[4] += x * x
+        here[5] += x * y
+        here[6] += x * z
+        here[7] += y * y
+        here[8] += y * z
+        here[9] += z * z
+    return count, len(keys)
+
+
+@njit(cache=True, nogil=True)
+def _occupy(rows: Keys, count: int, start: int, keys: Keys) -> tuple[int, int]:
+    """Add keys from `start` on, until the table is half full; returns how many there are, and the first not added."""
+    for i in range(start, len(keys)):
+        row = voxel_kernels.find_or_insert(rows, keys[i])
+        if rows[row, 0] == 0:
+            if 2 * count >= len(rows):
+                return count, i
+            rows[row, 0] = keys[i]
+            count += 1
+    return count, len(keys)
+
+
+def _sharpness(stretches: list[_Stretch], length_m: float) -> Sharpness:
+    surfaces = [stretch.surfaces() for stretch in stretches]
+    variances = np.concatenate([np.empty((0, 3)), *(variances for variances, _ in surfaces)])
+    steepness = np.concatenate([np.empty(0), *(steepness for _, steepness in surfaces)])
+    voxels = sum(stretch.voxels for stretch in stretches)
     thickness = np.sqrt(variances[:, 0])
     entropies = 0.5 * (3 * np.log(2 * np.pi * np.e) + np.log(variances).sum(axis=1))
     return Sharpness(
@@ -187,23 +274,8 @@ def _merge(stretches: list[list[_Block]], length_m: float, settings: SharpnessSe
         voxels_per_m=voxels / length_m if length_m > 1.0 else float("nan"),
         voxels=voxels,
         cells=len(thickness),
-        scans=scans,
+        scans=sum(stretch.scans for stretch in stretches),
     )
-
-
-def _surfaces(stretch: list[_Block], settings: SharpnessSettings) -> tuple[Array, Array]:
-    """Variances (c, 3), smallest first, of the cubes seen often enough, and the |z| of their normals (c,)."""
-    keys, place, seen = np.unique(
-        np.concatenate([block.keys for block in stretch]), return_inverse=True, return_counts=True
-    )
-    sums = _sum_by(place, np.concatenate([block.sums for block in stretch]), len(keys))
-    sums = sums[(sums[:, 0] >= settings.min_points) & (seen >= settings.min_scans)]
-    mean = sums[:, 1:4] / sums[:, :1]
-    covariances = np.empty((len(sums), 3, 3))
-    i, j = UPPER
-    covariances[:, i, j] = covariances[:, j, i] = sums[:, 4:] / sums[:, :1] - mean[:, i] * mean[:, j]
-    variances, axes = np.linalg.eigh(covariances)
-    return np.maximum(variances, THINNEST_M**2), np.abs(axes[:, 2, 0])
 
 
 def _median(values: Array) -> float:

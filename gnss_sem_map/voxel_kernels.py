@@ -65,7 +65,8 @@ def _home(key, size):
 
 
 @njit(cache=True, nogil=True)
-def _find_or_insert(rows, key):
+def find_or_insert(rows, key):
+    """Row of a key in a hash table (slots, words), or the empty row where it belongs; one must be empty."""
     slot = _home(key, len(rows))
     while rows[slot, 0] != key and rows[slot, 0] != 0:
         slot += 1
@@ -108,7 +109,7 @@ def fuse(
         if run + PREFETCH_AHEAD < runs:
             _prefetch(rows, _home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
         first, end = starts[run], starts[run + 1]
-        slot = _find_or_insert(rows, keys[first])
+        slot = find_or_insert(rows, keys[first])
         if rows[slot, 0] == 0:
             if count == capacity:
                 return count, first
@@ -184,7 +185,7 @@ def rehash(old, new):
     """Move every voxel of a table into a larger, empty one."""
     for i in range(len(old)):
         if old[i, 0] != 0:
-            slot = _find_or_insert(new, old[i, 0])
+            slot = find_or_insert(new, old[i, 0])
             for word in range(old.shape[1]):
                 new[slot, word] = old[i, word]
 

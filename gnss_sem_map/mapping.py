@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import os
 import pickle
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,6 +27,7 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.chunks import ChunkStore, open_store
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import ConfigError, DataError
@@ -183,17 +185,27 @@ def label_points(
 
     `moving` (see `Drive`) are points that the last map, the refined one, has removed: vehicles, whatever stands there.
     """
-    for scan in log.scans:
+    one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
+
+    def look(scan: Scan) -> list[PointLabels] | None:
         try:
             points = scan.read()
             p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
-            continue  # counted when the map was built
+            return None  # counted when the map was built
         keys = keys_of(p_map, settings.mapping.voxel_size_m)
-        found = [_look_up(semantic_map, keys, valid) for semantic_map in maps]
+        places = [m.voxels.places(keys) for m in (maps[:1] if one_grid else maps)]
+        places *= len(maps) // len(places)
+        found = [
+            _look_up(semantic_map, place, valid) for semantic_map, place in zip(maps, places, strict=True)
+        ]
         if moving is not None and scan.number in moving:
             _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
-        yield scan, found
+        return found
+
+    for scan, found in ahead(look, log.scans, threads=os.cpu_count() or 1):
+        if found is not None:
+            yield scan, found
 
 
 def _remove(found: PointLabels, places: NDArray[np.int64], semantic_map: SemanticMap) -> None:
@@ -204,8 +216,7 @@ def _remove(found: PointLabels, places: NDArray[np.int64], semantic_map: Semanti
     found.removed[places] = True
 
 
-def _look_up(semantic_map: SemanticMap, keys: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:
-    places = semantic_map.voxels.places(keys)
+def _look_up(semantic_map: SemanticMap, places: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:
     known = valid.copy()
     known[valid] = places >= 0
     places = places[places >= 0]

@@ -6,10 +6,8 @@ Files are read and decoded a few scans ahead, in a thread.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +16,7 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import labels, scan_kernels
 from gnss_sem_map.account import Account
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.config import Settings
 from gnss_sem_map.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
 from gnss_sem_map.errors import DataError
@@ -95,7 +94,7 @@ def seen_scans(drive: Drive, account: Account | None = None) -> Iterator[SeenSca
 def look_at(drive: Drive, scans: Sequence[Scan], account: Account) -> Iterator[SeenScan | None]:
     """Every scan, or None for one that cannot be used; why is in the account."""
     look = _Look(drive.log, drive.segmenter, drive.settings, account)
-    for scan, points, classes in _read_ahead(scans, look):
+    for scan, (points, classes) in ahead(look, scans, under_way=READ_AHEAD):
         yield None if points is None else _see(drive, scan, points, classes, account)
 
 
@@ -194,19 +193,3 @@ class _Look:
         except MissingLabels as error:
             self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None
-
-
-def _read_ahead(
-    scans: Sequence[Scan], look: _Look
-) -> Iterator[tuple[Scan, Points | None, tuple[Image, ClassImage] | None]]:
-    """Scans with what they and their images hold, in order; files are read and decoded a few ahead, in a thread."""
-    with ThreadPoolExecutor(max_workers=1) as thread:
-        waiting = iter(scans)
-        ahead: list[tuple[Scan, Future[tuple[Points | None, tuple[Image, ClassImage] | None]]]] = [
-            (scan, thread.submit(look, scan)) for scan in islice(waiting, READ_AHEAD)
-        ]
-        while ahead:
-            scan, reading = ahead.pop(0)
-            points, classes = reading.result()
-            ahead.extend((later, thread.submit(look, later)) for later in islice(waiting, 1))
-            yield scan, points, classes

@@ -116,10 +116,9 @@ def _unseen(noise: ImuNoise, span_s: float) -> ImuNoise:
 def _distinct(stamps: Array, keep: Array | None = None) -> Array:
     """Sorted stamps without those that follow another too closely; the ones in `keep` stay."""
     if keep is None:
-        close = np.diff(stamps, prepend=-np.inf) < SAME_STAMP_S
-        close[-1] = False  # the last stamp is the end of the log: the one before it goes instead
-        if len(stamps) > 2 and stamps[-1] - stamps[-2] < SAME_STAMP_S:
-            close[-2] = True
+        # the last stamp is the end of the log: it stays, however many lie beside it
+        close = (np.diff(stamps, prepend=-np.inf) < SAME_STAMP_S) | (stamps > stamps[-1] - SAME_STAMP_S)
+        close[-1] = False
         return stamps[~close]
     nearest = np.clip(np.searchsorted(keep, stamps), 1, len(keep) - 1)
     distance = np.minimum(np.abs(stamps - keep[nearest - 1]), np.abs(stamps - keep[nearest]))

@@ -22,7 +22,7 @@ from factor_graphs.graph import (
 from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import correlation_time, decorrelate, inside, plausible
+from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
@@ -126,8 +126,8 @@ def pose_problem(
         )
     relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
     relative = relative[relative_used]
-    correlation_time_s = correlation_time(fixes[used], settings, steady=len(relative) > 0)
-    kept = decorrelate(fixes[used], correlation_time_s, settings.min_fix_stddev_m)
+    correlation_times_s = correlation_times(fixes[used], settings, relative.stamps)
+    kept = decorrelate(fixes[used], correlation_times_s, settings.min_fix_stddev_m)
     marks = np.concatenate([kept.stamps, relative.stamps.ravel()])
     intervals = split(imu, marks, settings.keyframe_interval_s)
     if intervals.blind.any():

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.settings import SmootherSettings
 
+Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # However slow the vehicle, two good fixes may differ by this much, m.
@@ -49,22 +50,29 @@ def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max
     return keep
 
 
-def correlation_time(fixes: GnssFixes, settings: SmootherSettings, steady: bool) -> float:
-    """How long the error of a fix lasts, s.
+def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_stamps: Array) -> Array:
+    """How long the error of each fix lasts, (m,) s; `relative_stamps` (k, 2) s are those of the relative poses.
 
-    An inertial unit's positions, ten a second, drift together for a minute. Where something else holds the shape
-    of the track (`steady`), they must not turn it: over a short way their drift looks like another heading.
+    An inertial unit's positions, ten a second, drift together for a minute. Where relative poses hold the shape of
+    the track, they must not turn it: over a short way their drift looks like another heading. Elsewhere nothing but
+    they and the IMU holds it.
     """
-    drifting = steady and len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
-    return max(settings.fix_correlation_time_s, settings.drift_correlation_time_s if drifting else 0.0)
+    times = np.full(len(fixes), settings.fix_correlation_time_s)
+    if len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S:
+        begun = np.searchsorted(np.sort(relative_stamps[:, 0]), fixes.stamps, side="right")
+        ended = np.searchsorted(np.sort(relative_stamps[:, 1]), fixes.stamps, side="left")
+        drift = max(settings.fix_correlation_time_s, settings.drift_correlation_time_s)
+        times[begun > ended] = drift
+    return times
 
 
-def decorrelate(fixes: GnssFixes, correlation_time_s: float, min_stddev_m: float) -> GnssFixes:
-    """The same fixes with stddevs such that all within one correlation time together weigh as one.
+def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev_m: float) -> GnssFixes:
+    """The same fixes with stddevs such that all within one correlation time, (m,) or one for all, weigh as one.
 
     An inertial unit that reports its filtered position ten times a second says the same thing ten times.
     """
-    first = np.searchsorted(fixes.stamps, fixes.stamps - correlation_time_s / 2 + 1e-9)
-    last = np.searchsorted(fixes.stamps, fixes.stamps + correlation_time_s / 2 - 1e-9)
+    half = np.asarray(correlation_times_s) / 2
+    first = np.searchsorted(fixes.stamps, fixes.stamps - half + 1e-9)
+    last = np.searchsorted(fixes.stamps, fixes.stamps + half - 1e-9)
     crowd = np.maximum(last - first, 1)[:, None]
     return GnssFixes(fixes.stamps, fixes.positions, np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))

@@ -28,6 +28,16 @@ def test_the_intervals_cover_the_imu_without_a_hole_and_have_a_keyframe_at_every
     np.testing.assert_allclose(whole, (stamps[-1] ** 2 - stamps[0] ** 2) / 2, rtol=1e-9)
 
 
+def test_measurements_that_end_together_with_the_imu_leave_no_empty_interval():
+    """A fix and the later ends of several relative poses may all bear the stamp of the last sample."""
+    stamps = np.arange(0.0, 2.0, 0.01)
+    for beside in (0.0, 2e-4):
+        cut = split(imu_at(stamps), np.array([0.0, 0.0, 1.0, 1.0, *[stamps[-1] - beside] * 3]))
+        assert (cut.keyframes[0], cut.keyframes[-1]) == (stamps[0], stamps[-1])
+        assert np.diff(cut.keyframes).min() > 0.5
+        assert np.diff(cut.nodes).min() > 5e-3
+
+
 def test_a_silent_imu_is_an_interval_of_its_own_with_the_noise_of_an_unseen_vehicle():
     stamps = np.concatenate([np.arange(0.0, 2.0, 0.01), np.arange(3.5, 5.0, 0.01)])
     cut = split(imu_at(stamps), np.array([0.5, 2.7]))

@@ -3,7 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.screening import decorrelate, inside, plausible
+from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
+from factor_graphs.settings import SmootherSettings
 
 
 def fixes_along(x: np.ndarray, stamps: np.ndarray | None = None) -> GnssFixes:
@@ -41,6 +42,27 @@ def test_ten_fixes_a_second_weigh_as_one_and_one_a_second_keeps_its_weight():
     fast = decorrelate(fixes_along(np.arange(500.0), np.arange(500) * 0.1), 1.0, 0.02)
     weight_per_second = np.sum(1 / fast.stddevs[100:400, 0] ** 2) / 30
     assert np.isclose(weight_per_second, 1.0, rtol=0.15)
+
+
+def test_fixes_drift_together_only_where_an_inertial_unit_reports_them_and_relative_poses_hold_the_shape():
+    settings = SmootherSettings(fix_correlation_time_s=1.0, drift_correlation_time_s=10.0)
+    stamps = np.arange(0.0, 20.0, 0.1)
+    unit = fixes_along(5 * stamps, stamps)
+    pairs = np.array([[3.95, 4.05], [3.95, 5.05], [11.95, 12.05], [4.05, 4.15]])
+    times = correlation_times(unit, settings, pairs)
+    held = ((stamps > 3.95) & (stamps < 5.05)) | ((stamps > 11.95) & (stamps < 12.05))
+    np.testing.assert_array_equal(times, np.where(held, 10.0, 1.0))
+    np.testing.assert_array_equal(correlation_times(unit, settings, np.empty((0, 2))), 1.0)
+    receiver = fixes_along(5 * np.arange(20.0))
+    np.testing.assert_array_equal(correlation_times(receiver, settings, pairs), 1.0)
+
+
+def test_fixes_of_different_correlation_times_lose_weight_each_by_its_own():
+    stamps = np.arange(500) * 0.1
+    both = decorrelate(fixes_along(stamps, stamps), np.where(stamps < 25.0, 1.0, 10.0), 0.02)
+    for time, rows in ((1.0, slice(50, 150)), (10.0, slice(350, 400))):
+        alone = decorrelate(fixes_along(stamps, stamps), time, 0.02)
+        np.testing.assert_array_equal(both.stddevs[rows], alone.stddevs[rows])
 
 
 def test_no_fix_is_trusted_beyond_the_least_stddev():

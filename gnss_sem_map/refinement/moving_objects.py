@@ -8,7 +8,7 @@ to something that moved.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement import range_images
-from gnss_sem_map.refinement.segments import VOXEL_M, find_segments, height_over_ground, near, take_apart
+from gnss_sem_map.refinement.distinct import distinct
+from gnss_sem_map.refinement.scan_grid import height_over_ground, near
+from gnss_sem_map.refinement.segments import Segments, find_segments, take_apart
 from gnss_sem_map.refinement.tracks import Segment
-from gnss_sem_map.refinement.vehicles import groups
 from gnss_sem_map.refinement.verdicts import GONE, MotionSettings, TrackedObject, judge
-from gnss_sem_map.voxel_map import keys_of
 
 FOOT_M, BODY_M = 0.05, 0.2
 """An object's body begins this high over the lowest ground around; its foot is what lies between, right under it."""
@@ -50,14 +50,10 @@ class _Observation:
     """(h,) where these points are in the scan."""
     p_map: NDArray[np.float64]
     """(h, 3) m."""
-    is_object: NDArray[np.bool_]
-    """(h,) whether the image calls it a vehicle."""
     is_body: NDArray[np.bool_]
     """(h,) whether it is higher than the foot of an object."""
-    segments: NDArray[np.int32]
-    """(h,) segment of the scan; -1 for points that only stand beside one."""
-    cut: NDArray[np.bool_]
-    """(s,) segments that the edge of the view or something nearer cuts."""
+    segments: Segments
+    """Of these points; some only stand beside one."""
 
 
 class MovingObjectDetector:
@@ -109,34 +105,42 @@ class MovingObjectDetector:
         """Decide about the oldest scans, by the testimony of all, and let go of their points."""
         if count == 0:
             return MovingObjects({}, ())
-        hits, throughs = self._testimony()
-        of_point = _apart(self._observations, hits, throughs, self._settings)
-        segments = _all_segments(self._observations, of_point)
-        numbers = np.concatenate(of_point)
-        hit, through = (_sums(numbers, looks, len(segments)) for looks in (hits, throughs))
-        objects = judge(segments, hit, through, self._settings)
-        gone = np.zeros(len(segments) + 1, np.bool_)  # the last one: points of no segment
+        looks = self._testimony()
+        segments = [
+            take_apart(
+                seen.segments, *of_scan, self._settings.segment_eps_m, self._settings.least_through_per_hit
+            )
+            for seen, of_scan in zip(self._observations, looks, strict=True)
+        ]
+        ends = np.cumsum([len(of_scan.cut) for of_scan in segments])
+        listed = _all_segments(self._observations, segments)
+        hits, throughs = (
+            np.concatenate([s.sums_of(of_scan[which]) for s, of_scan in zip(segments, looks, strict=True)])
+            for which in (0, 1)
+        )
+        objects = judge(listed, hits, throughs, self._settings)
+        gone = np.zeros(len(listed), np.bool_)
         for one in objects:
             gone[list(one.segments)] = one.motion in GONE
         settled, self._observations = self._observations[:count], self._observations[count:]
         points = {
-            seen.number: seen.places[_grown(seen, gone[numbers], self._settings.grow_m)]
-            for seen, numbers in zip(settled, of_point, strict=False)
+            seen.number: seen.places[_grown(seen, of_scan.points_of(which), self._settings.grow_m)]
+            for seen, of_scan, which in zip(settled, segments, np.split(gone, ends), strict=False)
         }
         self._past += [(seen.image, seen.T_lidar_map) for seen in settled]
         del self._past[: -self._settings.window_scans]
-        begun = tuple(one for one in objects if segments[one.segments[0]].scan < count)
+        begun = tuple(one for one in objects if listed[one.segments[0]].scan < count)
         return MovingObjects(points, begun)
 
-    def _testimony(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How often the place of every kept point in a segment was hit and seen through by other scans: (n,) each."""
+    def _testimony(self) -> list[tuple[NDArray[np.int32], NDArray[np.int32]]]:
+        """How often every voxel of each scan's segments was hit and seen through by other scans: (v,) each."""
         settings, observations = self._settings, self._observations
-        inside = np.concatenate([seen.segments for seen in observations]) >= 0
-        p_map = np.concatenate([seen.p_map for seen in observations])[inside]
-        voxel = np.unique(keys_of(p_map, VOXEL_M), return_inverse=True)[1]
-        points = np.bincount(voxel)
-        centroids = np.stack([np.bincount(voxel, p_map[:, axis]) / points for axis in range(3)], axis=1)
-        hits, throughs = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+        parts = [seen.segments.parts for seen in observations]
+        keys, place = distinct(np.concatenate([seen.segments.keys for seen in observations]))
+        points = np.bincount(place, np.concatenate([part.points for part in parts]))
+        sums = np.concatenate([part.sums for part in parts])
+        centroids = np.stack([np.bincount(place, sums[:, axis]) / points for axis in range(3)], axis=1)
+        hits, throughs = np.zeros(len(keys), np.int32), np.zeros(len(keys), np.int32)
         witnesses = self._past + [(seen.image, seen.T_lidar_map) for seen in observations]
         images, poses = zip(*witnesses, strict=True)
         range_images.look_at(
@@ -146,37 +150,9 @@ class MovingObjectDetector:
             settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
             hits, throughs,
         )  # fmt: skip
-        of_point = np.zeros((2, len(inside)), np.int32)
-        of_point[:, inside] = np.maximum(hits - 1, 0)[voxel], throughs[voxel]  # less the scan that found it
-        return of_point[0], of_point[1]
-
-
-def _sums(numbers: NDArray[np.int64], looks: NDArray[np.int32], count: int) -> NDArray[np.float64]:
-    """What the points of every segment sum up to: (s,)."""
-    inside = numbers >= 0
-    return np.asarray(np.bincount(numbers[inside], looks[inside], count), np.float64)
-
-
-def _apart(
-    observations: list[_Observation],
-    hits: NDArray[np.int32],
-    throughs: NDArray[np.int32],
-    settings: MotionSettings,
-) -> list[NDArray[np.int64]]:
-    """Segment of every kept point of each scan, -1 for none, counted over all scans.
-
-    A mover beside something that stands may have been found as one segment with it.
-    """
-    of_point, start, count = [], 0, 0
-    for seen in observations:
-        looks = slice(start, start := start + len(seen.segments))
-        numbers = take_apart(
-            seen.p_map, seen.segments, hits[looks], throughs[looks],
-            settings.segment_eps_m, settings.least_through_per_hit,
-        )  # fmt: skip
-        of_point.append(np.where(numbers >= 0, numbers + np.int64(count), -1))
-        count += int(numbers.max(initial=-1)) + 1
-    return of_point
+        hits = np.maximum(hits - 1, 0)  # less the scan that found it
+        ends = np.cumsum([len(part.points) for part in parts])[:-1]
+        return list(zip(np.split(hits[place], ends), np.split(throughs[place], ends), strict=True))
 
 
 def _observe(
@@ -193,14 +169,13 @@ def _observe(
     range_images.draw(p_map, T_lidar_map, image)
     heights = height_over_ground(p_map)
     above = np.flatnonzero((heights > FOOT_M) & _within(p_map, T_map_lidar, settings.farthest_object_m))
-    points, named = p_map[above], is_object[above]
-    body = np.flatnonzero(heights[above] > BODY_M)
+    points, named, is_body = p_map[above], is_object[above], heights[above] > BODY_M
     # nobody testifies on what is farther away, so that only a name makes it an object
-    known = is_known[above[body]] | ~_within(points[body], T_map_lidar, settings.farthest_m)
-    segments = np.full(len(above), -1, np.int32)
-    segments[body], cut = find_segments(points[body], named[body], known, settings.segment_eps_m)
-    cut |= range_images.hidden_sides(points, segments, T_lidar_map, image, len(cut), HIDING_M)
-    keep = near(points, segments >= 0, settings.grow_m)
+    known = is_known[above] | ~_within(points, T_map_lidar, settings.farthest_m)
+    segments = find_segments(points, named, known, is_body, settings.segment_eps_m)
+    of_points = segments.of_points
+    hidden = range_images.hidden_sides(points, of_points, T_lidar_map, image, len(segments.cut), HIDING_M)
+    keep = near(points, of_points >= 0, settings.grow_m)
     return _Observation(
         number=number,
         stamp=stamp,
@@ -208,10 +183,8 @@ def _observe(
         image=image,
         places=above[keep],
         p_map=points[keep],
-        is_object=named[keep],
-        is_body=heights[above[keep]] > BODY_M,
-        segments=segments[keep],
-        cut=cut,
+        is_body=is_body[keep],
+        segments=replace(segments, voxel=segments.voxel[keep], cut=segments.cut | hidden),
     )
 
 
@@ -222,25 +195,26 @@ def _within(
     return np.asarray(east * east + north * north <= reach_m**2)
 
 
-def _all_segments(observations: list[_Observation], of_point: list[NDArray[np.int64]]) -> list[Segment]:
+def _all_segments(observations: list[_Observation], segments: list[Segments]) -> list[Segment]:
     """The segments of all scans in time order."""
-    segments: list[Segment] = []
-    for scan, (seen, numbers) in enumerate(zip(observations, of_point, strict=True)):
-        for part in groups(np.where(numbers >= 0, numbers - len(segments), -1)):
-            xy = seen.p_map[part, :2]
-            segments.append(
+    listed: list[Segment] = []
+    for scan, (seen, of_scan) in enumerate(zip(observations, segments, strict=True)):
+        whole = of_scan.whole
+        centroids = whole.sums[:, :2] / whole.points[:, None]
+        for number, cut in enumerate(of_scan.cut.tolist()):
+            listed.append(
                 Segment(
                     scan=scan,
                     stamp=seen.stamp,
-                    centroid=xy.mean(axis=0),
-                    lowest=xy.min(axis=0),
-                    highest=xy.max(axis=0),
-                    points=len(part),
-                    shown=bool(seen.is_object[part].any()),
-                    cut=bool(seen.cut[seen.segments[part[0]]]),
+                    centroid=centroids[number],
+                    lowest=whole.lowest[number, :2],
+                    highest=whole.highest[number, :2],
+                    points=int(whole.points[number]),
+                    shown=bool(whole.named[number]),
+                    cut=cut,
                 )
             )
-    return segments
+    return listed
 
 
 def _grown(seen: _Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
@@ -248,10 +222,11 @@ def _grown(seen: _Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArr
     grown = gone.copy()
     if not gone.any() or reach_m == 0:
         return grown
-    rest = np.flatnonzero((seen.segments < 0) & seen.is_body)
+    beside = near(seen.p_map, gone, reach_m) & (seen.segments.voxel < 0)
+    rest = np.flatnonzero(beside & seen.is_body)
     distances = cKDTree(seen.p_map[gone]).query(seen.p_map[rest], distance_upper_bound=reach_m)[0]
     grown[rest[np.isfinite(distances)]] = True
-    feet = np.flatnonzero(~seen.is_body)
+    feet = np.flatnonzero(near(seen.p_map, grown, FOOT_REACH_M) & ~seen.is_body)
     above = cKDTree(seen.p_map[grown, :2])
     distances = above.query(seen.p_map[feet, :2], distance_upper_bound=FOOT_REACH_M)[0]
     grown[feet[np.isfinite(distances)]] = True

@@ -1,13 +1,19 @@
-"""The objects of one scan: what the image calls a vehicle, and what stands around the car and is no larger than one."""
+"""The objects of one scan: what the image calls a vehicle, and what stands around the car and is no larger than one.
+
+Points are gathered into voxels once, and whatever is asked of a segment is asked of those: a scan has ten times as many
+points.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from gnss_sem_map.refinement.dbscan import dbscan
+from gnss_sem_map.refinement.distinct import distinct
 from gnss_sem_map.voxel_map import keys_of, unpack
 
 VOXEL_M = 0.2
@@ -15,7 +21,6 @@ CLOSER = 0.5
 """What may be two vehicles is taken apart at this share of the distance."""
 PART_M = 0.2
 """A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
-GROUND_CELL_M = 1.0
 LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.6
 """What is longer than the first is perhaps two vehicles. A segment that reaches beyond what the image shows is no
 larger than the next two, a lorry or a bus, and one that no image shows no lower than the last."""
@@ -26,15 +31,88 @@ MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200
 that one object comes apart as well."""
 
 
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Sets of points of one scan, and what is asked of each of them."""
+
+    points: NDArray[np.int64]
+    """(p,) how many it has."""
+    named: NDArray[np.int64]
+    """(p,) how many of them the image calls a vehicle."""
+    sums: NDArray[np.float64]
+    """(p, 3) m: of their coordinates."""
+    lowest: NDArray[np.float64]
+    """(p, 3) m: corner of the box around them."""
+    highest: NDArray[np.float64]
+    """(p, 3) m: the opposite corner."""
+
+    @classmethod
+    def of(
+        cls, p_map: NDArray[np.float64], is_object: NDArray[np.bool_], part: NDArray[np.int32], count: int
+    ) -> Parts:
+        """Of points (n, 3): `part` (n,) says to which of `count` parts each belongs, -1 for none."""
+        ones = np.ones(len(p_map), np.int64)
+        return cls(ones, is_object.astype(np.int64), p_map, p_map, p_map).joined(part, count)
+
+    def joined(self, whole: NDArray[np.integer], count: int) -> Parts:
+        """Parts of these parts: `whole` (p,) says to which of `count` each belongs, -1 for none."""
+        low = np.full((count, 3), np.inf)
+        joined = Parts(np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, 3)), low, -low)
+        _join(
+            self.points, self.named, self.sums, self.lowest, self.highest, whole,
+            joined.points, joined.named, joined.sums, joined.lowest, joined.highest,
+        )  # fmt: skip
+        return joined
+
+
 @njit(cache=True, nogil=True)
-def _boxes(points, clusters, count):
-    """Lowest and highest corner of the points (n, d) of every cluster: (count, d) each."""
-    low, high = np.full((count, points.shape[1]), np.inf), np.full((count, points.shape[1]), -np.inf)
-    for i in range(len(points)):
-        for axis in range(points.shape[1]):
-            low[clusters[i], axis] = min(low[clusters[i], axis], points[i, axis])
-            high[clusters[i], axis] = max(high[clusters[i], axis], points[i, axis])
-    return low, high
+def _join(
+    points, named, sums, lowest, highest, whole, all_points, all_named, all_sums, all_lowest, all_highest
+):
+    for i in range(len(whole)):
+        w = whole[i]
+        if w < 0:
+            continue
+        all_points[w] += points[i]
+        all_named[w] += named[i]
+        for axis in range(3):
+            all_sums[w, axis] += sums[i, axis]
+            all_lowest[w, axis] = min(all_lowest[w, axis], lowest[i, axis])
+            all_highest[w, axis] = max(all_highest[w, axis], highest[i, axis])
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """The segments of one scan, voxel by voxel."""
+
+    voxel: NDArray[np.int32]
+    """(n,) of every point, -1 for one in no segment."""
+    keys: NDArray[np.int64]
+    """(v,) the voxels, in ascending order; each is of one segment."""
+    parts: Parts
+    """(v,) what of each voxel belongs to its segment."""
+    number: NDArray[np.int32]
+    """(v,) its segment."""
+    cut: NDArray[np.bool_]
+    """(s,) segments that the edge of the view or something nearer cuts."""
+
+    @property
+    def of_points(self) -> NDArray[np.int32]:
+        """Segment of every point (n,), -1 for none."""
+        return np.append(self.number, np.int32(-1))[self.voxel]
+
+    @property
+    def whole(self) -> Parts:
+        """What is asked of every segment (s,)."""
+        return self.parts.joined(self.number, len(self.cut))
+
+    def points_of(self, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Points (n,) of some of the segments (s,)."""
+        return np.append(which[self.number], False)[self.voxel]
+
+    def sums_of(self, looks: NDArray[np.int32]) -> NDArray[np.float64]:
+        """What all points of every segment (s,) sum up to, of what is known of each voxel (v,)."""
+        return np.asarray(np.bincount(self.number, looks * self.parts.points, len(self.cut)), np.float64)
 
 
 @njit(cache=True, nogil=True)
@@ -55,118 +133,99 @@ def _whole(low, high):
     return np.searchsorted(np.unique(owners), owners)
 
 
-@njit(cache=True, nogil=True)
-def _cells(p_map, size_m):
-    """Cell in x and y of every point (n, 3), from 0, and how many cells there are."""
-    cells = np.empty((len(p_map), 2), np.int64)
-    for i in range(len(p_map)):
-        cells[i, 0], cells[i, 1] = np.floor(p_map[i, 0] / size_m), np.floor(p_map[i, 1] / size_m)
-    for axis in range(2):
-        cells[:, axis] -= cells[:, axis].min()
-    return cells, (cells[:, 0].max() + 1, cells[:, 1].max() + 1)
-
-
-@njit(cache=True, nogil=True)
-def _lowest(cells, z, ground):
-    for i in range(len(z)):
-        ground[cells[i, 0], cells[i, 1]] = min(ground[cells[i, 0], cells[i, 1]], z[i])
-
-
-def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height of every point of one scan (n, 3) over the lowest of its 1 m cell and the eight around it: (n,) m."""
-    if len(p_map) == 0:
-        return np.zeros(0)
-    cells, shape = _cells(p_map, GROUND_CELL_M)
-    ground = np.full(shape, np.inf)
-    _lowest(cells, p_map[:, 2], ground)
-    ground = ndimage.minimum_filter(ground, size=3, mode="constant", cval=np.inf)
-    return np.asarray(p_map[:, 2] - ground[cells[:, 0], cells[:, 1]])
-
-
 def find_segments(
-    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], is_known: NDArray[np.bool_], eps_m: float
-) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Segment of every point above ground (n, 3), -1 for none; and which segments (s,) the edge of the view cuts.
+    p_map: NDArray[np.float64],
+    is_object: NDArray[np.bool_],
+    is_known: NDArray[np.bool_],
+    is_body: NDArray[np.bool_],
+    eps_m: float,
+) -> Segments:
+    """Segments among the points above ground (n, 3), and which of them the edge of the view cuts.
 
-    `is_object` says which points the image calls a vehicle, `is_known` which it shows at all. A vehicle at the edge
+    `is_object` says which points the image calls a vehicle, `is_known` which it shows at all, `is_body` which may
+    belong to a segment. A vehicle at the edge
     of the view goes on in the points around it, if the whole is no larger than a vehicle; else its shown part is a
     segment, marked as cut. Where nothing is known, whatever has a vehicle's size is a segment.
     """
-    segments = np.full(len(p_map), -1, np.int32)
-    candidates = np.flatnonzero(is_object | ~is_known)
-    if len(candidates) == 0:
-        return segments, np.zeros(0, np.bool_)
-    clusters = _objects(p_map[candidates], eps_m)
-    shown = np.bincount(clusters, is_object[candidates]) > 0
-    points = np.bincount(clusters)
-    low, high = _boxes(p_map[candidates], clusters, len(points))
-    length, height = np.hypot(*(high - low)[:, :2].T), (high - low)[:, 2]
-    fits = (length <= LONGEST_M) & (height <= HIGHEST_M)
-    fits &= shown | ((height >= LEAST_HEIGHT_M) & (points >= LEAST_POINTS))
-    numbers = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)
-    segments[candidates] = numbers[clusters]
-    rest = candidates[~fits[clusters] & is_object[candidates]]
-    parts = _cluster(p_map[rest], eps_m)
-    segments[rest] = parts + fits.sum()
-    joined = points > np.bincount(clusters, is_object[candidates])  # with points that the image does not show
-    cut = np.zeros(parts.max(initial=-1) + 1, np.bool_)
-    cut[parts] = joined[clusters[~fits[clusters] & is_object[candidates]]]
-    return segments, np.concatenate([np.zeros(fits.sum(), np.bool_), cut])
+    candidates = np.flatnonzero((is_object | ~is_known) & is_body)
+    points, named = p_map[candidates], is_object[candidates]
+    keys, voxel = distinct(keys_of(points, VOXEL_M))
+    voxels = Parts.of(points, named, voxel, len(keys))
+    clusters, count = _objects(keys, voxels, eps_m)
+    whole = voxels.joined(clusters, count)
+    fits = _is_vehicle_sized(whole)
+    number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
+    shown = ~fits[clusters] & (voxels.named > 0)  # of what is too large, or too small, the part with a name
+    part = _cluster(keys[shown], eps_m)
+    number[shown] = part + np.int32(fits.sum())
+    cut = np.zeros(part.max(initial=-1) + 1, np.bool_)
+    cut[part] = (whole.points > whole.named)[clusters[shown]]  # with points that the image does not show
+    inside = (number >= 0)[voxel] & (named | ~shown[voxel])
+    row = np.full(len(p_map), -1, np.int32)
+    row[candidates[inside]] = (np.cumsum(number >= 0, dtype=np.int32) - 1)[voxel[inside]]
+    kept = number >= 0
+    parts = Parts.of(p_map, is_object, row, int(kept.sum()))
+    return Segments(
+        row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), cut])
+    )
 
 
-def _objects(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int64]:
-    """Cluster of every point (n, 3): what is too large comes apart, and what is a part of another is joined to it."""
-    clusters = _cluster(p_map, eps_m).astype(np.int64)
-    low, high = _boxes(p_map[:, :2], clusters, clusters.max() + 1)
-    large = np.hypot(*(high - low).T)[clusters] > LARGE_M
-    clusters[large] = _cluster(p_map[large], CLOSER * eps_m) + clusters.max() + 1
-    clusters = np.unique(clusters, return_inverse=True)[1]
-    return np.asarray(_whole(*_boxes(p_map[:, :2], clusters, clusters.max() + 1))[clusters])
+def _is_vehicle_sized(whole: Parts) -> NDArray[np.bool_]:
+    size = whole.highest - whole.lowest
+    length, height = np.hypot(size[:, 0], size[:, 1]), size[:, 2]
+    unnamed = (height >= LEAST_HEIGHT_M) & (whole.points >= LEAST_POINTS)
+    return np.asarray((length <= LONGEST_M) & (height <= HIGHEST_M) & ((whole.named > 0) | unnamed))
+
+
+def _objects(keys: NDArray[np.int64], voxels: Parts, eps_m: float) -> tuple[NDArray[np.int64], int]:
+    """Cluster of every voxel (v,) and their number.
+
+    What is too large comes apart, and what is a part of another is joined to it.
+    """
+    clusters = _cluster(keys, eps_m)
+    count = int(clusters.max(initial=-1)) + 1
+    boxes = voxels.joined(clusters, count)
+    size = boxes.highest - boxes.lowest
+    large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_M)[clusters]
+    clusters[large] = _cluster(keys[large], CLOSER * eps_m) + np.int32(count)
+    used, of_used = np.unique(clusters, return_inverse=True)
+    boxes = voxels.joined(of_used, len(used))
+    owners = _whole(boxes.lowest, boxes.highest)
+    return owners[of_used], int(owners.max(initial=-1)) + 1
 
 
 def take_apart(
-    p_map: NDArray[np.float64],
-    segments: NDArray[np.int32],
+    segments: Segments,
     hits: NDArray[np.int32],
     throughs: NDArray[np.int32],
     eps_m: float,
     least_through_per_hit: float,
-) -> NDArray[np.int32]:
-    """Segments (n,) of points (n, 3), where what once was empty is apart from what always stood beside it.
+) -> Segments:
+    """Segments where what once was empty is apart from what always stood beside it.
 
     A mover that passes something closely is one segment with it. If a good part of a segment was seen through, by
-    `throughs` (n,) and `hits` (n,), and a good part was not, it is clustered again, more closely, and its clusters
-    that were seen through become a new segment.
+    `throughs` (v,) and `hits` (v,) of its voxels, and a good part was not, it is clustered again, more closely, and its
+    clusters that were seen through become a new segment.
     """
+    points, number, count = segments.parts.points, segments.number.copy(), len(segments.cut)
     once_empty = throughs > least_through_per_hit * hits
-    counts = np.bincount(segments[segments >= 0])
-    emptied = np.bincount(segments[once_empty & (segments >= 0)], minlength=len(counts))
-    stood = np.bincount(segments[(hits > 0) & (throughs == 0) & (segments >= 0)], minlength=len(counts))
-    least = np.maximum(MIXED_SHARE * counts, LEAST_DENSE_POINTS)
-    apart, count = segments.copy(), len(counts)
-    for number in np.flatnonzero((emptied >= least) & (stood >= least)):
-        part = np.flatnonzero(segments == number)
-        clusters = _cluster(p_map[part], CLOSER * eps_m)
-        hit, through = np.bincount(clusters, hits[part]), np.bincount(clusters, throughs[part])
+    stood = (hits > 0) & (throughs == 0)
+    all_of, empty_of, stood_of = (
+        np.bincount(number, points * which, count) for which in (np.ones_like(stood), once_empty, stood)
+    )
+    least = np.maximum(MIXED_SHARE * all_of, LEAST_DENSE_POINTS)
+    cut = segments.cut
+    for mixed in np.flatnonzero((empty_of >= least) & (stood_of >= least)):
+        part = np.flatnonzero(number == mixed)
+        clusters = _cluster(segments.keys[part], CLOSER * eps_m)
+        hit, through = (np.bincount(clusters, points[part] * looks[part]) for looks in (hits, throughs))
         left = (through > least_through_per_hit * hit)[clusters]
-        if min(left.sum(), (~left).sum()) >= least[number]:
-            apart[part[left]] = count
-            count += 1
-    return apart
+        if min(points[part[left]].sum(), points[part[~left]].sum()) >= least[mixed]:
+            number[part[left]] = len(cut)
+            cut = np.append(cut, cut[mixed])
+    return replace(segments, number=number, cut=cut)
 
 
-def _cluster(p_map: NDArray[np.float64], eps_m: float) -> NDArray[np.int32]:
-    """Cluster of every point (n, 3): those of neighbouring 0.2 m voxels belong together."""
-    keys, voxel = np.unique(keys_of(p_map, VOXEL_M), return_inverse=True)
-    return dbscan(unpack(keys), eps_m / VOXEL_M, min_samples=1)[voxel]
-
-
-def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
-    """Points (n, 3) in a square cell of `reach_m` that holds a marked point, or beside one."""
-    if reach_m == 0 or not marked.any():
-        return marked
-    cells, shape = _cells(p_map, reach_m)
-    grid = np.zeros(shape, np.bool_)
-    grid[cells[marked, 0], cells[marked, 1]] = True
-    grid = ndimage.binary_dilation(grid, np.ones((3, 3), np.bool_))
-    return np.asarray(grid[cells[:, 0], cells[:, 1]])
+def _cluster(keys: NDArray[np.int64], eps_m: float) -> NDArray[np.int32]:
+    """Cluster of every voxel: neighbouring ones belong together."""
+    return dbscan(unpack(keys), eps_m / VOXEL_M, min_samples=1)

@@ -46,7 +46,7 @@ def test_where_nothing_came_back_nothing_is_known():
 def test_beams_that_pass_only_above_a_place_have_not_looked_through_it():
     image = wall_image()
     row = int((np.degrees(np.arctan2(-1.0, 10.0)) - range_images.LOWEST_DEG) / range_images.ROW_DEG)
-    image[: row + 1] = range_images.EMPTY
+    image[: row + 2] = range_images.EMPTY  # the first is the frame
     assert seen_at(image, [(10.0, 0.0, -1.0)]) == 0
     assert seen_at(wall_image(), [(10.0, 0.0, -1.0)]) == -1
 
@@ -66,7 +66,7 @@ def test_the_nearest_return_of_a_pixel_counts():
 
 def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
     image = wall_image()
-    middle = range_images.COLUMNS // 2
+    middle = 1 + range_images.COLUMNS // 2
     for columns, expected in ((slice(0, 0), False), (slice(middle + 12, middle + 30), True)):
         nearer = image.copy()
         nearer[:, columns] = 800
@@ -74,3 +74,22 @@ def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
         points = WALL_M * np.stack([np.cos(azimuths), np.sin(azimuths), -0.02 + 0 * azimuths], axis=1)
         segments = np.zeros(len(points), np.int32)
         assert range_images.hidden_sides(points, segments, np.eye(4), nearer, 1, 0.5).tolist() == [expected]
+
+
+def test_pixels_are_where_the_angles_say():
+    """The polynomial of the arc tangent against numpy's."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(2000, 3)) * [20, 20, 3]
+    azimuths = np.degrees(np.arctan2(points[:, 1], points[:, 0])) + 180
+    elevations = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+    rows = np.floor((elevations - range_images.LOWEST_DEG) / range_images.ROW_DEG).astype(int)
+    columns = np.floor(azimuths / range_images.COLUMN_DEG).astype(int) % range_images.COLUMNS
+    ranges = np.linalg.norm(points, axis=1)
+    expected = range_images.empty_image()
+    seen = (ranges >= range_images.NEAREST_M) & (rows >= 0) & (rows < range_images.ROWS)
+    centimetres = (ranges[seen] * range_images.UNITS_PER_M).astype(np.uint16)
+    np.minimum.at(expected, (rows[seen] + 1, columns[seen] + 1), centimetres)
+    drawn = range_images.empty_image()
+    range_images.draw(points, np.eye(4), drawn)
+    np.testing.assert_array_equal(drawn[:, 1:-1], expected[:, 1:-1])
+    np.testing.assert_array_equal(drawn[:, [0, -1]], expected[:, [-2, 1]])

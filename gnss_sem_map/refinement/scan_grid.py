@@ -1,0 +1,73 @@
+"""One scan on a grid of square cells: how high its points are over the ground, and which are near others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import int32, njit
+from numpy.typing import NDArray
+
+GROUND_CELL_M = 1.0
+
+
+def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Height of every point of one scan (n, 3) over the lowest of its 1 m cell and the eight around it: (n,) m."""
+    heights = np.empty(len(p_map))
+    if len(p_map):
+        _heights(p_map, GROUND_CELL_M, heights)
+    return heights
+
+
+def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
+    """Points (n, 3) in a square cell of `reach_m` that holds a marked point, or beside one."""
+    if reach_m == 0 or not marked.any():
+        return marked
+    found = np.empty(len(p_map), np.bool_)
+    _near(p_map, marked, reach_m, found)
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cells(p_map, size_m):
+    """Cell of every point (n, 3), as its place in a list, and the length and width of the grid.
+
+    Around the cells of the points is one more on all sides, so that each has eight neighbours.
+    """
+    n = len(p_map)
+    east, north = np.empty(n, np.int32), np.empty(n, np.int32)
+    for i in range(n):
+        east[i], north[i] = int32(np.floor(p_map[i, 0] / size_m)), int32(np.floor(p_map[i, 1] / size_m))
+    west, south = east.min() - 1, north.min() - 1
+    length, width = east.max() - west + 2, north.max() - south + 2
+    for i in range(n):
+        east[i] = (east[i] - west) * width + north[i] - south
+    return east, length, width
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _heights(p_map, size_m, heights):
+    cells, length, width = _cells(p_map, size_m)
+    lowest = np.full(length * width, np.inf)
+    for i in range(len(cells)):
+        lowest[cells[i]] = min(lowest[cells[i]], p_map[i, 2])
+    # of three along one axis, then of three of those along the other
+    across = lowest.copy()
+    for c in range(1, len(lowest) - 1):
+        across[c] = min(lowest[c - 1], lowest[c], lowest[c + 1])
+    for c in range(width, len(lowest) - width):
+        lowest[c] = min(across[c - width], across[c], across[c + width])
+    for i in range(len(cells)):
+        heights[i] = p_map[i, 2] - lowest[cells[i]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _near(p_map, marked, size_m, found):
+    cells, length, width = _cells(p_map, size_m)
+    reached = np.zeros(length * width, np.bool_)
+    for i in range(len(cells)):
+        if marked[i]:
+            reached[cells[i]] = True
+    for c in np.flatnonzero(reached):
+        for row in range(c - width, c + width + 1, width):
+            reached[row - 1 : row + 2] = True
+    for i in range(len(cells)):
+        found[i] = reached[cells[i]]

@@ -117,9 +117,10 @@ def _distinct(stamps: Array, keep: Array | None = None) -> Array:
     """Sorted stamps without those that follow another too closely; the ones in `keep` stay."""
     if keep is None:
         # the last stamp is the end of the log: it stays, however many lie beside it
-        close = (np.diff(stamps, prepend=-np.inf) < SAME_STAMP_S) | (stamps > stamps[-1] - SAME_STAMP_S)
-        close[-1] = False
-        return stamps[~close]
+        apart = (np.diff(stamps, prepend=-np.inf) >= SAME_STAMP_S) & (stamps <= stamps[-1] - SAME_STAMP_S)
+        apart[-1] = True
+        distinct: Array = stamps[apart]
+        return distinct
     nearest = np.clip(np.searchsorted(keep, stamps), 1, len(keep) - 1)
     distance = np.minimum(np.abs(stamps - keep[nearest - 1]), np.abs(stamps - keep[nearest]))
     kept: Array = stamps[(distance == 0) | (distance > SAME_STAMP_S)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,6 +23,7 @@ from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import usable_points_at_stamp
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
@@ -117,11 +117,16 @@ def match_scans(
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips = []
-    for done, (scan, sweep) in enumerate(_prepared(log, trajectory, settings), 1):
+    # the next sweeps are prepared on a second core while one is matched
+    prepare = partial(
+        _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
+    )
+    for done, (scan, sweep) in enumerate(ahead(prepare, log.scans), 1):
         try:
-            matches.append(odometry.match(scan, sweep.result()))
-        except (DataError, MeasurementError) as error:
-            skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+            if isinstance(sweep, Skip):
+                skips.append(sweep)
+            else:
+                matches.append(odometry.match(scan, sweep))
         except _NoMatch as error:
             skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
         progress("scan matching", done, len(log.scans))
@@ -145,25 +150,19 @@ class _Sweep:
     T_map_lidar: Array
 
 
-def _prepared(
-    log: SensorLog, trajectory: Trajectory, settings: ScanMatchingSettings
-) -> Iterator[tuple[Scan, Future[_Sweep]]]:
-    """Every scan of a drive, and what becomes of it: the next is prepared on a second core while one is matched."""
-    prepare = partial(
-        _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
-    )
-    with ThreadPoolExecutor(1, "sweeps") as worker:
-        ahead = [worker.submit(prepare, scan) for scan in log.scans[:1]]
-        for scan, following in zip(log.scans, (*log.scans[1:], None), strict=False):
-            sweep = ahead.pop()
-            if following is not None:
-                ahead.append(worker.submit(prepare, following))
-            yield scan, sweep
-
-
 def _prepare(
     scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
-) -> _Sweep:
+) -> _Sweep | Skip:
+    """The sweep ready to be matched, or why there is none."""
+    try:
+        return _sweep(scan, trajectory, T_imu_lidar, settings)
+    except (DataError, MeasurementError) as error:
+        return Skip("scan", f"frame {scan.number}", str(error))
+    except _NoMatch as error:
+        return Skip("scan matching", f"frame {scan.number}", str(error))
+
+
+def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings) -> _Sweep:
     """Deskew a sweep, keep one point per cube, and fit a plane to each.
 
     By one thread: two keep other points every time.

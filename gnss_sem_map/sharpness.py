@@ -19,6 +19,7 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import voxel_kernels
 from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import EXTRAPOLATE_S, usable_points_in_map
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
@@ -86,7 +87,7 @@ def of_clouds(
     settings = settings or SharpnessSettings()
     stretch = _Stretch(settings)
     for p_map in clouds:
-        stretch.add(p_map)
+        stretch.add(_Cloud.of(p_map, settings))
     return _sharpness([stretch], length_m)
 
 
@@ -102,26 +103,22 @@ def of_drive(
     out: it blurs alike for every trajectory.
     """
     settings = settings or SharpnessSettings()
-    chosen = _stretches(log.scans, settings)
-    gathered: list[list[_Stretch]] = [[] for _ in trajectories]
-    lengths = np.zeros(len(trajectories))
-    total, done = sum(len(stretch) for stretch in chosen), 0
-    for scans in chosen:
-        stretches, stamps = [_Stretch(settings) for _ in trajectories], []
-        for scan in scans:
-            done += 1
-            progress("sharpness", done, total)
-            try:
-                clouds = _clouds(scan, trajectories, log.calibration.T_imu_lidar, settings)
-            except (DataError, MeasurementError):
-                continue  # counted when the map is built
-            stamps.append(scan.stamp)
-            for stretch, p_map in zip(stretches, clouds, strict=True):
-                stretch.add(p_map)
-        lengths += [_length(t, np.array(stamps)) for t in trajectories]
-        for of_one, stretch in zip(gathered, stretches, strict=True):
-            of_one.append(stretch)
-    return [_sharpness(of_one, length) for of_one, length in zip(gathered, lengths.tolist(), strict=True)]
+    stretches = _stretches(log.scans, settings)
+    gathered = [[_Stretch(settings) for _ in stretches] for _ in trajectories]
+    stamps: list[list[float]] = [[] for _ in stretches]
+    numbered = [(n, scan) for n, stretch in enumerate(stretches) for scan in stretch]
+
+    def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
+        return _clouds(numbered_scan[1], trajectories, log.calibration.T_imu_lidar, settings)
+
+    for done, ((n, scan), clouds) in enumerate(ahead(clouds_of, numbered), 1):
+        if clouds is not None:
+            stamps[n].append(scan.stamp)
+            for of_one, cloud in zip(gathered, clouds, strict=True):
+                of_one[n].add(cloud)
+        progress("sharpness", done, len(numbered))
+    lengths = [sum(_length(t, np.array(s)) for s in stamps) for t in trajectories]
+    return [_sharpness(of_one, length) for of_one, length in zip(gathered, lengths, strict=True)]
 
 
 def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tuple[Scan, ...]]:
@@ -135,17 +132,20 @@ def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tup
 
 def _clouds(
     scan: Scan, trajectories: Sequence[Trajectory], T_imu_lidar: Array, settings: SharpnessSettings
-) -> list[Array]:
-    """The points of a sweep in the map (n, 3) by each trajectory."""
-    every, points = settings.every_nth_point, scan.read()
-    stamps = None if points.stamps is None else points.stamps[::every]
-    some = Points(points.xyz[::every], points.intensity[::every], stamps)
-    return [
-        usable_points_in_map(
-            some, scan.stamp, trajectory, T_imu_lidar, settings.nearest_m, settings.farthest_m
-        )[0]
-        for trajectory in trajectories
-    ]
+) -> list[_Cloud] | None:
+    """A sweep in the map, by each trajectory; None when it cannot be read, or leaves a trajectory or the map."""
+    every, (nearest_m, farthest_m) = settings.every_nth_point, (settings.nearest_m, settings.farthest_m)
+    try:
+        points = scan.read()
+        stamps = None if points.stamps is None else points.stamps[::every]
+        some = Points(points.xyz[::every], points.intensity[::every], stamps)
+        placed = [
+            usable_points_in_map(some, scan.stamp, t, T_imu_lidar, nearest_m, farthest_m)[0]
+            for t in trajectories
+        ]
+        return [_Cloud.of(p_map, settings) for p_map in placed]
+    except (DataError, MeasurementError):
+        return None  # counted when the map is built
 
 
 def _length(trajectory: Trajectory, stamps: Array) -> float:
@@ -154,6 +154,20 @@ def _length(trajectory: Trajectory, stamps: Array) -> float:
     every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))  # jitter is no way driven
     positions = trajectory.at(np.append(stamps[:-1:every], stamps[-1]), EXTRAPOLATE_S)[:, :3, 3]
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """The points (n, 3) of a sweep in the map, and in which cubes and voxels they lie."""
+
+    p_map: Array
+    cubes: Keys
+    voxels: Keys
+
+    @classmethod
+    def of(cls, p_map: Array, settings: SharpnessSettings) -> _Cloud:
+        """Raises DataError for a point that is not inside the map."""
+        return cls(p_map, keys_of(p_map, settings.cell_size_m), keys_of(p_map, settings.voxel_size_m))
 
 
 class _Stretch:
@@ -165,22 +179,20 @@ class _Stretch:
         self._cubes, self._voxels = _empty(SMALLEST_TABLE, CUBE_WORDS), _empty(SMALLEST_TABLE, 1)
         self._cube_count = self.voxels = 0
 
-    def add(self, p_map: Array) -> None:
-        """The points (n, 3) of one more sweep; raises DataError for a point that is not inside the map."""
-        cubes = keys_of(p_map, self._settings.cell_size_m)
-        voxels = keys_of(p_map, self._settings.voxel_size_m)
+    def add(self, cloud: _Cloud) -> None:
+        """One more sweep."""
         self.scans += 1
         done = 0
-        while done < len(cubes):
+        while done < len(cloud.cubes):
             self._cubes = _with_room(self._cubes, self._cube_count)
             self._cube_count, done = _gather(
-                self._cubes, self._cubes.view(np.float64), self._cube_count, done, cubes, p_map,
+                self._cubes, self._cubes.view(np.float64), self._cube_count, done, cloud.cubes, cloud.p_map,
                 self._settings.cell_size_m, self.scans,
             )  # fmt: skip
         done = 0
-        while done < len(voxels):
+        while done < len(cloud.voxels):
             self._voxels = _with_room(self._voxels, self.voxels)
-            self.voxels, done = _occupy(self._voxels, self.voxels, done, voxels)
+            self.voxels, done = _occupy(self._voxels, self.voxels, done, cloud.voxels)
 
     def surfaces(self) -> tuple[Array, Array]:
         """Variances (c, 3), smallest first, of the cubes seen often enough, and the |z| of their normals (c,)."""

@@ -7,10 +7,17 @@ from numpy.typing import NDArray
 
 from gnss_sem_map import labels
 from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import EXTRAPOLATE_S
-from gnss_sem_map.refinement.moving_objects import MovingObjectDetector, MovingObjects
+from gnss_sem_map.refinement.moving_objects import (
+    THREADS,
+    MovingObjectDetector,
+    MovingObjects,
+    Observation,
+    observe,
+)
 from gnss_sem_map.refinement.verdicts import TrackedObject
-from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
 
 MOVABLE = ("vehicle", "person", "pedestrian", "rider", "cyclist", "bicycle", "motorcycle")
 """Classes, where the class set has them, whose objects may move."""
@@ -22,17 +29,11 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     What no image shows is followed too, but is only said to have moved when it was seen to go elsewhere.
     """
     detector = MovingObjectDetector(drive.settings.refinement.motion)
-    label_set = labels.label_set(drive.settings.classes)
-    movable = [label_set.index(name) for name in MOVABLE if name in label_set.names]
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []
     total = len(drive.log.scans)
-    for done, seen in enumerate(seen_scans(drive), 1):
-        T_map_imu = drive.trajectory.at(np.array([seen.scan.stamp]), EXTRAPOLATE_S)[0]
-        T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
-        shown = seen.labels
-        is_object, is_known = np.isin(shown, movable), shown >= 0
-        detector.observe(seen.scan.number, seen.scan.stamp, seen.p_map, T_map_lidar, is_object, is_known)
+    for done, (_, observation) in enumerate(ahead(_observed, seen_scans(drive), THREADS), 1):
+        detector.add(observation)
         settled = detector.settle()
         points.update(settled.points)
         objects += settled.objects
@@ -40,3 +41,15 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     rest = detector.decide()
     progress("motion", total, total)
     return MovingObjects(points | dict(rest.points), (*objects, *rest.objects))
+
+
+def _observed(seen: SeenScan) -> Observation:
+    drive, scan = seen.drive, seen.scan
+    T_map_imu = drive.trajectory.at(np.array([scan.stamp]), EXTRAPOLATE_S)[0]
+    T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
+    is_movable = np.isin([*drive.label_set.names, labels.OTHER, ""], MOVABLE)  # the last one: of no class
+    shown = seen.labels
+    return observe(
+        scan.number, scan.stamp, seen.p_map, T_map_lidar, is_movable.take(shown), shown >= 0,
+        drive.settings.refinement.motion,
+    )  # fmt: skip

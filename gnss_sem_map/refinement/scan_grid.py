@@ -1,4 +1,4 @@
-"""One scan on a grid of square cells: how high its points are over the ground, and which are near others."""
+"""One scan from above: how high its points are over the ground, and which are near a place or near others."""
 
 from __future__ import annotations
 
@@ -17,6 +17,13 @@ def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
     return heights
 
 
+def within(p_map: NDArray[np.float64], centre: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
+    """Points (n, 3) at most so far from a centre (2,), east and north."""
+    found = np.empty(len(p_map), np.bool_)
+    _within(p_map, centre[0], centre[1], reach_m * reach_m, found)
+    return found
+
+
 def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
     """Points (n, 3) in a square cell of `reach_m` that holds a marked point, or beside one."""
     if reach_m == 0 or not marked.any():
@@ -24,6 +31,13 @@ def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) 
     found = np.empty(len(p_map), np.bool_)
     _near(p_map, marked, reach_m, found)
     return found
+
+
+@njit(cache=True, nogil=True)
+def _within(p_map, x, y, square, found):
+    for i in range(len(p_map)):
+        east, north = p_map[i, 0] - x, p_map[i, 1] - y
+        found[i] = east * east + north * north <= square
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -99,7 +99,7 @@ class Segments:
     @property
     def of_points(self) -> NDArray[np.int32]:
         """Segment of every point (n,), -1 for none."""
-        return np.append(self.number, np.int32(-1))[self.voxel]
+        return np.append(self.number, np.int32(-1)).take(self.voxel)
 
     @property
     def whole(self) -> Parts:
@@ -108,7 +108,7 @@ class Segments:
 
     def points_of(self, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Points (n,) of some of the segments (s,)."""
-        return np.append(which[self.number], False)[self.voxel]
+        return np.append(which[self.number], False).take(self.voxel)
 
     def sums_of(self, looks: NDArray[np.int32]) -> NDArray[np.float64]:
         """What all points of every segment (s,) sum up to, of what is known of each voxel (v,)."""
@@ -148,7 +148,7 @@ def find_segments(
     segment, marked as cut. Where nothing is known, whatever has a vehicle's size is a segment.
     """
     candidates = np.flatnonzero((is_object | ~is_known) & is_body)
-    points, named = p_map[candidates], is_object[candidates]
+    points, named = p_map.take(candidates, axis=0), is_object.take(candidates)
     keys, voxel = distinct(keys_of(points, VOXEL_M))
     voxels = Parts.of(points, named, voxel, len(keys))
     clusters, count = _objects(keys, voxels, eps_m)
@@ -160,10 +160,10 @@ def find_segments(
     number[shown] = part + np.int32(fits.sum())
     cut = np.zeros(part.max(initial=-1) + 1, np.bool_)
     cut[part] = (whole.points > whole.named)[clusters[shown]]  # with points that the image does not show
-    inside = (number >= 0)[voxel] & (named | ~shown[voxel])
-    row = np.full(len(p_map), -1, np.int32)
-    row[candidates[inside]] = (np.cumsum(number >= 0, dtype=np.int32) - 1)[voxel[inside]]
     kept = number >= 0
+    row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
+    row = np.full(len(p_map), -1, np.int32)
+    row[candidates] = np.where(named | ~shown.take(voxel), row_of.take(voxel), -1)
     parts = Parts.of(p_map, is_object, row, int(kept.sum()))
     return Segments(
         row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), cut])

@@ -39,8 +39,6 @@ class Segment:
     """An image calls some of it a vehicle."""
     cut: bool
     """The edge of the view cuts it: its ends are not its own."""
-    fleeting: bool = False
-    """Its place was found empty by other scans, more often than not."""
 
 
 @dataclass(eq=False)
@@ -68,11 +66,12 @@ class Track:
         self.last = segment
 
 
-def track(segments: list[Segment], gate_m: float) -> list[Track]:
+def track(segments: list[Segment], gate_m: float, fleeting: NDArray[np.bool_]) -> list[Track]:
     """Tracks of the segments, which come in time order: each scan's are joined to the nearest prediction, greedily.
 
-    What drives fast is nowhere near where it was: among what is left, fleeting segments are joined to fleeting ones of
-    the scan before, as far as the fastest could have come. What stands is not fleeting, and is never joined so.
+    A segment is `fleeting` (s,) if other scans found its place empty, more often than not. What drives fast is nowhere
+    near where it was: among what is left, fleeting segments are joined to fleeting ones of the scan before, as far as
+    the fastest could have come. What stands is not fleeting, and is never joined so.
     """
     tracks: list[Track] = []
     by_scan: dict[int, list[int]] = {}
@@ -87,7 +86,9 @@ def track(segments: list[Segment], gate_m: float) -> list[Track]:
                 free.remove(number)
                 taken.add(place)
                 alive[place].extend(number, segments[number])
-        for number, t in _fast_ones(segments, sorted(free), alive, scan):
+        for number, t in _fast_ones(
+            segments, [n for n in sorted(free) if fleeting[n]], alive, fleeting, scan
+        ):
             if number in free and len(t.segments) == 1:
                 free.remove(number)
                 t.extend(number, segments[number], first_share=1.0)
@@ -100,17 +101,22 @@ def track(segments: list[Segment], gate_m: float) -> list[Track]:
 
 
 def _fast_ones(
-    segments: list[Segment], numbers: list[int], alive: list[Track], scan: int
+    segments: list[Segment],
+    numbers: list[int],
+    alive: list[Track],
+    fleeting: NDArray[np.bool_],
+    scan: int,
 ) -> list[tuple[int, Track]]:
-    """Pairs of a fleeting segment and a track of one fleeting segment of the scan before, nearest first."""
+    """Pairs of a segment and a track of one fleeting segment of the scan before, nearest first."""
     begun = [
-        t for t in alive if len(t.segments) == 1 and t.last and t.last.fleeting and t.last.scan == scan - 1
+        t
+        for t in alive
+        if len(t.segments) == 1 and fleeting[t.segments[0]] and t.last and t.last.scan == scan - 1
     ]
-    fleeting = [n for n in numbers if segments[n].fleeting]
-    if not begun or not fleeting or begun[0].last is None:
+    if not begun or not numbers or begun[0].last is None:
         return []
-    reach_m = FASTEST_M_S * (segments[fleeting[0]].stamp - begun[0].last.stamp)
-    return [(n, begun[place]) for n, place in _nearest_first(segments, fleeting, begun, reach_m)]
+    reach_m = FASTEST_M_S * (segments[numbers[0]].stamp - begun[0].last.stamp)
+    return [(n, begun[place]) for n, place in _nearest_first(segments, numbers, begun, reach_m)]
 
 
 def _nearest_first(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,9 +85,8 @@ def judge(
     large = [n for n, segment in enumerate(segments) if segment.points >= LEAST_TRACKED_POINTS]
     alone = [n for n, segment in enumerate(segments) if segment.points < LEAST_TRACKED_POINTS]
     objects = []
-    fleeting = throughs > settings.through_per_hit * hits
-    tracks = track([replace(segments[n], fleeting=bool(fleeting[n])) for n in large], settings.gate_m)
-    for one in tracks:
+    fleeting = (throughs > settings.through_per_hit * hits)[large]
+    for one in track([segments[n] for n in large], settings.gate_m, fleeting):
         members = [large[place] for place in one.segments]
         if not any(segments[n].shown for n in members):
             objects += _nameless(members, segments, hits, throughs, settings)

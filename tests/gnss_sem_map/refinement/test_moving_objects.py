@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.refinement.moving_objects import MovingObjectDetector
+from gnss_sem_map.refinement.moving_objects import MovingObjectDetector, observe
 from gnss_sem_map.refinement.vehicles import Motion
 from gnss_sem_map.refinement.verdicts import MotionSettings
 
@@ -60,7 +60,9 @@ def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=N
         T_map_lidar = np.eye(4)
         T_map_lidar[:3, 3] = origin + drift_m * np.array([np.sin(t), np.cos(1.7 * t), 0.3 * np.sin(2 * t)])
         p_map = p_map + T_map_lidar[:3, 3] - origin
-        detector.observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known)
+        detector.add(
+            observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings or MotionSettings())
+        )
         kept.append(what)
     moving = detector.decide()
     removed, total = np.zeros(len(cars) + 3), np.zeros(len(cars) + 3)
@@ -179,12 +181,18 @@ def test_only_points_of_the_mover_are_removed_and_no_scans_are_no_error():
     mover = {}
     for scan in range(20):
         p_map, what = cast(np.array([0.0, 0.0, LIDAR_HEIGHT_M]), [car_at(30 - scan, 3.0)])
-        detector.observe(scan, scan * SCAN_S, p_map, pose(0.0), what == 1)
+        detector.add(seen(scan, p_map, pose(0.0), what == 1))
         mover[scan] = what == 1
     moving = detector.decide()
     for scan, points in moving.points.items():
         assert mover[scan][points].all()
     assert sum(map(len, moving.points.values())) > 0
+
+
+def seen(scan, p_map, T_map_lidar, is_object):
+    """A scan of a camera that looks all around."""
+    known = np.ones(len(p_map), bool)
+    return observe(scan, scan * SCAN_S, p_map, T_map_lidar, is_object, known, MotionSettings())
 
 
 def pose(x):
@@ -197,7 +205,7 @@ def test_every_point_called_vehicle_is_no_error():
     detector = MovingObjectDetector()
     for scan in range(5):
         p_map, what = cast(np.array([scan, 0.0, LIDAR_HEIGHT_M]), [car_at(12, 3.0)])
-        detector.observe(scan, scan * SCAN_S, p_map, pose(scan), np.ones(len(what), bool))
+        detector.add(seen(scan, p_map, pose(scan), np.ones(len(what), bool)))
     removed = sum(map(len, detector.decide().points.values()))
     assert removed == 0
 
@@ -211,7 +219,7 @@ def test_settling_in_windows_says_what_deciding_at_the_end_says_and_forgets_the_
             t = scan * SCAN_S
             cars = [car_at(12, 4.5), car_at(20, 4.5), car_at(60 - 12 * t, -3.5)]
             p_map, what = cast(np.array([6 * t, 0.0, LIDAR_HEIGHT_M]), cars)
-            detector.observe(scan, t, p_map, pose(6 * t), what > 0)
+            detector.add(seen(scan, p_map, pose(6 * t), what > 0))
             found.update(detector.settle().points)
         assert (len(found) > 0) == (window == 10)
         found.update(detector.decide().points)
@@ -226,7 +234,8 @@ def test_settling_in_windows_says_what_deciding_at_the_end_says_and_forgets_the_
 def test_empty_scans_and_scans_out_of_order():
     detector = MovingObjectDetector()
     nothing = np.empty((0, 3))
-    detector.observe(7, 1.0, nothing, np.eye(4), np.zeros(0, bool))
+    empty = seen(7, nothing, np.eye(4), np.zeros(0, bool))
+    detector.add(empty)
     with pytest.raises(DataError, match="time order"):
-        detector.observe(8, 1.0, nothing, np.eye(4), np.zeros(0, bool))
+        detector.add(empty)
     assert detector.decide().points[7].shape == (0,)

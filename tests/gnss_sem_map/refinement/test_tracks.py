@@ -8,16 +8,16 @@ from gnss_sem_map.refinement.vehicles import Motion
 from gnss_sem_map.refinement.verdicts import MotionSettings, judge
 
 
-def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False, fleeting=False):
+def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False):
     centre, half = np.array([x, y]), np.array([length / 2, 0.9])
-    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut, fleeting)
+    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut)
 
 
 def test_two_cars_that_pass_each_other_keep_their_tracks():
     segments = [
         s for scan in range(30) for s in (segment(scan, scan * 0.8), segment(scan, 24 - scan * 0.8, 2.5))
     ]
-    tracks = track(segments, gate_m=1.5)
+    tracks = track(segments, 1.5, np.zeros(60, bool))
     assert [t.segments for t in tracks] == [list(range(0, 60, 2)), list(range(1, 60, 2))]
     np.testing.assert_allclose(tracks[0].velocity, [8.0, 0.0], atol=0.1)
 
@@ -25,13 +25,14 @@ def test_two_cars_that_pass_each_other_keep_their_tracks():
 def test_a_track_survives_five_scans_out_of_sight_and_not_six():
     for gap, count in ((5, 1), (6, 2)):
         scans = [*range(10), *range(10 + gap, 20 + gap)]
-        assert len(track([segment(scan, scan * 0.5) for scan in scans], gate_m=1.5)) == count
+        segments = [segment(scan, scan * 0.5) for scan in scans]
+        assert len(track(segments, 1.5, np.zeros(len(segments), bool))) == count
 
 
 def test_on_a_highway_a_fleeting_segment_is_followed_as_far_as_it_drives_and_a_standing_one_is_not():
     for speed, fleeting, count in ((33.0, True, 1), (33.0, False, 8), (60.0, True, 8)):
-        segments = [segment(scan, scan * 0.1 * speed, fleeting=fleeting) for scan in range(8)]
-        assert len(track(segments, gate_m=1.5)) == count
+        segments = [segment(scan, scan * 0.1 * speed) for scan in range(8)]
+        assert len(track(segments, 1.5, np.full(8, fleeting))) == count
 
 
 def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
@@ -39,12 +40,12 @@ def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
         s
         for scan in range(10)
         for s in (
-            segment(scan, scan * 2.5, fleeting=True),
-            segment(scan, 20 + scan * 2.5, fleeting=True),
-            segment(scan, 40 - scan * 3.3, 4.0, fleeting=True),
+            segment(scan, scan * 2.5),
+            segment(scan, 20 + scan * 2.5),
+            segment(scan, 40 - scan * 3.3, 4.0),
         )
     ]
-    tracks = track(segments, gate_m=1.5)
+    tracks = track(segments, 1.5, np.ones(30, bool))
     assert [t.segments for t in tracks] == [list(range(k, 30, 3)) for k in range(3)]
     np.testing.assert_allclose(tracks[2].velocity, [-33.0, 0.0], atol=0.5)
 

@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 # them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
 TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
 MAX_ITERATIONS = 30
+# Once a sweep is in its place, so much of a voxel's edge is far enough to look for a point's surface. What is farther
+# has moved: a car ahead, half a metre on since the last sweep, would drag the sweep along with it.
+SETTLED = 0.5
 # A point's plane is that of so many neighbours: ten and twenty tilt it at edges, and roll the sweep with it.
 NEIGHBOURS = 6
 
@@ -58,6 +61,8 @@ class ScanMatchingSettings(BaseModel):
     max_correction_deg: float = Field(5.0, gt=0, description="Likewise, in rotation.")
     max_gap_s: float = Field(1.0, gt=0, description="After a longer gap a new local map is begun.")
     steps: tuple[int, ...] = Field((1, 10), min_length=1, description="Relative poses over so many sweeps.")
+    # Two halves of the sweeps of a real drive (KITTI 0005, every other 2000 points), matched each for itself, differ by
+    # errors of 3 to 8 mm and 0.4 to 0.7 mrad over one second: beams and scenes err alike in a whole sweep.
     translation_stddev_m: float = Field(0.005, gt=0, description="No relative position is trusted more.")
     rotation_stddev_rad: float = Field(0.0005, gt=0, description="No relative rotation is trusted more.")
     degenerate_share: float = Field(
@@ -207,28 +212,40 @@ class _Odometry:
 
     def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:
         settings = self._settings
-        result = small_gicp.align(
-            self._map,
-            points,
-            guess,
-            max_correspondence_distance=settings.voxel_size_m,
-            max_iterations=MAX_ITERATIONS,
-        )
-        found = result.num_inliers / points.size()
+        coarse = self._align(points, guess, settings.voxel_size_m)
+        found = coarse.num_inliers / points.size()
         if found < settings.min_inlier_share:
             raise _NoMatch(
                 f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
             )
-        information, weight = _information(result, points)
+        settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m)
+        # the coarse match knows what holds the sweep: what moves makes its residuals larger, and it less sure
+        information, weight = _information(coarse, points)
         length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
         T, covariance, is_open = _close_open_directions(
-            guess, _rigid(result.T_target_source), information, weight, length, settings
+            guess, _rigid(settled.T_target_source), information, weight, length, settings
         )
         # at its limit, not stuck at a minimum; where a direction is open, sliding along it does no harm
-        if not result.converged and result.iterations >= MAX_ITERATIONS - 1 and not is_open:
+        if not is_open and not all(_has_converged(result) for result in (coarse, settled)):
             raise _NoMatch(f"the registration did not converge in {MAX_ITERATIONS} iterations")
         _refuse_divergence(_inverse(guess) @ T, settings)
         return T, covariance, is_open
+
+    def _align(
+        self, points: small_gicp.PointCloud, guess: Array, within_m: float
+    ) -> small_gicp.RegistrationResult:
+        """Register by the points that lie so close to the mean of their voxel: small_gicp's result."""
+        return small_gicp.align(
+            self._map,
+            points,
+            guess,
+            max_correspondence_distance=within_m,
+            max_iterations=MAX_ITERATIONS,
+        )
+
+
+def _has_converged(result: small_gicp.RegistrationResult) -> bool:
+    return bool(result.converged or result.iterations < MAX_ITERATIONS - 1)
 
 
 def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> None:

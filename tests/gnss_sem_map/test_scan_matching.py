@@ -122,6 +122,18 @@ def test_moving_vehicles_hardly_matter() -> None:
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.03
 
 
+def test_slow_traffic_all_around_does_not_drag_the_sweep_along() -> None:
+    """Cars that go a third of a metre per sweep still lie beside where they were, and would be taken for walls."""
+    cars: tuple[scenes.Box, ...] = (
+        ((8.0, -1.2, 0.3), (12.5, 1.2, 3.2), (3.0, 0, 0)),
+        ((14.0, 2.2, 0.2), (18.0, 4.0, 1.8), (3.0, 0, 0)),
+        ((8.0, -4.2, 0.2), (12.0, -2.0, 1.8), (3.0, 0, 0)),
+    )
+    log, truth = street(cars)
+    off = errors(match_scans(log, truth).relative_poses, truth)
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.01
+
+
 @cache
 def tunnel() -> tuple[SensorLog, Trajectory]:
     motion = scenes.drive(SWEEPS * 0.1)

@@ -37,6 +37,8 @@ MAX_ITERATIONS = 30
 # Once a sweep is in its place, so much of a voxel's edge is far enough to look for a point's surface. What is farther
 # has moved: a car ahead, half a metre on since the last sweep, would drag the sweep along with it.
 SETTLED = 0.5
+# The first match ends when it goes on by less than the first, the second at less than the other.
+COARSE_M, FINE_M = 0.01, 0.001
 # A point's plane is that of so many neighbours: ten and twenty tilt it at edges, and roll the sweep with it.
 NEIGHBOURS = 6
 
@@ -212,13 +214,13 @@ class _Odometry:
 
     def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:
         settings = self._settings
-        coarse = self._align(points, guess, settings.voxel_size_m)
+        coarse = self._align(points, guess, settings.voxel_size_m, COARSE_M)
         found = coarse.num_inliers / points.size()
         if found < settings.min_inlier_share:
             raise _NoMatch(
                 f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
             )
-        settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m)
+        settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m, FINE_M)
         # the coarse match knows what holds the sweep: what moves makes its residuals larger, and it less sure
         information, weight = _information(coarse, points)
         length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
@@ -232,15 +234,16 @@ class _Odometry:
         return T, covariance, is_open
 
     def _align(
-        self, points: small_gicp.PointCloud, guess: Array, within_m: float
+        self, points: small_gicp.PointCloud, guess: Array, within_m: float, step_m: float
     ) -> small_gicp.RegistrationResult:
-        """Register by the points that lie so close to the mean of their voxel: small_gicp's result."""
+        """Register by the points that lie so close to the mean of their voxel, until a step is so small."""
         return small_gicp.align(
             self._map,
             points,
             guess,
             max_correspondence_distance=within_m,
             max_iterations=MAX_ITERATIONS,
+            translation_epsilon=step_m,
         )
 
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+
 import numpy as np
-from numba import njit
+from numba import int64, njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import gammaln
 
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
 """Layer height, in voxels, that holds every column in one layer."""
+THREADS = os.cpu_count() or 1
+LEAST_AT_ONCE = 1 << 18
+"""Fewer voxels are not worth a thread."""
 LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
 """A map's own word on its errors is believed within these: to agree with itself is not to be right."""
 
@@ -60,59 +67,78 @@ def count_grid(
     `keys` (v,) sorted packed voxels, `labels` (v,). A column is a square of `cell_voxels`, whole or, with
     `layer_voxels`, the layers within `reach_layers` of the voxel's own.
     """
-    counts = np.empty((len(keys), 2), np.int32)
-    _count(keys, labels, classes[0], classes[1], cell_voxels, layer_voxels, reach_layers, counts)
+    votes, counts = np.zeros((256, 2), np.int32), np.empty((len(keys), 2), np.int32)
+    for k in (0, 1):
+        votes[np.uint8(classes[k]), k] = 1
+    pairs = [array.view(np.int64)[:, 0] for array in (votes, counts)]  # two counts add as one integer
+
+    def count(part: slice) -> None:
+        _count(
+            keys[part], labels.view(np.uint8)[part], pairs[0], cell_voxels, layer_voxels, reach_layers, pairs[1][part]
+        )  # fmt: skip
+
+    for _ in ahead(count, _slabs(keys, cell_voxels), THREADS):
+        pass
     return counts
 
 
-@njit(cache=True, nogil=True)
-def _runs(keys, cell, layer):
-    """Runs of sorted voxels that share a column and a layer: cell in y and layer, (r, 2), and ends (r + 1,)."""
-    cells, ends = np.empty((len(keys), 2), np.int64), np.zeros(len(keys) + 1, np.int64)
+def _slabs(keys: NDArray[np.int64], cell: int) -> Iterator[slice]:
+    """Parts of the sorted voxels, no fewer than the threads, that no cell is in two of."""
+    start = 0
+    while start < len(keys):
+        last = keys[min(start + max(len(keys) // THREADS, LEAST_AT_ONCE), len(keys)) - 1] >> (2 * AXIS_BITS)
+        end = int(np.searchsorted(keys, (last // cell + 1) * cell << (2 * AXIS_BITS)))
+        yield slice(start, end)
+        start = end
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _ends(keys, layer):
+    """Ends of the runs of sorted voxels that share a column and a layer: (r + 1,), from 0."""
+    ends = np.zeros(len(keys) + 1, np.int64)
     count, i = 0, 0
     while i < len(keys):
         z = keys[i] & AXIS_MASK
-        cells[count] = ((keys[i] >> AXIS_BITS) & AXIS_MASK) // cell, z // layer
         past = keys[i] - z + (z // layer + 1) * layer
-        while i + 4 <= len(keys) and keys[i + 3] < past:  # keys are sorted: the fourth decides for four
-            i += 4
+        while i + 8 <= len(keys) and keys[i + 7] < past:  # keys are sorted: the eighth decides for eight
+            i += 8
         while i < len(keys) and keys[i] < past:
             i += 1
         count += 1
         ends[count] = i
-    return cells[:count], ends[: count + 1]
+    return ends[: count + 1]
 
 
 @njit(cache=True, nogil=True)
-def _count(keys, labels, a, b, cell, layer, reach, counts):
+def _count(keys, labels, votes, cell, layer, reach, counts):
     """One slab of cells at a time, run by run, on a grid of its cells (y, z) with room for the reach."""
     start = 0
     while start < len(keys):
         past = ((keys[start] >> (2 * AXIS_BITS)) // cell + 1) * cell << (2 * AXIS_BITS)
         slab = slice(start, start + np.searchsorted(keys[start:], past))
         start = slab.stop
-        cells, ends = _runs(keys[slab], cell, layer)
-        _count_slab(labels[slab], a, b, cells, ends, reach, counts[slab])
+        _count_slab(
+            keys[slab], labels[slab], votes, cell, layer, reach, _ends(keys[slab], layer), counts[slab]
+        )
 
 
-@njit(cache=True, nogil=True)
-def _count_slab(labels, a, b, cells, ends, reach, counts):
-    low_y, low_z = cells[:, 0].min(), cells[:, 1].min() - reach
-    grid = np.zeros((cells[:, 0].max() - low_y + 1, cells[:, 1].max() + reach - low_z + 1, 2), np.int32)
-    for run in range(len(cells)):
-        first, second = 0, 0
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_slab(keys, labels, votes, cell, layer, reach, ends, counts):
+    runs = len(ends) - 1
+    y, z = np.empty(runs, np.int64), np.empty(runs, np.int64)
+    for run in range(runs):
+        y[run] = ((keys[ends[run]] >> AXIS_BITS) & AXIS_MASK) // cell
+        z[run] = (keys[ends[run]] & AXIS_MASK) // layer
+    low_y, low_z = y.min(), z.min() - reach
+    grid = np.zeros((y.max() - low_y + 1, z.max() + reach - low_z + 1), np.int64)
+    for run in range(runs):
+        pair = int64(0)
         for label in labels[ends[run] : ends[run + 1]]:
-            first += label == a
-            second += label == b
-        grid[cells[run, 0] - low_y, cells[run, 1] - low_z, 0] += first
-        grid[cells[run, 0] - low_y, cells[run, 1] - low_z, 1] += second
-    for run in range(len(cells)):
-        first, second = 0, 0
-        for z in range(cells[run, 1] - low_z - reach, cells[run, 1] - low_z + reach + 1):
-            first += grid[cells[run, 0] - low_y, z, 0]
-            second += grid[cells[run, 0] - low_y, z, 1]
-        for i in range(ends[run], ends[run + 1]):
-            counts[i, 0], counts[i, 1] = first, second
+            pair += votes[label]
+        grid[y[run] - low_y, z[run] - low_z] += pair
+    for run in range(runs):
+        layers = grid[y[run] - low_y, z[run] - low_z - reach : z[run] - low_z + reach + 1]
+        counts[ends[run] : ends[run + 1]] = layers.sum()
 
 
 def paper_log_odds(

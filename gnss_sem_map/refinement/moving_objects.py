@@ -8,7 +8,6 @@ to something that moved.
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -144,7 +143,8 @@ class MovingObjectDetector:
             )  # fmt: skip
 
         starts = range(0, len(keys), PLACES_AT_ONCE)
-        deque(ahead(look, (slice(start, start + PLACES_AT_ONCE) for start in starts), THREADS), maxlen=0)
+        for _ in ahead(look, (slice(start, start + PLACES_AT_ONCE) for start in starts), THREADS):
+            pass
         hits = np.maximum(hits - 1, 0)  # less the scan that found it
         ends = np.cumsum([len(part.points) for part in parts])[:-1]
         return list(zip(np.split(hits[place], ends), np.split(throughs[place], ends), strict=True))

@@ -51,6 +51,15 @@ def test_the_count_grid_of_one_voxel_columns_is_a_bincount():
         np.testing.assert_array_equal(counts[:, k], np.bincount(column, labels == c)[column])
 
 
+def test_any_number_of_threads_counts_the_same(monkeypatch):
+    keys, labels = voxels(np.random.default_rng(2), 5000, 30)
+    expected = count_grid(keys, labels, (BUILDING, VEGETATION), 5, 5, 1)
+    monkeypatch.setattr(grids, "LEAST_AT_ONCE", 1)
+    for threads in (1, 3, 50):
+        monkeypatch.setattr(grids, "THREADS", threads)
+        np.testing.assert_array_equal(count_grid(keys, labels, (BUILDING, VEGETATION), 5, 5, 1), expected)
+
+
 def test_the_papers_rule_is_bayes_with_a_binomial_likelihood():
     indices = np.array([(0, 0, z) for z in range(5)] + [(9, 9, z) for z in range(4)])
     labels = np.array([3, 3, 3, 4, 3, 4, 4, 4, 3], np.int8)

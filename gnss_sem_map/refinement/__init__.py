@@ -35,6 +35,7 @@ Scores = NDArray[np.float32]
 NAT_PER_LOOK = 1.3
 """Between a look that says nothing (1) and one that is sure (1.6 for five classes and a floor of 5 %)."""
 SWITCHED_OFF, LACKING = "switched off", "the class set lacks one of them"
+NO_ROAD = "the map has no road to stand on"
 
 
 class RefinementSettings(BaseModel):
@@ -285,6 +286,10 @@ def _judge_vehicles(
         )
         gone = found.moving | found.rejected
         return scores, gone, found.objects, Step(name, _changes(voxels.label_set, labels, labels, gone))
+    if not (
+        labels == classes[1]
+    ).any():  # nothing is known of any vehicle: a camera that looks aside sees no road
+        return scores, nothing, (), Step(name, {}, NO_ROAD)
     found = vehicles.supported(
         voxels.indices, labels, heights, classes[0], classes[1], settings.support, voxels.voxel_size_m
     )

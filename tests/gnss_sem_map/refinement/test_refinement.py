@@ -106,6 +106,17 @@ def test_the_papers_rule_removes_a_parked_car_that_stands_beside_the_road_and_ev
     assert (evidence.labels[cars] == VEHICLE).mean() > 0.85
 
 
+def test_without_any_road_evidence_keeps_the_cars_and_says_why():
+    voxels, truth = street(np.random.default_rng(3))
+    voxels, truth = voxels[truth != ROAD], truth[truth != ROAD]
+    evidence, report = refine(voxels, RefinementSettings(geometry="off"))
+    assert (evidence.labels[truth == VEHICLE] == VEHICLE).all()
+    assert {step.name: step.skipped for step in report.steps}["vehicles"] == "the map has no road to stand on"
+    paper, _ = refine(voxels, RefinementSettings(vehicles="paper"))
+    assert not paper.shown[truth == VEHICLE].any(), "eq. 12 asks for road in the column"
+    assert evidence.shown.all()
+
+
 def test_removed_voxels_come_back_as_a_layer_only_where_nothing_else_stands():
     static = voxel_map([(0, 0, 0), (1, 0, 0)], [ROAD, -1])
     moving = voxel_map([(1, 0, 0), (2, 0, 0), (3, 0, 0)], [VEHICLE, VEHICLE, -1])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.scan_matching import ScanMatches, ScanMatchingSettings, match_scans
-from gnss_sem_map.sensor_log import Points, SensorLog
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
 SWEEPS = 16
@@ -292,3 +293,33 @@ def test_a_drive_without_sweeps_has_no_relative_poses() -> None:
 def test_settings_that_make_no_sense_are_refused(setting: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         ScanMatchingSettings.model_validate(setting)
+
+
+@pytest.mark.slow
+def test_two_halves_of_the_sweeps_of_a_real_drive_agree_within_the_covariances(real_data: Path) -> None:
+    """Half their difference is the error of the whole sweep, as far as they are independent of each other."""
+    from gnss_sem_map.io import open_drive
+
+    log = open_drive(real_data / "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync")
+    assert log.reference is not None
+    whole, one, other = (
+        match_scans(some, log.reference).relative_poses for some in (log, half_of(log, 0), half_of(log, 1))
+    )
+    np.testing.assert_array_equal(one.stamps, whole.stamps)
+    np.testing.assert_array_equal(other.stamps, whole.stamps)
+    off = np.linalg.inv(one.T_imu_imu) @ other.T_imu_imu
+    half = np.column_stack([Rotation.from_matrix(off[:, :3, :3]).as_rotvec(), off[:, :3, 3]]) / 2
+    squares = np.einsum("ki,kij,kj->k", half, np.linalg.inv(whole.covariances), half)
+    over_a_second = np.diff(whole.stamps, axis=1)[:, 0] > 0.5
+    assert 0.5 < squares[~over_a_second].mean() < 6
+    assert 0.5 < squares[over_a_second].mean() < 6
+
+
+def half_of(log: SensorLog, which: int) -> SensorLog:
+    """The drive with every other 2000 points of its sweeps, as the file has them: other beams, other places."""
+
+    def read(scan: Scan) -> Points:
+        points = scan.read()
+        return points[np.arange(len(points.xyz)) // 2000 % 2 == which]
+
+    return replace(log, scans=tuple(replace(s, read=partial(read, s)) for s in log.scans))

@@ -168,23 +168,28 @@ def observe(
     image = range_images.empty_image()
     range_images.draw(p_map, T_lidar_map, image)
     heights, centre = height_over_ground(p_map), T_map_lidar[:2, 3]
-    above = np.flatnonzero((heights > FOOT_M) & within(p_map, centre, settings.farthest_object_m))
-    points, named, is_body = p_map.take(above, axis=0), is_object.take(above), heights.take(above) > BODY_M
+    above = (heights > FOOT_M) & within(p_map, centre, settings.farthest_object_m)
+    is_body = heights > BODY_M
     # nobody testifies on what is farther away, so that only a name makes it an object
-    known = is_known.take(above) | ~within(points, centre, settings.farthest_m)
-    segments = find_segments(points, named, known, is_body, settings.segment_eps_m)
-    of_points = segments.of_points
-    hidden = range_images.hidden_sides(points, of_points, T_lidar_map, image, len(segments.cut), HIDING_M)
-    keep = np.flatnonzero(near(points, of_points >= 0, settings.grow_m))
+    unknown = ~is_known & within(p_map, centre, settings.farthest_m)
+    candidates = np.flatnonzero(above & is_body & (is_object | unknown))
+    points = p_map.take(candidates, axis=0)
+    segments = find_segments(points, is_object.take(candidates), settings.segment_eps_m)
+    hidden = range_images.hidden_sides(
+        points, segments.of_points, T_lidar_map, image, len(segments.cut), HIDING_M
+    )
+    voxel = np.full(len(p_map), -1, np.int32)
+    voxel[candidates] = segments.voxel
+    keep = np.flatnonzero(above & near(p_map, voxel >= 0, settings.grow_m))
     return Observation(
         number=number,
         stamp=stamp,
         T_lidar_map=T_lidar_map,
         image=image,
-        places=above.take(keep),
-        p_map=points.take(keep, axis=0),
+        places=keep,
+        p_map=p_map.take(keep, axis=0),
         is_body=is_body.take(keep),
-        segments=replace(segments, voxel=segments.voxel.take(keep), cut=segments.cut | hidden),
+        segments=replace(segments, voxel=voxel.take(keep), cut=segments.cut | hidden),
     )
 
 

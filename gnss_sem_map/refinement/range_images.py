@@ -118,12 +118,13 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
     first = np.full(count, -1, np.int32)
     low, high = np.zeros(count, np.int32), np.zeros(count, np.int32)
     for i in range(n):
-        s = segments[i]
-        if s < 0:
-            continue
         x, y, z = _in_lidar(T_lidar_map, flat, i)
         ranges[i] = np.sqrt(x * x + y * y + z * z)
         rows[i], columns[i] = _pixel(x, y, z)
+    for i in range(n):
+        s = segments[i]
+        if s < 0:
+            continue
         if first[s] < 0:
             first[s] = columns[i]
         columns[i] = (

@@ -133,24 +133,15 @@ def _whole(low, high):
     return np.searchsorted(np.unique(owners), owners)
 
 
-def find_segments(
-    p_map: NDArray[np.float64],
-    is_object: NDArray[np.bool_],
-    is_known: NDArray[np.bool_],
-    is_body: NDArray[np.bool_],
-    eps_m: float,
-) -> Segments:
-    """Segments among the points above ground (n, 3), and which of them the edge of the view cuts.
+def find_segments(p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float) -> Segments:
+    """Segments among points above ground (n, 3), and which of them the edge of the view cuts.
 
-    `is_object` says which points the image calls a vehicle, `is_known` which it shows at all, `is_body` which may
-    belong to a segment. A vehicle at the edge
-    of the view goes on in the points around it, if the whole is no larger than a vehicle; else its shown part is a
-    segment, marked as cut. Where nothing is known, whatever has a vehicle's size is a segment.
+    `is_object` says which points the image calls a vehicle; the others it does not show. A vehicle at the edge of the
+    view goes on in the points around it, if the whole is no larger than a vehicle; else its shown part is a segment,
+    marked as cut. Where the image shows nothing, whatever has a vehicle's size is a segment.
     """
-    candidates = np.flatnonzero((is_object | ~is_known) & is_body)
-    points, named = p_map.take(candidates, axis=0), is_object.take(candidates)
-    keys, voxel = distinct(keys_of(points, VOXEL_M))
-    voxels = Parts.of(points, named, voxel, len(keys))
+    keys, voxel = distinct(keys_of(p_map, VOXEL_M))
+    voxels = Parts.of(p_map, is_object, voxel, len(keys))
     clusters, count = _objects(keys, voxels, eps_m)
     whole = voxels.joined(clusters, count)
     fits = _is_vehicle_sized(whole)
@@ -162,8 +153,7 @@ def find_segments(
     cut[part] = (whole.points > whole.named)[clusters[shown]]  # with points that the image does not show
     kept = number >= 0
     row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
-    row = np.full(len(p_map), -1, np.int32)
-    row[candidates] = np.where(named | ~shown.take(voxel), row_of.take(voxel), -1)
+    row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
     parts = Parts.of(p_map, is_object, row, int(kept.sum()))
     return Segments(
         row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), cut])

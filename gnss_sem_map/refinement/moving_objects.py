@@ -97,40 +97,41 @@ class MovingObjectDetector:
         settings = self._settings
         looks = self._testimony()
         segments = [
-            take_apart(seen.segments, *looked, settings.segment_eps_m, settings.least_through_per_hit)
+            take_apart(
+                seen.segments, looked[0], looked[1], settings.segment_eps_m, settings.least_through_per_hit
+            )
             for seen, looked in zip(self._observations, looks, strict=True)
         ]
-        hits, throughs = (
-            np.concatenate([s.sums_of(looked[which]) for s, looked in zip(segments, looks, strict=True)])
-            for which in (0, 1)
+        hits, throughs = np.concatenate(
+            [of_scan.sums_of(looked) for of_scan, looked in zip(segments, looks, strict=True)], axis=1
         )
         listed = _all_segments(self._observations, segments)
         objects = judge(listed, hits, throughs, settings)
         gone = np.zeros(len(listed), np.bool_)
         for one in objects:
             gone[list(one.segments)] = one.motion in GONE
+        gone_of = np.split(gone, np.cumsum([len(of_scan.cut) for of_scan in segments]))
         settled, self._observations = self._observations[:count], self._observations[count:]
-        of_scans = np.split(gone, np.cumsum([len(s.cut) for s in segments]))
 
-        def moved(place: int) -> NDArray[np.int64]:
-            seen, points = settled[place], segments[place].points_of(of_scans[place])
-            return seen.places[_grown(seen, points, settings.grow_m)]
+        def moved(scan: int) -> NDArray[np.int64]:
+            seen, of_gone = settled[scan], segments[scan].points_of(gone_of[scan])
+            return seen.places[_grown(seen, of_gone, settings.grow_m)]
 
-        points = {settled[place].number: where for place, where in ahead(moved, range(count), THREADS)}
+        points = {settled[scan].number: places for scan, places in ahead(moved, range(count), THREADS)}
         self._past += [(seen.image, seen.T_lidar_map) for seen in settled]
         del self._past[: -self._settings.window_scans]
         begun = tuple(one for one in objects if listed[one.segments[0]].scan < count)
         return MovingObjects(points, begun)
 
-    def _testimony(self) -> list[tuple[NDArray[np.int32], NDArray[np.int32]]]:
-        """How often every voxel of each scan's segments was hit and seen through by other scans: (v,) each."""
+    def _testimony(self) -> list[NDArray[np.int32]]:
+        """For each scan, how often every voxel of its segments was hit and seen through by other scans: (2, v)."""
         settings, observations = self._settings, self._observations
         parts = [seen.segments.parts for seen in observations]
         keys, place = distinct(np.concatenate([seen.segments.keys for seen in observations]))
         points = np.bincount(place, np.concatenate([part.points for part in parts]))
         sums = np.concatenate([part.sums for part in parts])
         centroids = np.stack([np.bincount(place, sums[:, axis]) / points for axis in range(3)], axis=1)
-        hits, throughs = np.zeros(len(keys), np.int32), np.zeros(len(keys), np.int32)
+        looks = np.zeros((2, len(keys)), np.int32)
         witnesses = self._past + [(seen.image, seen.T_lidar_map) for seen in observations]
         images, poses = zip(*witnesses, strict=True)
         looking = np.stack(images), np.stack(poses)
@@ -139,15 +140,14 @@ class MovingObjectDetector:
             range_images.look_at(
                 centroids[part], *looking,
                 settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
-                hits[part], throughs[part],
+                *looks[:, part],
             )  # fmt: skip
 
         starts = range(0, len(keys), PLACES_AT_ONCE)
         for _ in ahead(look, (slice(start, start + PLACES_AT_ONCE) for start in starts), THREADS):
             pass
-        hits = np.maximum(hits - 1, 0)  # less the scan that found it
-        ends = np.cumsum([len(part.points) for part in parts])[:-1]
-        return list(zip(np.split(hits[place], ends), np.split(throughs[place], ends), strict=True))
+        looks[0] = np.maximum(looks[0] - 1, 0)  # less the scan that found it
+        return np.split(looks[:, place], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
 
 
 def observe(

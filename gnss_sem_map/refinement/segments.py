@@ -111,8 +111,9 @@ class Segments:
         return np.append(which[self.number], False).take(self.voxel)
 
     def sums_of(self, looks: NDArray[np.int32]) -> NDArray[np.float64]:
-        """What all points of every segment (s,) sum up to, of what is known of each voxel (v,)."""
-        return np.asarray(np.bincount(self.number, looks * self.parts.points, len(self.cut)), np.float64)
+        """What the points of every segment sum up to (k, s), of k things that are known of every voxel (k, v)."""
+        weights, count = looks * self.parts.points, len(self.cut)
+        return np.array([np.bincount(self.number, row, count) for row in weights], np.float64)
 
 
 @njit(cache=True, nogil=True)

@@ -29,7 +29,8 @@ FOOT_M, BODY_M = 0.05, 0.2
 FOOT_REACH_M = 0.2
 HIDING_M = 0.5
 """What is nearer by this hides the side of an object."""
-THREADS = os.cpu_count() or 1
+THREADS = min(os.cpu_count() or 1, 4)
+"""More would wait for the one that reads, each with two scans in memory."""
 PLACES_AT_ONCE = 1 << 14
 """Places that one thread looks at before it takes the next."""
 

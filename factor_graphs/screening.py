@@ -50,6 +50,11 @@ def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max
     return keep
 
 
+def are_drifting(fixes: GnssFixes) -> bool:
+    """Whether they are an inertial unit's positions, whose errors last for a minute, not a receiver's."""
+    return len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
+
+
 def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_stamps: Array) -> Array:
     """How long the error of each fix lasts, (m,) s; `relative_stamps` (k, 2) s are those of the relative poses.
 
@@ -58,7 +63,7 @@ def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_sta
     they and the IMU holds it.
     """
     times = np.full(len(fixes), settings.fix_correlation_time_s)
-    if len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S:
+    if are_drifting(fixes):
         begun = np.searchsorted(np.sort(relative_stamps[:, 0]), fixes.stamps, side="right")
         ended = np.searchsorted(np.sort(relative_stamps[:, 1]), fixes.stamps, side="left")
         drift = max(settings.fix_correlation_time_s, settings.drift_correlation_time_s)

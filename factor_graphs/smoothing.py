@@ -17,6 +17,7 @@ from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
+from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
 
@@ -31,7 +32,8 @@ class Solution:
     """What the smoother found, and how far to believe it.
 
     `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6),
-    accelerometer m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases).
+    accelerometer m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases) as the
+    graph has them: with the fixes of an inertial unit, which drift together, `keyframes` and `trajectory` say more.
     For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
     outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
     `relative_weights`, likewise. `chi2_per_dof` is about 1 when the
@@ -93,7 +95,10 @@ def smooth(
 def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     covariances = keyframe_covariances(fit.graph, fit.values, len(T))
-    keyframes = Trajectory(problem.intervals.keyframes, T, velocities, covariances[:, :6, :6])
+    of_poses = covariances[:, :6, :6]
+    if are_drifting(fixes[problem.used]):
+        of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])
+    keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
     noise = problem.noise.scaled(fit.inflation)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
     weights, rejected = np.zeros(len(fixes)), ~problem.used
@@ -116,6 +121,19 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         iterations=fit.iterations,
         notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
     )
+
+
+def _no_better_than(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
+    """Pose covariances (k, 6, 6) of a track that is nowhere better placed than by one fix.
+
+    Fixes that drift together are wrong together: the more of them, the better the shape, not the place. What the best
+    placed keyframe lacks in variance of a fix is added to all of them, so their differences stay as sure as they are.
+    """
+    in_map = np.einsum("kij,kjl,kil->ki", R_map_imu, covariances[:, 3:, 3:], R_map_imu)
+    lacking = np.maximum(np.median(fixes.stddevs, axis=0) ** 2 - in_map.min(axis=0), 0.0)
+    placed = covariances.copy()
+    placed[:, 3:, 3:] += np.swapaxes(R_map_imu, 1, 2) * lacking @ R_map_imu
+    return placed
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:

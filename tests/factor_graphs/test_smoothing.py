@@ -77,6 +77,41 @@ def test_the_errors_are_as_large_as_the_covariances_say(simulate):
     assert low < np.mean(values) < high
 
 
+def test_positions_of_an_inertial_unit_that_drift_together_place_the_track_no_better_than_one_of_them(
+    simulate,
+):
+    """One error per drive; a graph that takes a fix each second for new is far too sure of the place."""
+    runs, honest, by_graph = 8, [], []
+    for seed in range(runs):
+        drive = simulate(300 + seed, seconds=20.0, noise=ImuNoise())
+        stamps, rng = np.arange(0.05, 19.9, 0.1), np.random.default_rng(seed)
+        positions = simulate_gnss(
+            drive.motion,
+            stamps,
+            [0.002] * 3,
+            LEVER,
+            rng,
+            correlated_stddevs=[0.4] * 3,
+            correlation_time_s=120.0,
+        ).positions
+        s = smooth(
+            drive.imu, GnssFixes(stamps, positions, np.full((len(stamps), 3), 0.4)), FRAME, None, LEVER
+        )
+        k = len(s.keyframes) // 2
+        off = s.keyframes.positions[k] - drive.motion.trajectory(s.keyframes.stamps[k : k + 1]).positions[0]
+        error = s.keyframes.T_map_imu[k, :3, :3].T @ off
+        honest.append(nees(error, s.keyframes.covariances[k, 3:, 3:]))
+        by_graph.append(nees(error, s.state_covariances[k, 3:6, 3:6]))
+    low, high = anees_band(3, runs)
+    assert low < np.mean(honest) < high
+    assert np.mean(by_graph) > high
+
+
+def test_fixes_of_a_receiver_place_the_track_as_the_graph_says(mems_solution):
+    s = mems_solution
+    np.testing.assert_array_equal(s.keyframes.covariances, s.state_covariances[:, :6, :6])
+
+
 def test_moving_the_whole_log_moves_the_trajectory_with_it(mems, mems_solution):
     yaw, shift = 2.0, np.array([1000.0, -500.0, 20.0])
     turn = Rotation.from_euler("z", yaw).as_matrix()

@@ -32,7 +32,9 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []
     total = len(drive.log.scans)
-    for done, (_, observation) in enumerate(ahead(_observed, seen_scans(drive), THREADS), 1):
+    for done, (_, observation) in enumerate(
+        ahead(_observed, seen_scans(drive, keep_points=True), THREADS), 1
+    ):
         detector.add(observation)
         settled = detector.settle()
         points.update(settled.points)

@@ -32,22 +32,28 @@ def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, 
         m = _move_block(
             rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
         )
-        x, y, z, here = block[0], block[1], block[2], p_map[3 * count : 3 * (count + m)]
-        for i in range(m):
-            here[3 * i], here[3 * i + 1], here[3 * i + 2] = x[i], y[i], z[i]
+        _append(block, count, m, p_map)
         count += m
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _append(block, count, m, p_map):
+    """Write the first m points of a block behind the `count` that are in p_map (3 n,)."""
+    x, y, z, here = block[0], block[1], block[2], p_map[3 * count : 3 * (count + m)]
+    for i in range(m):
+        here[3 * i], here[3 * i + 1], here[3 * i + 2] = x[i], y[i], z[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def place(
     rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, voxel_size_m, P, nearest_depth_m, half_columns,
-    valid, keys, points, columns, lines, depths, nearest,
+    valid, keys, p_map, points, columns, lines, depths, nearest,
 ):  # fmt: skip
     """Find the voxels of the usable points of a scan, and those that fall into the image; returns both numbers.
 
-    As `to_map`, but of the points only the `keys` (m,) of their voxels are kept, 0 where no key can be, and what
-    `project` finds with `P`; without an image `nearest` is empty.
+    As `to_map`, but what is kept are the `keys` (m,) of their voxels, 0 where no key can be, and what `project` finds
+    with `P`; without an image `nearest` is empty. Where `p_map` is empty the points themselves are not kept.
     """
     count, inside, block, knots = 0, 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
     for start in range(0, len(valid), BLOCK):
@@ -57,6 +63,8 @@ def place(
         x, y, z, here = block[0, :m], block[1, :m], block[2, :m], keys[count : count + m]
         for i in range(m):
             here[i] = pack_key(x[i], y[i], z[i], voxel_size_m)
+        if len(p_map) > 0:
+            _append(block, count, m, p_map)
         if len(nearest) > 0:
             inside = project(
                 x, y, z, count, P, nearest_depth_m, half_columns, points, columns, lines, depths, inside, nearest

@@ -71,11 +71,15 @@ class SeenScan:
     """(m,) row of `classes` that each point saw, -1 for none."""
     classes: NDArray[np.uint8]
     """(p, c + 1) class probabilities, `other` last."""
+    kept: NDArray[np.float64] | None = None
+    """(m, 3) m, `p_map` if it was asked for beforehand."""
 
     @cached_property
     def p_map(self) -> NDArray[np.float64]:
         """(m, 3) m, where each is: found when it is asked for, for the map needs no more than the voxel."""
         drive = self.drive
+        if self.kept is not None:
+            return self.kept
         return map_points(self.points, self.scan, drive.trajectory, drive.log, drive.settings.mapping)[0]
 
     @property
@@ -85,26 +89,36 @@ class SeenScan:
         return np.asarray(of_pixel[self.pixels], np.int8)
 
 
-def seen_scans(drive: Drive, account: Account | None = None) -> Iterator[SeenScan]:
-    """Every usable scan in time order, with its points in the map and what its image shows of them."""
+def seen_scans(drive: Drive, account: Account | None = None, keep_points: bool = False) -> Iterator[SeenScan]:
+    """Every usable scan in time order, with its points in the map and what its image shows of them.
+
+    `keep_points` finds every `p_map` on the way, which takes less time than asking for it later.
+    """
     account = account or Account()
-    return (seen for seen in look_at(drive, drive.log.scans, account) if seen is not None)
+    return (seen for seen in look_at(drive, drive.log.scans, account, keep_points) if seen is not None)
 
 
-def look_at(drive: Drive, scans: Sequence[Scan], account: Account) -> Iterator[SeenScan | None]:
+def look_at(
+    drive: Drive, scans: Sequence[Scan], account: Account, keep_points: bool = False
+) -> Iterator[SeenScan | None]:
     """Every scan, or None for one that cannot be used; why is in the account."""
     look = _Look(drive.log, drive.segmenter, drive.settings, account)
     for scan, (points, classes) in ahead(look, scans, under_way=READ_AHEAD):
-        yield None if points is None else _see(drive, scan, points, classes, account)
+        yield None if points is None else _see(drive, scan, points, classes, account, keep_points)
 
 
 def _see(
-    drive: Drive, scan: Scan, points: Points, image: tuple[Image, ClassImage] | None, account: Account
+    drive: Drive,
+    scan: Scan,
+    points: Points,
+    image: tuple[Image, ClassImage] | None,
+    account: Account,
+    keep_points: bool = False,
 ) -> SeenScan | None:
     """Everything between reading a scan and fusing it, in one pass over its points."""
     log, n = drive.log, len(points.xyz)
     mapping, labelling = drive.settings.mapping, drive.settings.labelling
-    valid, keys = np.zeros(n, np.bool_), np.empty(n, np.int64)
+    valid, keys, p_map = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(3 * n if keep_points else 0)
     try:
         stamps, knots = knots_of(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
@@ -116,7 +130,7 @@ def _see(
     count, inside = scan_kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
-        valid, keys, *view.inside, view.nearest,
+        valid, keys, p_map, *view.inside, view.nearest,
     )  # fmt: skip
     if count == 0:
         account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
@@ -131,7 +145,8 @@ def _see(
     account.counts["points"] += n
     account.counts["points left out"] += n - count
     account.counts["points labelled"] += len(classes)
-    seen_scan = SeenScan(drive, scan, points, valid, keys[:count], pixels, classes)
+    kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
+    seen_scan = SeenScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
     if not seen_scan.keys.all():
         keys_of(seen_scan.p_map, mapping.voxel_size_m)  # says which point it is
     return seen_scan

@@ -67,6 +67,16 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
     assert reasons == [("labels", "no image near its stamp")] * (len(drive.log.scans) - 2)
 
 
+def test_points_that_are_kept_on_the_way_are_those_that_are_found_later(drive: Drive) -> None:
+    on_the_way = list(seen_scans(drive, keep_points=True))
+    assert len(on_the_way) == len(drive.log.scans)
+    for seen, asked in zip(on_the_way, seen_scans(drive), strict=True):
+        assert asked.kept is None
+        np.testing.assert_array_equal(seen.p_map, asked.p_map)
+        np.testing.assert_array_equal(seen.keys, asked.keys)
+        np.testing.assert_array_equal(seen.pixels, asked.pixels)
+
+
 def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_scans(
     drive: Drive, at_once: tuple[Maps, Account]
 ) -> None:

@@ -400,7 +400,7 @@ def demo(
 
 
 _DEMO_LABELS = {
-    "network": "of the small network that was trained on simulated streets of seeds 1 to 60; no use on real images",
+    "network": "of the small network that was trained on simulated streets of seeds 1 to 100; no use on real images",
     "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
 }
 

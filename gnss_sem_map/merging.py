@@ -40,11 +40,10 @@ def merge_runs(
     frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
     static, removed = [], []
     for run in (first, second):
-        raw = tiles.read(run / "map", label_set)
-        refined = tiles.read(run / "refined", label_set)
-        gone = refined.voxels[refined.states == State.REMOVED]
-        static.append(raw.voxels)
-        removed.append(gone[raw.voxels.places(gone.keys) < 0])
+        refined = tiles.read(run / "refined", label_set)  # map/ holds what moved as well
+        gone = refined.states == State.REMOVED
+        static.append(refined.voxels[~gone])
+        removed.append(refined.voxels[gone])
     stands = merge(static[0], static[1], frames[0], frames[1])
     return stands, merge(removed[0], removed[1], frames[0], frames[1]), frames[0]
 

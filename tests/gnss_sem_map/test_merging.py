@@ -12,6 +12,7 @@ from gnss_sem_map import tiles
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.merging import into_frame, merge, merge_runs
+from gnss_sem_map.refinement import refine
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
 
 URBAN = label_set()
@@ -52,18 +53,23 @@ def test_one_frame_is_added_exactly() -> None:
 
 
 def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
+    """Folders as a run writes them: `map` is everything, `refined` says what of it moved."""
     for name, frame, seed in (("a", HERE, 0), ("b", THERE, 1)):
         voxels = street(frame, seed)
-        raw = SemanticMap.of(voxels[voxels.labels != URBAN.index("building")])
-        states = np.where(voxels.labels == URBAN.index("building"), State.REMOVED, State.OBSERVED)
-        whole = SemanticMap.of(voxels)
-        tiles.write(raw, tmp_path / name / "map", frame)
-        refined = SemanticMap(voxels, whole.labels, whole.confidence, states.astype(np.uint8))
+        moved = voxels.labels == URBAN.index("building")
+        refined, _ = refine(voxels[~moved], removed=voxels[moved])
+        assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
+        tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
         tiles.write(refined, tmp_path / name / "refined", frame)
     stands, removed, frame = merge_runs(tmp_path / "a", tmp_path / "b")
     assert frame == HERE
     assert stands.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
+    assert URBAN.index("building") not in stands.labels
+    again, _ = refine(stands, removed=removed)
+    assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
+        stands.places(removed.keys) < 0
+    )
 
 
 def test_maps_that_do_not_fit_together_are_refused() -> None:

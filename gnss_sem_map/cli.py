@@ -351,7 +351,9 @@ def simulate(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the results.")] = Path("demo"),
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder of the results; the drive goes into OUT_drive.")
+    ] = Path("demo"),
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
     seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
     labels: Annotated[
@@ -371,9 +373,10 @@ def demo(
     from gnss_sem_map.simulation import simulate as write_drive
 
     check_replaceable(out)
+    world = out.with_name(f"{out.name}_drive")
+    _check_drive_replaceable(world)
     if labels == "network":
         _open_demo_network()  # what is missing is said now, not after the simulation
-    world = out.with_name(f"{out.name}_drive")
     shutil.rmtree(world, ignore_errors=True)
     start = time.perf_counter()
     with progress_bars() as progress:
@@ -403,6 +406,19 @@ _DEMO_LABELS = {
     "network": "of the small network that was trained on simulated streets of seeds 1 to 100; no use on real images",
     "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
 }
+
+
+def _check_drive_replaceable(world: Path) -> None:
+    """Raise DataError when the folder holds anything that no demo wrote."""
+    from gnss_sem_map.errors import DataError
+    from gnss_sem_map.simulation.drive import DATE
+
+    foreign = {path.name for path in world.iterdir()} - {DATE, "probabilities"} if world.is_dir() else set()
+    if foreign or world.is_file():
+        raise DataError(
+            f"{world}: the demo's drive goes here, but it holds {sorted(foreign)[:3] or 'a file'}; choose another -o"
+            " or move that away"
+        )
 
 
 def _open_demo_network() -> None:

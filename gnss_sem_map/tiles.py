@@ -25,7 +25,7 @@ from gnss_sem_map import labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_OFFSET
-from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack, unpack
+from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, pack, unpack
 
 TILE_BITS = 9
 Z_BITS = 14
@@ -255,6 +255,7 @@ def _about(
         "voxel_size_m": voxel_size_m,
         "classes": list(label_set.names),
         "class_set": label_set.name,
+        "states": {state.name.lower(): int(state) for state in State},
         "origin": origin,
         "axes": "east, north, up at the origin, m" if frame else "x, y, z of the drive's own poses, m",
         "utm_epsg": None if frame is None else frame.utm_epsg,

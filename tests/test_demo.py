@@ -103,6 +103,17 @@ def test_a_run_can_be_scored_again_on_fewer_points(demo: tuple[Path, Path, str])
     assert restricted["coverage"] > everything["coverage"]
 
 
+def test_a_folder_that_no_demo_wrote_is_left_alone(tmp_path: Path) -> None:
+    precious = tmp_path / "mine_drive" / "precious.txt"
+    precious.parent.mkdir()
+    precious.write_text("years of work")
+    done = gnss_sem_map("demo", "-o", tmp_path / "mine", "--seconds", "3")
+    assert done.returncode == 1
+    assert "precious.txt" in done.stderr
+    assert "choose another -o" in done.stderr
+    assert precious.read_text() == "years of work"
+
+
 def test_a_truth_that_does_not_fit_is_refused(demo: tuple[Path, Path, str], tmp_path: Path) -> None:
     out, truth, _ = demo
     shutil.copytree(truth / "labels", tmp_path / "labels")

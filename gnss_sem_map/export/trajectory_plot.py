@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 AXES = ("east", "north", "up")
 COLOURS = ("tab:red", "tab:green", "tab:blue")
+HEADROOM = 1.15
 
 
 def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
@@ -86,16 +87,15 @@ def _stddevs(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     stddevs = solution.trajectory.position_stddevs
     for name, colour, stddev in zip(AXES, COLOURS, stddevs.T, strict=True):
         axes.plot(solution.trajectory.stamps, stddev, color=colour, linewidth=1, label=name)
-    axes.set(ylabel="position stddev, m")
-    axes.set_ylim(bottom=0.0)
+    axes.set(ylabel="position stddev, m", ylim=(0.0, HEADROOM * stddevs.max()))
+    axes.legend(loc="lower right", fontsize=7, ncols=3)
     axes.grid(alpha=0.3)
 
 
 def _heading(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     stddev = np.degrees(heading_stddevs(solution.trajectory))
     axes.plot(solution.trajectory.stamps, stddev, color="tab:purple", linewidth=1)
-    axes.set(ylabel="heading stddev, °")
-    axes.set_ylim(bottom=0.0)
+    axes.set(ylabel="heading stddev, °", ylim=(0.0, HEADROOM * stddev.max()))
     axes.grid(alpha=0.3)
 
 

@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.account import Progress, silent
+from gnss_sem_map.ahead import ahead
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, LabelSet
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
@@ -33,6 +33,20 @@ class BatchSegmenter(Protocol):
 
     def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
         """Class probabilities (h, w, c) of every image."""
+        ...
+
+
+@runtime_checkable
+class ThreadedSegmenter(Protocol):
+    """A segmenter that answers sooner when several threads ask, each for an image of its own."""
+
+    @property
+    def threads(self) -> int:
+        """How many should ask."""
+        ...
+
+    def on_one_core(self, image: Image) -> NDArray[np.float32]:
+        """Class probabilities (h, w, c) of one image, by the asking thread alone."""
         ...
 
 
@@ -68,11 +82,18 @@ def write_cache(
     waiting = [image for image in images if not _file(folder, image).exists()]
     kept, skips, sizes, start = len(images) - len(waiting), list[Skip](), list[int](), time.perf_counter()
     progress("segmenting", kept, len(images))
-    remaining = iter(waiting)
-    while batch := list(islice(remaining, batch_size)):
-        for image, seen in _segment(batch, segmenter, skips):
-            small = quantised(seen, segmenter.class_names, label_set)
-            sizes.append(_write(_file(folder, image), small, label_set))
+    threads = segmenter.threads if isinstance(segmenter, ThreadedSegmenter) and batch_size == 1 else 1
+
+    def make(batch: list[Image]) -> tuple[list[int], list[Skip]]:
+        lost: list[Skip] = []
+        seen = _segment(batch, segmenter, lost, threads > 1)
+        small = ((image, quantised(each, segmenter.class_names, label_set)) for image, each in seen)
+        return [_write(_file(folder, image), each, label_set) for image, each in small], lost
+
+    batches = (waiting[i : i + batch_size] for i in range(0, len(waiting), batch_size))
+    for _, (written, lost) in ahead(make, batches, threads, under_way=threads):
+        sizes += written
+        skips += lost
         progress("segmenting", kept + len(sizes) + len(skips), len(images))
     if images and not (kept or sizes):
         raise DataError(f"none of {len(images)} images could be segmented; first reason: {skips[0].reason}")
@@ -92,7 +113,7 @@ def quantised(
 
 
 def _segment(
-    batch: list[Image], segmenter: Segmenter, skips: list[Skip]
+    batch: list[Image], segmenter: Segmenter, skips: list[Skip], on_one_core: bool
 ) -> Iterator[tuple[Image, NDArray[np.uint8] | NDArray[np.float32]]]:
     """All at once where the segmenter can; one by one where it cannot, or where one of them is damaged."""
     if isinstance(segmenter, BatchSegmenter) and len(batch) > 1:
@@ -101,9 +122,10 @@ def _segment(
             return
         except DataError:
             pass  # some image is damaged: the loop below finds out which
+    ask = segmenter.on_one_core if on_one_core and isinstance(segmenter, ThreadedSegmenter) else segmenter
     for image in batch:
         try:
-            yield image, segmenter(image)
+            yield image, ask(image)
         except MissingLabels as error:
             skips.append(Skip("labels", f"frame {image.number}", str(error)))
         except DataError as error:

@@ -50,6 +50,16 @@ class NetworkSegmenter:
         """Class probabilities (h, w, c) of one image."""
         return self.segment_many([image])[0]
 
+    @property
+    def threads(self) -> int:
+        """How many should ask at once: one per core, for cores that share an image wait; one for a GPU."""
+        return torch.get_num_threads() if self._device.type == "cpu" else 1
+
+    def on_one_core(self, image: Image) -> NDArray[np.float32]:
+        """Class probabilities (h, w, c) of one image, by the asking thread alone."""
+        torch.set_num_threads(1)  # of this thread
+        return self(image)
+
     def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
         """Class probabilities of several images of one size in one go, as if each had been alone."""
         pixels = [checked_pixels(image) for image in images]

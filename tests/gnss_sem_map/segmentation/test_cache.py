@@ -83,6 +83,24 @@ def test_an_interrupted_cache_ends_with_the_bytes_of_an_uninterrupted_one(tmp_pa
     assert files(tmp_path / "a") == files(tmp_path / "b")
 
 
+def test_threads_that_each_ask_for_an_image_change_nothing(tmp_path: Path) -> None:
+    class Threaded(Dice):
+        threads, asked = 3, 0
+
+        def on_one_core(self, image: Image) -> np.ndarray:
+            self.asked += 1
+            return self(image)
+
+    segmenter = Threaded()
+    images = [*IMAGES, image(20, black=True)]
+    report = write_cache(images, segmenter, URBAN, tmp_path / "a", "dice", batch_size=1)
+    assert segmenter.asked == len(images)
+    assert report.written == 5
+    assert [(skip.what, skip.where) for skip in report.skips] == [("image", "frame 20")]
+    write_cache(images, Dice(), URBAN, tmp_path / "b", "dice", batch_size=1)
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+
+
 def test_a_damaged_image_is_skipped_and_reported_and_the_others_are_not(tmp_path: Path) -> None:
     report = write_cache([*IMAGES, image(20, black=True)], Dice(), URBAN, tmp_path, "dice")
     assert report.written == 5

@@ -51,8 +51,9 @@ def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) ->
     order = np.argsort(keys, kind="stable")
     if (np.diff(keys[order]) == 0).any():
         raise DataError("dbscan: found a voxel twice, expected each once; pass unique indices")
-    clusters = np.empty(len(voxels), np.int32)
-    clusters[order] = _dbscan_sorted(voxels[order], np.argsort(order), _stencil(eps_voxels), min_samples)
+    positions, clusters = np.empty(len(voxels), np.int64), np.empty(len(voxels), np.int32)
+    positions[order] = np.arange(len(voxels))
+    clusters[order] = _dbscan_sorted(voxels[order], positions, _stencil(eps_voxels), min_samples)
     return clusters
 
 
@@ -169,37 +170,75 @@ def _count_neighbours(keys, masks, own, bits, stencil):
     return counts
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _widened(mask, half):
+    """The bits of a word and those up to `half` from one."""
+    reach = 0
+    while reach < half:
+        step = min(2 * reach + 1, half - reach)  # what is within `reach` has no gaps
+        mask |= (mask << uint64(step)) | (mask >> uint64(step))
+        reach += step
+    return mask
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _join(parents, i, j):
+    """Union of the sets of i and j: the lower root stays."""
+    i, j = _find_root(parents, i), _find_root(parents, j)
+    parents[max(i, j)] = min(i, j)
+
+
+@njit(cache=True, nogil=True)
+def _runs(own, bits, column_reach, parents):
+    """Join what lies within the radius of the next in its column and word; word and bits of each such run (r,)."""
+    n = len(own)
+    words, runs, count = np.empty(n, np.int64), np.zeros(n, np.uint64), 0
+    for i in range(n):
+        if i > 0 and own[i] == own[i - 1] and bits[i] - bits[i - 1] <= column_reach:
+            parents[i] = parents[i - 1]
+        else:
+            words[count] = own[i]
+            count += 1
+        runs[count - 1] |= uint64(1) << uint64(bits[i])
+    return words[:count], runs[:count]
+
+
 @njit(cache=True, nogil=True)
 def _join_cores(keys, masks, first, own, bits, stencil, parents):
     """Union of all core voxels within the radius of each other; half of the stencil sees every pair once.
 
-    After a join the next bits within the radius are skipped: they are joined to that bit within their own
-    column.
+    A run is joined to whatever is near it in a column. Bits that lie within the radius of the bit below are skipped:
+    they are joined to that one within their own column.
     """
     column_reach = stencil[len(stencil) // 2, 1]
+    words, runs = _runs(own, bits, column_reach, parents)
     for s in range(len(stencil) // 2 + 1):
         offset, half = stencil[s]
         j = 0
-        for i in range(len(own)):
-            wanted = keys[own[i]] + offset
+        for r in range(len(words)):
+            w = words[r]
+            wanted = keys[w] + offset
             while j < len(keys) and keys[j] < wanted:
                 j += 1
             if j == len(keys) or keys[j] != wanted:
                 continue
-            lowest = bits[i] - half
-            found = _window(masks[j], bits[i], half)
-            root = _find_root(parents, i)
+            found = masks[j] & _widened(runs[r], half)
+            if found == 0:
+                continue
+            voxel = _voxel_of(_lowest_bit(runs[r]), masks[w], first[w])
+            last = -LARGEST_EPS_VOXELS - 1
             while found != 0:
                 bit = _lowest_bit(found)
-                below = masks[j] & ((uint64(1) << uint64(lowest + bit)) - uint64(1))
-                other = _find_root(parents, first[j] + _popcount(below))
-                if other < root:
-                    parents[root] = other
-                    root = other
-                else:
-                    parents[other] = root
-                shift = bit + column_reach + 1
-                found = (found >> uint64(shift)) << uint64(shift) if shift < 64 else uint64(0)
+                found &= found - uint64(1)
+                if bit - last > column_reach:
+                    _join(parents, voxel, _voxel_of(bit, masks[j], first[j]))
+                last = bit
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _voxel_of(bit, mask, first):
+    """Number of the voxel at a bit of a word, whose first voxel is known."""
+    return first + _popcount(mask & ((uint64(1) << uint64(bit)) - uint64(1)))
 
 
 @njit(cache=True, nogil=True)
@@ -218,8 +257,7 @@ def _reach_borders(wanted_keys, bits, keys, masks, first, stencil, core_clusters
             found = _window(masks[j], bits[i], half)
             while found != 0:
                 bit = _lowest_bit(found)
-                below = masks[j] & ((uint64(1) << uint64(bits[i] - half + bit)) - uint64(1))
-                cluster = core_clusters[first[j] + _popcount(below)]
+                cluster = core_clusters[_voxel_of(bits[i] - half + bit, masks[j], first[j])]
                 if clusters[i] < 0 or cluster < clusters[i]:
                     clusters[i] = cluster
                 shift = bit + column_reach + 1

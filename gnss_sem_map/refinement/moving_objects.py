@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement import range_images
 from gnss_sem_map.refinement.distinct import distinct
-from gnss_sem_map.refinement.scan_grid import height_over_ground, near, within
+from gnss_sem_map.refinement.scan_grid import height_over_ground, near, reached, within
 from gnss_sem_map.refinement.segments import Segments, find_segments, take_apart
 from gnss_sem_map.refinement.tracks import Segment
 from gnss_sem_map.refinement.verdicts import GONE, MotionSettings, TrackedObject, judge
@@ -31,6 +30,8 @@ HIDING_M = 0.5
 """What is nearer by this hides the side of an object."""
 THREADS = min(os.cpu_count() or 1, 4)
 """More would wait for the one that reads, each with two scans in memory."""
+WINDOWS_HELD = 3
+"""Of scans that are not decided: with more, fewer are looked at twice, and more memory is taken."""
 PLACES_AT_ONCE = 1 << 14
 """Places that one thread looks at before it takes the next."""
 
@@ -52,10 +53,10 @@ class Observation:
     stamp: float
     T_lidar_map: NDArray[np.float64]
     image: NDArray[np.uint16]
-    places: NDArray[np.int64]
+    places: NDArray[np.int32]
     """(h,) where these points are in the scan."""
-    p_map: NDArray[np.float64]
-    """(h, 3) m."""
+    p_near: NDArray[np.float32]
+    """(h, 3) m, along the axes of the map, from where the scan was made."""
     is_body: NDArray[np.bool_]
     """(h,) whether it is higher than the foot of an object."""
     segments: Segments
@@ -63,7 +64,7 @@ class Observation:
 
 
 class MovingObjectDetector:
-    """Collects scans in time order; memory: two windows of scans, a range image and some points of each."""
+    """Collects scans in time order; memory: some windows of scans, a range image and some points of each."""
 
     def __init__(self, settings: MotionSettings | None = None) -> None:
         self._settings = settings or MotionSettings()
@@ -83,9 +84,12 @@ class MovingObjectDetector:
         self._observations.append(seen)
 
     def settle(self) -> MovingObjects:
-        """Decide about the scans that a whole window of later ones has testified on: often none."""
-        window = self._settings.window_scans
-        return self._decide(window) if len(self._observations) >= 2 * window else MovingObjects({}, ())
+        """Decide about the scans that a whole window of later ones has testified on: mostly none, then many at once.
+
+        For what is not decided is looked at again the next time.
+        """
+        window, count = self._settings.window_scans, len(self._observations)
+        return self._decide(count - window) if count >= WINDOWS_HELD * window else MovingObjects({}, ())
 
     def decide(self) -> MovingObjects:
         """Decide about all scans that are not settled yet."""
@@ -116,7 +120,7 @@ class MovingObjectDetector:
 
         def moved(scan: int) -> NDArray[np.int64]:
             seen, of_gone = settled[scan], segments[scan].points_of(gone_of[scan])
-            return seen.places[_grown(seen, of_gone, settings.grow_m)]
+            return seen.places[_grown(seen, of_gone, settings.grow_m)].astype(np.int64)
 
         points = {settled[scan].number: places for scan, places in ahead(moved, range(count), THREADS)}
         self._past += [(seen.image, seen.T_lidar_map) for seen in settled]
@@ -187,8 +191,8 @@ def observe(
         stamp=stamp,
         T_lidar_map=T_lidar_map,
         image=image,
-        places=keep,
-        p_map=p_map.take(keep, axis=0),
+        places=keep.astype(np.int32),
+        p_near=(p_map.take(keep, axis=0) - T_map_lidar[:3, 3]).astype(np.float32),
         is_body=is_body.take(keep),
         segments=replace(segments, voxel=voxel.take(keep), cut=segments.cut | hidden),
     )
@@ -221,15 +225,6 @@ def _grown(seen: Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArra
     grown = gone.copy()
     if not gone.any() or reach_m == 0:
         return grown
-    beside = near(seen.p_map, gone, reach_m) & (seen.segments.voxel < 0)
-    rest = np.flatnonzero(beside & seen.is_body)
-    grown[rest[_reached(seen.p_map[rest], seen.p_map[gone], reach_m)]] = True
-    feet = np.flatnonzero(near(seen.p_map, grown, FOOT_REACH_M) & ~seen.is_body)
-    grown[feet[_reached(seen.p_map[feet, :2], seen.p_map[grown, :2], FOOT_REACH_M)]] = True
-    return grown
-
-
-def _reached(points: NDArray[np.float64], others: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
-    """Points (n, d) nearer to one of the others (m, d) than the reach."""
-    tree = cKDTree(others, balanced_tree=False, compact_nodes=False)  # many others, few questions
-    return np.isfinite(tree.query(points, distance_upper_bound=reach_m)[0])
+    beside = seen.is_body & (seen.segments.voxel < 0)
+    grown |= reached(seen.p_near, gone, beside, reach_m)
+    return grown | reached(seen.p_near[:, :2], grown, ~seen.is_body, FOOT_REACH_M)

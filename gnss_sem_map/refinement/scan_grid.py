@@ -1,4 +1,4 @@
-"""One scan from above: how high its points are over the ground, and which are near a place or near others."""
+"""One scan from above: how high its points are over the ground, and which are near a place or other points."""
 
 from __future__ import annotations
 
@@ -30,6 +30,16 @@ def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) 
         return marked
     found = np.empty(len(p_map), np.bool_)
     _near(p_map, marked, reach_m, found)
+    return found
+
+
+def reached(
+    points: NDArray[np.floating], marked: NDArray[np.bool_], asked: NDArray[np.bool_], reach_m: float
+) -> NDArray[np.bool_]:
+    """Which of the points (n, 2 or 3) that are asked for are nearer than `reach_m` to a marked one: (n,)."""
+    found = np.zeros(len(points), np.bool_)
+    if reach_m > 0 and marked.any():
+        _reached(points, marked, asked, reach_m, found)
     return found
 
 
@@ -85,3 +95,27 @@ def _near(p_map, marked, size_m, found):
             reached[row - 1 : row + 2] = True
     for i in range(len(cells)):
         found[i] = reached[cells[i]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reached(points, marked, asked, reach_m, found):
+    cells, length, width = _cells(points, reach_m)
+    latest, before = np.full(length * width, -1, np.int32), np.empty(len(cells), np.int32)
+    for i in np.flatnonzero(marked):  # a list of those in each cell
+        before[i] = latest[cells[i]]
+        latest[cells[i]] = i
+    for i in np.flatnonzero(asked):
+        for row in range(cells[i] - width, cells[i] + width + 1, width):
+            for cell in range(row - 1, row + 2):
+                j = latest[cell]
+                while j >= 0 and not found[i]:
+                    found[i] = _square(points, i, j) < reach_m * reach_m
+                    j = before[j]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _square(points, i, j):
+    square = 0.0
+    for axis in range(points.shape[1]):
+        square += (np.float64(points[i, axis]) - np.float64(points[j, axis])) ** 2
+    return square

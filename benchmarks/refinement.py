@@ -180,7 +180,7 @@ def by_the_paper(drive: Drive) -> Points:
 
 
 def timed_find_moving(drive: Drive) -> tuple[Points, dict[str, float]]:
-    """The moving points, and what finding them costs per scan beside reading and labelling, and by the clock with it."""
+    """The moving points, and what finding them costs per scan: beside reading and labelling, and waiting for all."""
     find_moving(replace(drive, log=replace(drive.log, scans=drive.log.scans[:10])))  # compiles
     found: list[MovingObjects] = []
     reading, waiting_to_read = clocked(lambda: [None for _ in seen_scans(drive)])

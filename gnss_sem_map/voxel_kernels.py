@@ -93,18 +93,16 @@ def pack_keys(p_map, voxel_size_m, keys):
 
 
 @njit(cache=True, nogil=True)
-def fuse(
-    rows, ints, count, capacity, start, keys, pixels, classes, log_table, log_percent, floor_percent, answers, abstain
-):  # fmt: skip
+def fuse(rows, ints, count, capacity, start, keys, pixels, looks, classes):
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
-    `pixels[i]` is the row of `classes` (p, c + 1; uint8 probabilities, `other` last) that point i saw, or -1; for the
-    rest see `_add_look`. Returns the number of voxels and the first point that is not in yet, or -1 - i for a point i
-    whose voxel overflows.
+    `pixels[i]` is the row of `looks` (p, c) that point i saw, or -1; `classes` are their columns, as a tuple: their
+    number is then known when this is compiled. Returns the number of voxels and the first point that is not in yet,
+    or -1 - i for a point i whose voxel overflows.
     """
-    hits = FIRST_SUM + classes.shape[1] - 1
-    starts = _run_starts(keys, start)
-    runs = len(starts) - 1
+    hits = FIRST_SUM + len(classes)
+    starts, looking = _run_starts(keys, start), np.flatnonzero(pixels >= 0)
+    runs, look = len(starts) - 1, np.searchsorted(looking, start)
     for run in range(runs):
         if run + PREFETCH_AHEAD < runs:
             _prefetch(rows, _home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
@@ -118,11 +116,14 @@ def fuse(
         if ints[slot, hits] > HITS_LIMIT - (end - first):
             return count, -1 - first
         ints[slot, hits] += end - first
-        for i in range(first, end):
-            if pixels[i] >= 0 and not _add_look(
-                ints[slot], classes[pixels[i]], log_table, log_percent, floor_percent, answers, abstain
-            ):
-                return count, -1 - i
+        while look < len(looking) and looking[look] < end:
+            pixel, lowest = pixels[looking[look]], int64(0)
+            for c in range(len(classes)):
+                ints[slot, FIRST_SUM + c] += looks[pixel, c]
+                lowest = min(lowest, int64(ints[slot, FIRST_SUM + c]))
+            if lowest < -EVIDENCE_LIMIT:
+                return count, -1 - looking[look]
+            look += 1
     return count, len(keys)
 
 
@@ -144,40 +145,39 @@ def _run_starts(keys, start):
 
 
 @njit(cache=True, nogil=True)
-def _add_look(ints, seen, log_table, log_percent, floor_percent, answers, abstain):
-    """Add to a voxel's sums what one point saw there; returns whether they are still inside their bounds.
+def log_likelihoods(
+    probabilities, log_table, log_percent, floor_percent, answers, abstain, classes, looks
+):  # fmt: skip
+    """Find what each pixel adds to the sums of a voxel that is seen in it: `looks` (p, c) in 2^-10 nat.
 
-    `seen` (c + 1,): the classes of the map are renormalised without `other`, floored, and renormalised again, all in
-    integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table. `answers` (c + 1, c), or (0, c) for none, is added
-    for what is most probable in the pixel, `other` included; with `abstain` a pixel that is most probably `other` says
-    nothing.
+    `probabilities` (p, c + 1) uint8: those of the map's `classes`, a tuple of columns, are renormalised without
+    `other`, floored, and renormalised again, all in integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table.
+    `answers` (c + 1, c), or (0, c) for none, is added for what is most probable in the pixel, `other` included; with
+    `abstain` a pixel that is most probably `other` says nothing.
     """
-    number_of_classes = len(seen) - 1
-    total = int64(0)
-    for c in range(number_of_classes):
-        total += seen[c]
-    lowest = int64(0)
-    if len(answers) > 0 or abstain:
-        answer = 0
-        for c in range(1, number_of_classes + 1):
-            if seen[c] > seen[answer]:
-                answer = c
-        if seen[answer] == 0 or (abstain and answer == number_of_classes):
-            return True
+    other = len(classes)
+    for i in range(len(looks)):
+        total, answer = int64(0), 0
+        for c in range(len(classes)):
+            looks[i, c] = 0
+            total += probabilities[i, c]
+        if len(answers) > 0 or abstain:
+            for c in range(1, other + 1):
+                if probabilities[i, c] > probabilities[i, answer]:
+                    answer = c
+            if probabilities[i, answer] == 0 or (abstain and answer == other):
+                continue
         if len(answers) > 0:
-            for c in range(number_of_classes):
-                ints[FIRST_SUM + c] += answers[answer, c]
-                lowest = min(lowest, int64(ints[FIRST_SUM + c]))
-    if total > 0:
-        floor = floor_percent * total
-        denominator = int64(0)
-        for c in range(number_of_classes):
-            denominator += max(100 * int64(seen[c]), floor)
+            for c in range(len(classes)):
+                looks[i, c] = answers[answer, c]
+        if total == 0:
+            continue
+        floor, denominator = floor_percent * total, int64(0)
+        for c in range(len(classes)):
+            denominator += max(100 * int64(probabilities[i, c]), floor)
         log_floor, log_sum = log_table[floor], log_table[denominator]
-        for c in range(number_of_classes):
-            ints[FIRST_SUM + c] += max(log_percent[seen[c]], log_floor) - log_sum
-            lowest = min(lowest, int64(ints[FIRST_SUM + c]))
-    return lowest >= -EVIDENCE_LIMIT
+        for c in range(len(classes)):
+            looks[i, c] += max(log_percent[probabilities[i, c]], log_floor) - log_sum
 
 
 @njit(cache=True, nogil=True)

@@ -231,6 +231,7 @@ class VoxelTable:
         self.voxel_size_m, self.label_set = voxel_size_m, label_set
         self._floor_percent = round(100 * probability_floor)
         self._words = VoxelMap.words(label_set)
+        self._columns = tuple(range(len(label_set.names)))
         self._count = 0
         self._rows = _empty_table(SMALLEST_TABLE, self._words)
         share = 1.0 if answers is None else 1.0 - ANSWER_SHARE
@@ -260,13 +261,17 @@ class VoxelTable:
         """
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
-            classes = np.zeros((1, len(self.label_set.names) + 1), np.uint8)
+            classes = np.zeros((0, len(self._columns) + 1), np.uint8)
+        looks = np.empty((len(classes), len(self._columns)), np.int32)
+        voxel_kernels.log_likelihoods(
+            classes, self._log_table, self._log_percent, self._floor_percent, self._answers, self._abstain,
+            self._columns, looks,
+        )  # fmt: skip
         done = 0
         while done < len(keys):
             self._count, done = voxel_kernels.fuse(
                 self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
-                keys, pixels, classes, self._log_table, self._log_percent, self._floor_percent,
-                self._answers, self._abstain,
+                keys, pixels, looks, self._columns,
             )  # fmt: skip
             if done < 0:
                 place = unpack(keys[[-1 - done]])[0]

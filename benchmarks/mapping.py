@@ -100,10 +100,11 @@ def whole_chain(job: Drive) -> Figures:
     """Read, deskew, project, occlusion, fuse: compiled against numpy, with decoded labels and with decoding them."""
     race, log = Race(), job.log
     table, plain = VoxelTable(SIZE, URBAN), numpy_chain.NumpyMap(SIZE, URBAN)
+    views = seen_scans.Views(job, Account())
     points = 0
 
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
-        seen = seen_scans._see(job, scan, scan.read(), (image, classes), Account())
+        seen = seen_scans._see(job, scan, scan.read(), (image, classes), views, Account())
         assert seen is not None
         table.add(seen.keys, seen.pixels, seen.classes)
 
@@ -176,7 +177,7 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
 
 
 def _keys(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.int64]:
-    placed = seen_scans._see(job, seen.scan, points, None, Account())
+    placed = seen_scans._see(job, seen.scan, points, None, seen_scans.Views(job, Account()), Account())
     assert placed is not None
     return placed.keys
 

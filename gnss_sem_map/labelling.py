@@ -98,8 +98,11 @@ class View:
     """(h, w) m; empty where there is no image."""
 
 
-def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int) -> View:
-    """Room for the `n` points of a scan in an image of (width, height)."""
+def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int, over: View | None = None) -> View:
+    """Room for the `n` points of a scan in an image of (width, height): that of the view `over`, if it is enough."""
+    if over is not None and over.nearest.shape == size[::-1] and len(over.inside[0]) >= n:
+        over.nearest.fill(np.inf)
+        return View(P, over.inside, over.nearest)
     points, columns, lines = (np.empty(n, np.int32) for _ in range(3))
     nearest = np.full(size[::-1], np.inf, np.float32)
     return View(P, (points, columns, lines, np.empty(n, np.float32)), nearest)
@@ -156,13 +159,18 @@ def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSe
     return image.stamp + (calibration.camera_time_offset_s if offset is None else offset)
 
 
-def view_at(stamp: float, trajectory: Trajectory, calibration: Calibration, n: int) -> View:
-    """The camera at the moment `stamp`, with room for `n` points; raises DataError when the drive has none."""
+def view_at(
+    stamp: float, trajectory: Trajectory, calibration: Calibration, n: int, over: View | None = None
+) -> View:
+    """The camera at the moment `stamp`, with room for `n` points; raises DataError when the drive has none.
+
+    Writes over an earlier view, if one is given: fresh memory costs more than what is done with it.
+    """
     if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
         raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
     T_map_imu = trajectory.at(np.array([stamp]), EXTRAPOLATE_S)[0]
     T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
-    return view_of(np.ascontiguousarray(calibration.K @ T_camera_map[:3]), calibration.image_size, n)
+    return view_of(np.ascontiguousarray(calibration.K @ T_camera_map[:3]), calibration.image_size, n, over)
 
 
 def visible(

@@ -102,9 +102,9 @@ def look_at(
     drive: Drive, scans: Sequence[Scan], account: Account, keep_points: bool = False
 ) -> Iterator[SeenScan | None]:
     """Every scan, or None for one that cannot be used; why is in the account."""
-    look = _Look(drive.log, drive.segmenter, drive.settings, account)
+    look, views = _Look(drive.log, drive.segmenter, drive.settings, account), Views(drive, account)
     for scan, (points, classes) in ahead(look, scans, under_way=READ_AHEAD):
-        yield None if points is None else _see(drive, scan, points, classes, account, keep_points)
+        yield None if points is None else _see(drive, scan, points, classes, views, account, keep_points)
 
 
 def _see(
@@ -112,6 +112,7 @@ def _see(
     scan: Scan,
     points: Points,
     image: tuple[Image, ClassImage] | None,
+    views: Views,
     account: Account,
     keep_points: bool = False,
 ) -> SeenScan | None:
@@ -126,7 +127,7 @@ def _see(
     except MeasurementError as error:
         account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         return None
-    view = _view_of(drive, image, n, account)
+    view = views.of(image, n)
     count, inside = scan_kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
@@ -152,16 +153,24 @@ def _see(
     return seen_scan
 
 
-def _view_of(drive: Drive, image: tuple[Image, ClassImage] | None, n: int, account: Account) -> View:
-    """From where an image looked at n points; NO_VIEW without one, or where the trajectory does not reach."""
-    if image is None:
-        return NO_VIEW
-    exposed = exposure_stamp(image[0], drive.log.calibration, drive.settings.labelling)
-    try:
-        return view_at(exposed, drive.trajectory, drive.log.calibration, n)
-    except MeasurementError as error:
-        account.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
-        return NO_VIEW
+class Views:
+    """From where the images of a drive looked at its scans, one after another: each view is written over the last."""
+
+    def __init__(self, drive: Drive, account: Account) -> None:
+        self._drive, self._account, self._last = drive, account, NO_VIEW
+
+    def of(self, image: tuple[Image, ClassImage] | None, n: int) -> View:
+        """From where an image looked at n points; NO_VIEW without one, or where the trajectory does not reach."""
+        if image is None:
+            return NO_VIEW
+        log, trajectory = self._drive.log, self._drive.trajectory
+        exposed = exposure_stamp(image[0], log.calibration, self._drive.settings.labelling)
+        try:
+            self._last = view_at(exposed, trajectory, log.calibration, n, over=self._last)
+        except MeasurementError as error:
+            self._account.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
+            return NO_VIEW
+        return self._last
 
 
 def map_points(

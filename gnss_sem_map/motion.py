@@ -28,7 +28,7 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
 
     What no image shows is followed too, but is only said to have moved when it was seen to go elsewhere.
     """
-    detector = MovingObjectDetector(drive.settings.refinement.motion)
+    detector = MovingObjectDetector(drive.settings.refinement.motion, drive.matched)
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []
     total = len(drive.log.scans)

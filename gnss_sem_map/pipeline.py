@@ -39,6 +39,9 @@ from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sharpness import Sharpness, of_drive
 from gnss_sem_map.voxel_map import SemanticMap
 
+MATCHED_SHARE = 0.95
+"""With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -85,9 +88,8 @@ def run(
         figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
     with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        drive, tracked = _without_moving(
-            Drive(log, trajectory, segmenter, settings), Path(folder), account, progress
-        )
+        whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
+        drive, tracked = _without_moving(whole, Path(folder), account, progress)
         with account.stage("mapping"):
             maps = build_maps(
                 drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -125,6 +127,10 @@ def _without_moving(
         moving = find_moving(drive, progress)
     account.counts["points of moving objects"] += sum(map(len, moving.points.values()))
     return replace(drive, moving=moving.points), moving.objects
+
+
+def _is_matched(log: SensorLog, account: Account) -> bool:
+    return account.counts["scans matched"] >= MATCHED_SHARE * max(len(log.scans), 1)
 
 
 def estimate_trajectory(

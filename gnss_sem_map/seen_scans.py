@@ -48,6 +48,8 @@ class Drive:
     settings: Settings
     moving: Mapping[int, NDArray[np.int64]] | None = None
     """Frame number -> places, among the points that `map_points` gives, that belong to something that moved."""
+    matched: bool = False
+    """Whether the trajectory was bound by matching these scans: what stands, then stands still in the map."""
 
     @cached_property
     def label_set(self) -> labels.LabelSet:

@@ -66,8 +66,9 @@ class Observation:
 class MovingObjectDetector:
     """Collects scans in time order; memory: some windows of scans, a range image and some points of each."""
 
-    def __init__(self, settings: MotionSettings | None = None) -> None:
-        self._settings = settings or MotionSettings()
+    def __init__(self, settings: MotionSettings | None = None, matched: bool = False) -> None:
+        """`matched`: the poses of the scans come from matching them, so that what stands, stands still."""
+        self._settings, self._matched = settings or MotionSettings(), matched
         self._observations: list[Observation] = []
         self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
         """Range images and poses of settled scans, which still testify."""
@@ -111,7 +112,7 @@ class MovingObjectDetector:
             [of_scan.sums_of(looked) for of_scan, looked in zip(segments, looks, strict=True)], axis=1
         )
         listed = _all_segments(self._observations, segments)
-        objects = judge(listed, hits, throughs, settings)
+        objects = judge(listed, hits, throughs, settings, self._matched)
         gone = np.zeros(len(listed), np.bool_)
         for one in objects:
             gone[list(one.segments)] = one.motion in GONE

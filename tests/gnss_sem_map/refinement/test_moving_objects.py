@@ -40,13 +40,13 @@ def car_at(x, y):
     return np.array([x - CAR[0] / 2, y - CAR[1] / 2, 0.2]), np.array([x + CAR[0] / 2, y + CAR[1] / 2, CAR[2]])
 
 
-def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=None):
+def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=None, matched=False):
     """Drive along x past facades and cars (functions of time -> x, y or None); the points of each car that went.
 
     Returns, for each car, the share of its points in all scans that was removed, that share of everything else, and
     the objects. A camera sees `view_deg` ahead and calls exactly the cars vehicles.
     """
-    detector = MovingObjectDetector(settings)
+    detector = MovingObjectDetector(settings, matched)
     facades = [(np.array([-40.0, y - 0.2, 0.0]), np.array([110.0, y + 0.2, 9.0])) for y in (-11.0, 12.0)]
     kept = []
     for scan in range(scans):
@@ -133,6 +133,19 @@ def test_an_overtaking_car_is_followed_back_to_where_the_camera_had_not_seen_it(
     assert share[-1] > 0.95
     np.testing.assert_array_equal(share[:-1], 0)
     assert others < 2e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lengths", "goes"), [(0.3, False), pytest.param(0.6, True, marks=pytest.mark.slow)]
+)
+def test_a_car_that_creeps_half_its_length_goes_where_poses_can_be_trusted_alone(lengths, goes):
+    scans = 60
+    creeping = going(14, -3.5, lengths * CAR[0] / (scans * SCAN_S))  # too slow to be seen to go elsewhere
+    for matched in (True, False):
+        share, _, _ = drive([*ROW, creeping], scans=scans, ego_speed=0.0, matched=matched)
+        assert share[-1] > 0.9 if goes and matched else share[-1] < 0.01
+        np.testing.assert_array_equal(share[:-1], 0)
 
 
 @pytest.mark.slow

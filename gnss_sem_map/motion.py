@@ -45,13 +45,22 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     return MovingObjects(points | dict(rest.points), (*objects, *rest.objects))
 
 
+def told(
+    shown: NDArray[np.int8], class_names: tuple[str, ...]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which points the image calls something that may move (n,), and of which it says anything (n,).
+
+    `shown` (n,) as `SeenScan.labels`. What is `other` to the map may be a pole or a pedestrian: nothing is said of it.
+    """
+    is_movable = np.isin([*class_names, labels.OTHER, ""], MOVABLE)  # the last one: in no image
+    return is_movable.take(shown), (shown >= 0) & (shown < len(class_names))
+
+
 def _observed(seen: SeenScan) -> Observation:
     drive, scan = seen.drive, seen.scan
     T_map_imu = drive.trajectory.at(np.array([scan.stamp]), EXTRAPOLATE_S)[0]
     T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
-    is_movable = np.isin([*drive.label_set.names, labels.OTHER, ""], MOVABLE)  # the last one: of no class
-    shown = seen.labels
     return observe(
-        scan.number, scan.stamp, seen.p_map, T_map_lidar, is_movable.take(shown), shown >= 0,
+        scan.number, scan.stamp, seen.p_map, T_map_lidar, *told(seen.labels, drive.label_set.names),
         drive.settings.refinement.motion,
     )  # fmt: skip

@@ -136,9 +136,7 @@ def test_an_overtaking_car_is_followed_back_to_where_the_camera_had_not_seen_it(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lengths", "goes"), [(0.3, False), pytest.param(0.6, True, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("lengths", "goes"), [(0.3, False), pytest.param(0.6, True, marks=pytest.mark.slow)])
 def test_a_car_that_creeps_half_its_length_goes_where_poses_can_be_trusted_alone(lengths, goes):
     scans = 60
     creeping = going(14, -3.5, lengths * CAR[0] / (scans * SCAN_S))  # too slow to be seen to go elsewhere

@@ -12,6 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from gnss_sem_map.account import Progress
+    from gnss_sem_map.camera_check import CameraCheck
 
 
 @contextmanager
@@ -88,6 +89,26 @@ def print_metrics(metrics: dict[str, Any]) -> None:
         )
     for line in lines:
         console.print(line, highlight=False)
+
+
+def print_camera_check(name: str, found: CameraCheck) -> None:
+    """How well time and mounting of the camera fit the images; what does not on stderr."""
+    typer.echo(
+        f"{name}: {found.edges} depth edges in {found.images} images; image edges are there"
+        f" {found.agreement:.2f} times as strong as elsewhere, at best {found.best_agreement:.2f}"
+    )
+    typer.echo(
+        f"exposure minus image stamp: {1e3 * found.time_offset_s:.1f} +- {1e3 * found.time_offset_stddev_s:.1f} ms"
+        f" (the file says {1e3 * found.given_time_offset_s:.1f})"
+    )
+    turns = zip("xyz", found.rotation_deg, found.rotation_stddev_deg, strict=True)
+    typer.echo(
+        "camera turned about "
+        + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
+    )
+    warn(found.warnings)
+    if not found.warnings:
+        typer.echo("time and mounting fit the images")
 
 
 def _percent(share: float | None) -> str:

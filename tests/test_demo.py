@@ -59,6 +59,31 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
     for name in ("perspective.png", "topview.png", "report.html", "viewer.html"):
         assert str(out / name) in printed
         assert (out / name).stat().st_size > 10_000
+    (costs,) = (line for line in printed.splitlines() if "mapping " in line)  # every stage once
+    for stage in ("simulate", "segment", "trajectory", "mapping", "refinement", "export"):
+        assert costs.count(f"{stage} ") == 1
+
+
+WITHOUT_TORCH = """
+import sys
+
+class Absent:
+    def find_spec(self, name, *_):
+        if name == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+sys.meta_path.insert(0, Absent())
+from gnss_sem_map.cli import main
+main()
+"""
+
+
+def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", WITHOUT_TORCH, "demo", "-o", str(tmp_path / "demo")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "torch is not installed; pip install 'gnss-sem-map[segmentation]'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_corrupted_truth_can_stand_in_for_the_network(

@@ -246,12 +246,10 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
-    from gnss_sem_map import config, labels
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
 
-    settings = config.load(run_folder / "config.yaml")
-    metrics = score_run(run_folder, truth, labels.label_set(settings.classes), restrict_to)
+    metrics = score_run(run_folder, truth, restrict_to=restrict_to)
     write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
     if as_json:
         typer.echo(json.dumps(metrics))

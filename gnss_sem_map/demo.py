@@ -79,7 +79,7 @@ def demonstrate(
     segmenter = open_segmenter(spec, label_set, expected_size=log.calibration.image_size)
     result = pipeline.run(log, segmenter, settings, progress)
     about = write_run(out, drive, log, result, settings, write_labels=True, segmenter=spec)
-    metrics = score_run(out, drive / "truth", label_set)
+    metrics = score_run(out, drive / "truth")
     write_report(out, about, metrics)
     return Demo(
         about | {"seconds": account.seconds | about["seconds"]},

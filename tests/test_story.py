@@ -207,6 +207,42 @@ def test_a_mistake_is_answered_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def refused(*arguments: str | Path) -> str:
+    """What a command says when it ends with an error of ours: one line."""
+    done = gnss_sem_map(*arguments)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+def test_a_run_is_not_merged_with_itself(raw_run: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(raw_run)
+    for second in (raw_run, link):
+        assert "is the first run as well" in refused("merge", raw_run, second, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_evaluated_says_what_is_missing_and_what_to_do(
+    raw_run: Path, small_drive: Street, tmp_path: Path
+) -> None:
+    again, merged, track = (tmp_path / name for name in ("again", "merged", "track"))
+    shutil.copytree(raw_run, again)
+    assert gnss_sem_map("merge", raw_run, again, "-o", merged).returncode == 0
+    assert gnss_sem_map("trajectory", small_drive.drive, "-o", track).returncode == 0
+    shutil.rmtree(again / "labels")
+    for folder, missing, what_to_do in (
+        (merged, "a merged map has no labels", f"evaluate the runs that it was made of, {raw_run.name} and again"),
+        (track, "a trajectory without a map", "gnss-sem-map run ... --write-labels"),
+        (again, "no point labels in this run", "make it again with --write-labels"),
+        (tmp_path / "nowhere", "no run folder here", "expected the -o of an earlier `gnss-sem-map run`"),
+    ):  # fmt: skip
+        said = refused("evaluate", folder, "--truth", raw_run)
+        assert str(folder) in said
+        assert missing in said
+        assert what_to_do in said
+
+
 def test_a_drive_with_images_and_no_segmenter_is_told_its_choices(
     small_drive: Street, tmp_path: Path
 ) -> None:

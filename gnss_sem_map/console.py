@@ -87,6 +87,12 @@ def print_metrics(metrics: dict[str, Any]) -> None:
             f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
             f" heading {t['heading_rms_deg']:.3f} deg, {100 * t['rpe_translation_share']:.2f} % relative"
         )
+        if "position_nees_per_dof" in t:
+            lines.append(
+                f"  squared error by its claimed variance (NEES per degree of freedom): position"
+                f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
+                " honest is 1 on average over many drives"
+            )
     for line in lines:
         console.print(line, highlight=False)
 

@@ -42,6 +42,8 @@ def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
     assert metrics["semantics"]["refined"]["mean_iou"] > metrics["semantics"]["raw"]["mean_iou"]
     assert set(metrics["dynamic"]) >= {"SA", "DA", "AA"}
     assert metrics["trajectory"]["ate_m"] < 2.0
+    for part in ("position", "orientation"):  # one short drive is one sample of three degrees of freedom
+        assert 0 < metrics["trajectory"][f"{part}_nees_per_dof"] < 10
     assert 0 <= metrics["calibration"]["ece"] < 0.2
 
 
@@ -51,6 +53,7 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
         "sidewalk",
         "moving vehicles removed",
         "trajectory",
+        "NEES per degree of freedom",
         "refinement",
         "mapping",
         "small network",

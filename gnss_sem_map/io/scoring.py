@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.accuracy import errors, relative_error
+from factor_graphs.accuracy import errors, pose_nees, relative_error
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
@@ -114,11 +114,14 @@ def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
-    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second."""
+    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second.
+
+    Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom.
+    """
     error = errors(estimate, truth)
     stamps = error.stamps
     relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
-    return {
+    scores = {
         "ate_m": error.ate_m,
         "horizontal_rms_m": error.horizontal_rms_m,
         "vertical_rms_m": error.vertical_rms_m,
@@ -127,6 +130,13 @@ def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float
         "rpe_translation_m": relative.translation_m,
         "rpe_translation_share": relative.translation_share,
         "rpe_rotation_deg": relative.rotation_deg,
+    }
+    if estimate.covariances is None:
+        return scores
+    position, orientation = pose_nees(estimate, truth)
+    return scores | {
+        "position_nees_per_dof": float(position.mean()) / 3,
+        "orientation_nees_per_dof": float(orientation.mean()) / 3,
     }
 
 

@@ -60,7 +60,10 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     from rich.table import Table
 
     raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
-    table = Table(title="Semantics, % of labelled points")
+    table = Table(
+        title="Semantics, % of labelled points",
+        caption="accuracy: of the points that carry the class, how many are of it (eq. 14; elsewhere: precision)",
+    )
     table.add_column("class")
     for column in ("accuracy raw", "refined", "IoU raw", "refined"):
         table.add_column(column, justify="right")

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
-from gnss_sem_map.console import print_camera_check, print_metrics, print_run, progress_bars, warn
+from gnss_sem_map.console import (
+    print_cache,
+    print_camera_check,
+    print_metrics,
+    print_run,
+    progress_bars,
+    warn,
+)
 
 if TYPE_CHECKING:
     from gnss_sem_map.config import Settings
@@ -176,11 +183,7 @@ def segment(
     with progress_bars() as progress:
         report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
     warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
-    typer.echo(
-        f"{report.written} images segmented, {report.kept} kept, {len(report.skips)} skipped;"
-        f" {report.bytes_per_frame / 1000:.0f} kB per image, {report.images_per_second:.1f} images/s;"
-        f" now use --segmenter labels:{out}"
-    )
+    print_cache(report, out)
 
 
 @app.command()
@@ -401,15 +404,27 @@ def _frame_range(frames: str) -> tuple[int, float]:
 
 
 def main() -> None:
-    """Entry point: one line on stderr and exit code 1 for every error that is ours."""
+    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours."""
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
     try:
-        app()
+        sys.exit(app(prog_name="gnss-sem-map", standalone_mode=False))
+    except typer.TyperException as error:
+        sys.exit(_wrong_usage(error))
     except (SemMapError, FactorGraphError) as error:
         typer.echo(f"gnss-sem-map: {' '.join(str(error).split())}", err=True)
         sys.exit(1)
+
+
+def _wrong_usage(error: typer.TyperException) -> int:
+    """Say in one line what was typed wrongly and where to read how; returns the exit code."""
+    message = " ".join(error.format_message().split())
+    context: typer.Context | None = getattr(error, "ctx", None)
+    command = "gnss-sem-map" if context is None else context.command_path
+    if message:  # no command at all: its help has been shown
+        typer.echo(f"gnss-sem-map: {message.rstrip('.')}; see {command} --help", err=True)
+    return error.exit_code
 
 
 if __name__ == "__main__":

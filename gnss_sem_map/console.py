@@ -13,6 +13,7 @@ import typer
 if TYPE_CHECKING:
     from gnss_sem_map.account import Progress
     from gnss_sem_map.camera_check import CameraCheck
+    from gnss_sem_map.segmentation.cache import CacheReport
 
 
 @contextmanager
@@ -98,6 +99,21 @@ def print_metrics(metrics: dict[str, Any]) -> None:
             )
     for line in lines:
         console.print(line, highlight=False)
+
+
+def print_cache(report: CacheReport, out: Path) -> None:
+    """How many images were segmented, what that cost, and how to use them."""
+    if not report.written and not report.skips:
+        there = f"all {report.kept} images are segmented" if report.kept else "the drive has no images"
+        typer.echo(f"nothing was to do: {there}")
+    else:
+        cost = f" ({report.bytes_per_frame / 1000:.0f} kB each, {report.images_per_second:.1f} images/s)"
+        typer.echo(
+            f"{report.written} images segmented{cost if report.written else ''}, {report.kept} kept,"
+            f" {len(report.skips)} skipped"
+        )
+    if report.written or report.kept:
+        typer.echo(f"now use --segmenter labels:{out}")
 
 
 def print_camera_check(name: str, found: CameraCheck) -> None:

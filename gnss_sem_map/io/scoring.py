@@ -126,6 +126,7 @@ def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float
         "horizontal_rms_m": error.horizontal_rms_m,
         "vertical_rms_m": error.vertical_rms_m,
         "heading_rms_deg": error.heading_rms_deg,
+        "tilt_rms_deg": error.tilt_rms_deg,
         "ate_aligned_m": _aligned_rms(estimate.at(stamps)[:, :3, 3], truth.at(stamps)[:, :3, 3]),
         "rpe_translation_m": relative.translation_m,
         "rpe_translation_share": relative.translation_share,

@@ -1,31 +1,37 @@
-# Every target does its own set-up in .venv. PYTHON may be any Python from 3.11 on.
+# Every target does its own set-up in .venv: the demo needs the package alone, all others the tools as well.
+# PYTHON may be any Python from 3.11 on.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+PACKAGE := $(VENV)/.package
+TOOLS := $(VENV)/.tools
 
 .PHONY: test test-slow check demo notebooks clean
 
-$(READY): pyproject.toml constraints.txt
+$(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[segmentation]'
+	touch $@
 
-test: $(READY)
+$(TOOLS): $(PACKAGE)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+test: $(TOOLS)
 	$(BIN)/pytest -m 'not slow'
 
-notebooks: $(READY)
+notebooks: $(TOOLS)
 	$(BIN)/pytest --nbmake --nbmake-timeout=600 examples
 
-demo: $(READY)
+demo: $(PACKAGE)
 	$(BIN)/gnss-sem-map demo
 
-test-slow: $(READY)
+test-slow: $(TOOLS)
 	$(BIN)/pytest -m slow
 
-check: $(READY)
+check: $(TOOLS)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -24,11 +23,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("POLARS_MAX_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 import numpy_chain
+from mapping_peers import duckdb_groups, kiss_icp_map, open3d_hash, pandas_groups, polars_groups
 from numba import njit
 from numpy.typing import NDArray
 
@@ -156,7 +155,7 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
         "ours, classes": lambda s, p: table.add(_keys(job, s, p), s.pixels, s.classes),
         "ours, no classes": lambda s, p: bare.add(_keys(job, s, p)),
     }
-    for name, build in (("open3d HashSet + numpy", _open3d), ("kiss-icp VoxelHashMap", _kiss_icp)):
+    for name, build in (("open3d HashSet + numpy", open3d_hash), ("kiss-icp VoxelHashMap", kiss_icp_map)):
         try:
             contestants[name] = build(job)
         except ImportError as error:
@@ -182,46 +181,6 @@ def _keys(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.int64]:
     return placed.keys
 
 
-def _pose(job: Drive, seen: SeenScan) -> NDArray[np.float64]:
-    T = np.asarray(job.trajectory.at([seen.scan.stamp], 0.15)[0] @ job.log.calibration.T_imu_lidar)
-    left, _, right = np.linalg.svd(
-        T[:3, :3]
-    )  # kiss-icp refuses a rotation that is off by 1e-9, as KITTI's are
-    T[:3, :3] = left @ right
-    return T
-
-
-def _open3d(job: Drive) -> Callable[[SeenScan, Points], None]:
-    """Open3D's hash of integer voxels, sums and hits in numpy."""
-    import open3d as o3d
-
-    core, capacity = o3d.core, 3_000_000
-    voxels = core.HashSet(capacity, core.int32, (3,), core.Device("CPU:0"))
-    evidence, hits = np.zeros((capacity, 5), np.int32), np.zeros(capacity, np.uint32)
-    logs = numpy_chain.log_table(5, 5)
-
-    def add(seen: SeenScan, points: Points) -> None:
-        T = _pose(job, seen)
-        p_map = points.xyz[seen.valid].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-        indices = core.Tensor.from_numpy(np.floor(p_map / SIZE).astype(np.int32))
-        voxels.insert(indices)
-        slots = voxels.find(indices)[0].numpy()
-        np.add.at(hits, slots, 1)
-        looked = seen.pixels >= 0
-        looks = numpy_chain.log_likelihoods(seen.classes[seen.pixels[looked]], logs, 5)
-        for c in range(5):
-            np.add.at(evidence[:, c], slots[looked], looks[:, c])
-
-    return add
-
-
-def _kiss_icp(job: Drive) -> Callable[[SeenScan, Points], None]:
-    from kiss_icp.mapping import VoxelHashMap
-
-    voxels = VoxelHashMap(SIZE, 120.0, 20)
-    return lambda seen, points: voxels.update(points.xyz[seen.valid].astype(np.float64), _pose(job, seen))
-
-
 def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
     """Ten scans at once, all in memory, keys and log-likelihoods ready: who groups fastest."""
     race, missing, seen = Race(), [], seen[:10]
@@ -244,7 +203,7 @@ def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
         return len(table)
 
     contestants: dict[str, Callable[[], int]] = {"ours": ours}
-    for name, build in (("pandas", _pandas), ("duckdb", _duckdb), ("polars", _polars)):
+    for name, build in (("pandas", pandas_groups), ("duckdb", duckdb_groups), ("polars", polars_groups)):
         try:
             contestants[name] = build(columns)
         except ImportError as error:
@@ -257,31 +216,6 @@ def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
         "ns_per_point": {name: 1e9 * value / len(keys) for name, value in s.items()},
         "ratio": {name: value / s["ours"] for name, value in s.items() if name != "ours"},
     }, missing  # fmt: skip
-
-
-def _pandas(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
-    import pandas
-
-    frame = pandas.DataFrame(columns)
-    return lambda: len(frame.groupby("key", sort=False).sum())
-
-
-def _duckdb(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
-    import duckdb
-    import pyarrow
-
-    base = duckdb.connect(config={"threads": 1})
-    base.register("points", pyarrow.table(columns))
-    base.execute("create table t as select * from points")
-    sums = ", ".join(f"sum({name})" for name in columns if name != "key")
-    return lambda: len(base.execute(f"select key, {sums} from t group by key").fetchnumpy()["key"])
-
-
-def _polars(columns: dict[str, NDArray[Any]]) -> Callable[[], int]:
-    import polars
-
-    frame = polars.DataFrame(columns)
-    return lambda: len(frame.group_by("key").agg(polars.all().sum()))
 
 
 @njit(cache=True, nogil=True)

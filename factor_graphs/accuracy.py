@@ -105,6 +105,26 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
     return np.asarray(np.sum(e * solved, axis=-1), dtype=np.float64)
 
 
+def pose_nees(estimate: Trajectory, reference: Trajectory) -> tuple[Array, Array]:
+    """NEES of position and of orientation, 3 degrees of freedom each, at the stamps that `errors` compares: (k,), (k,).
+
+    The covariance is that of the nearest stamp of the estimate. Raises MeasurementError without covariances, or when
+    the two do not overlap.
+    """
+    if estimate.covariances is None:
+        raise MeasurementError("the estimate has no covariances: nothing says how large its errors may be")
+    off = errors(estimate, reference)
+    after = np.searchsorted(estimate.stamps, off.stamps).clip(max=len(estimate) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = off.stamps - estimate.stamps[before] < estimate.stamps[after] - off.stamps
+    covariances = estimate.covariances[np.where(nearer, before, after)]
+    R_imu_map = np.swapaxes(
+        estimate.at(off.stamps)[:, :3, :3], 1, 2
+    )  # covariances are in the axes of the imu
+    rotation, position = ((R_imu_map @ e[..., None])[..., 0] for e in (off.rotation, off.position))
+    return nees(position, covariances[:, 3:, 3:]), nees(rotation, covariances[:, :3, :3])
+
+
 def anees_band(dof: int, runs: int, confidence: float = 0.99) -> tuple[float, float]:
     """Where the mean NEES of independent runs must lie if the covariances are right (Bar-Shalom 2001, 5.4)."""
     tail = (1 - confidence) / 2

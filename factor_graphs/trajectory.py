@@ -178,6 +178,8 @@ class Trajectory:
             table = pq.read_table(path)
         except pa.ArrowInvalid as error:
             raise MeasurementError(f"{path}: not a Parquet file ({error})") from error
+        except FileNotFoundError:
+            raise MeasurementError(f"{path}: no such file; expected a saved trajectory") from None
         pose = ("stamp_s", "x", "y", "z", "qx", "qy", "qz", "qw")
         missing = [name for name in pose if name not in table.column_names]
         if missing:

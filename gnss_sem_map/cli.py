@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
 import typer
 
-from gnss_sem_map.console import print_metrics, print_run, progress_bars, warn
+from gnss_sem_map.console import (
+    print_cache,
+    print_camera_check,
+    print_metrics,
+    print_run,
+    progress_bars,
+    warn,
+)
 
 if TYPE_CHECKING:
     from gnss_sem_map.config import Settings
@@ -176,11 +183,7 @@ def segment(
     with progress_bars() as progress:
         report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
     warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
-    typer.echo(
-        f"{report.written} images segmented, {report.kept} kept, {len(report.skips)} skipped;"
-        f" {report.bytes_per_frame / 1000:.0f} kB per image, {report.images_per_second:.1f} images/s;"
-        f" now use --segmenter labels:{out}"
-    )
+    print_cache(report, out)
 
 
 @app.command()
@@ -246,12 +249,10 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
-    from gnss_sem_map import config, labels
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
 
-    settings = config.load(run_folder / "config.yaml")
-    metrics = score_run(run_folder, truth, labels.label_set(settings.classes), restrict_to)
+    metrics = score_run(run_folder, truth, restrict_to=restrict_to)
     write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
     if as_json:
         typer.echo(json.dumps(metrics))
@@ -314,23 +315,8 @@ def check(
         found = check_camera(log, trajectory, settings, images, progress)
     if as_json:
         typer.echo(json.dumps(asdict(found)))
-        return
-    typer.echo(
-        f"{log.name}: {found.edges} depth edges in {found.images} images; image edges are there"
-        f" {found.agreement:.2f} times as strong as elsewhere, at best {found.best_agreement:.2f}"
-    )
-    typer.echo(
-        f"exposure minus image stamp: {1e3 * found.time_offset_s:.1f} +- {1e3 * found.time_offset_stddev_s:.1f} ms"
-        f" (the file says {1e3 * found.given_time_offset_s:.1f})"
-    )
-    turns = zip("xyz", found.rotation_deg, found.rotation_stddev_deg, strict=True)
-    typer.echo(
-        "camera turned about "
-        + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
-    )
-    warn(list(found.warnings))
-    if not found.warnings:
-        typer.echo("time and mounting fit the images")
+    else:
+        print_camera_check(log.name, found)
 
 
 @app.command()
@@ -365,74 +351,16 @@ def demo(
     ] = "network",
 ) -> None:
     """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
-    import shutil
-    import time
-
-    from gnss_sem_map.export.run_folder import check_replaceable
-    from gnss_sem_map.segmentation import DEMO_CALIBRATION
-    from gnss_sem_map.simulation import simulate as write_drive
-
-    check_replaceable(out)
-    world = out.with_name(f"{out.name}_drive")
-    _check_drive_replaceable(world)
-    if labels == "network":
-        _open_demo_network()  # what is missing is said now, not after the simulation
-    shutil.rmtree(world, ignore_errors=True)
-    start = time.perf_counter()
-    with progress_bars() as progress:
-        drive = write_drive(world, seconds, seed, lambda done, total: progress("simulate", done, total))
-    simulated = time.perf_counter()
-    settings: list[str] = []
-    if labels == "network":
-        segment(drive, world / "probabilities", "demo")
-        settings = [f"calibration={DEMO_CALIBRATION}"]
-    else:
-        _corrupt_labels(drive, world / "probabilities", seed)
-    segmented = time.perf_counter()
-    run(drive, out, segmenter=f"labels:{world / 'probabilities'}", set_=settings, write_labels=True)
-    evaluate(out, drive / "truth")
-    typer.echo(f"Labels          {_DEMO_LABELS[labels]}")
-    about = json.loads((out / "run.json").read_text("utf-8"))
-    seconds_of = {"simulate": simulated - start, "segment": segmented - simulated} | about["seconds"]
-    typer.echo(
-        "Time            " + ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds_of.items())
-    )
-    for name in ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html"):
-        if (out / name).is_file():
-            typer.echo(f"Look at         {out / name}")
-
-
-_DEMO_LABELS = {
-    "network": "of the small network that was trained on simulated streets of seeds 1 to 100; no use on real images",
-    "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
-}
-
-
-def _check_drive_replaceable(world: Path) -> None:
-    """Raise DataError when the folder holds anything that no demo wrote."""
-    from gnss_sem_map.errors import DataError
-    from gnss_sem_map.simulation.drive import DATE
-
-    foreign = {path.name for path in world.iterdir()} - {DATE, "probabilities"} if world.is_dir() else set()
-    if foreign or world.is_file():
-        raise DataError(
-            f"{world}: the demo's drive goes here, but it holds {sorted(foreign)[:3] or 'a file'}; choose another -o"
-            " or move that away"
-        )
-
-
-def _open_demo_network() -> None:
-    from gnss_sem_map import labels
-    from gnss_sem_map.segmentation import open_segmenter
-
-    open_segmenter("demo", labels.label_set())
-
-
-def _corrupt_labels(drive: Path, folder: Path, seed: int) -> None:
-    from gnss_sem_map.simulation import write_corrupted_labels
+    from gnss_sem_map.demo import LABELS, demonstrate
 
     with progress_bars() as progress:
-        write_corrupted_labels(drive, folder, seed, lambda done, total: progress("segment", done, total))
+        done = demonstrate(out, seconds, seed, labels, progress)
+    warn(done.about["warnings"])
+    print_run(done.about, out, as_json=False)
+    print_metrics(done.metrics)
+    typer.echo(f"labels          {LABELS[labels]}")
+    for picture in done.pictures:
+        typer.echo(f"look at         {picture}")
 
 
 @app.command()
@@ -476,15 +404,27 @@ def _frame_range(frames: str) -> tuple[int, float]:
 
 
 def main() -> None:
-    """Entry point: one line on stderr and exit code 1 for every error that is ours."""
+    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours."""
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
     try:
-        app()
+        sys.exit(app(prog_name="gnss-sem-map", standalone_mode=False))
+    except typer.TyperException as error:
+        sys.exit(_wrong_usage(error))
     except (SemMapError, FactorGraphError) as error:
         typer.echo(f"gnss-sem-map: {' '.join(str(error).split())}", err=True)
         sys.exit(1)
+
+
+def _wrong_usage(error: typer.TyperException) -> int:
+    """Say in one line what was typed wrongly and where to read how; returns the exit code."""
+    message = " ".join(error.format_message().split())
+    context: typer.Context | None = getattr(error, "ctx", None)
+    command = "gnss-sem-map" if context is None else context.command_path
+    if message:  # no command at all: its help has been shown
+        typer.echo(f"gnss-sem-map: {message.rstrip('.')}; see {command} --help", err=True)
+    return error.exit_code
 
 
 if __name__ == "__main__":

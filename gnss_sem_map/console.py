@@ -12,6 +12,8 @@ import typer
 
 if TYPE_CHECKING:
     from gnss_sem_map.account import Progress
+    from gnss_sem_map.camera_check import CameraCheck
+    from gnss_sem_map.segmentation.cache import CacheReport
 
 
 @contextmanager
@@ -59,7 +61,10 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     from rich.table import Table
 
     raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
-    table = Table(title="Semantics, % of labelled points")
+    table = Table(
+        title="Semantics, % of labelled points",
+        caption="accuracy: of the points that carry the class, how many are of it (eq. 14; elsewhere: precision)",
+    )
     table.add_column("class")
     for column in ("accuracy raw", "refined", "IoU raw", "refined"):
         table.add_column(column, justify="right")
@@ -84,10 +89,52 @@ def print_metrics(metrics: dict[str, Any]) -> None:
         t = metrics["trajectory"]
         lines.append(
             f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
-            f" heading {t['heading_rms_deg']:.3f} deg, {100 * t['rpe_translation_share']:.2f} % relative"
+            f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
+            f" {100 * t['rpe_translation_share']:.2f} % relative"
         )
+        if "position_nees_per_dof" in t:
+            lines.append(
+                f"  squared error by its claimed variance (NEES per degree of freedom): position"
+                f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
+                " honest is 1 on average over many drives"
+            )
     for line in lines:
         console.print(line, highlight=False)
+
+
+def print_cache(report: CacheReport, out: Path) -> None:
+    """How many images were segmented, what that cost, and how to use them."""
+    if not report.written and not report.skips:
+        there = f"all {report.kept} images are segmented" if report.kept else "the drive has no images"
+        typer.echo(f"nothing was to do: {there}")
+    else:
+        cost = f" ({report.bytes_per_frame / 1000:.0f} kB each, {report.images_per_second:.1f} images/s)"
+        typer.echo(
+            f"{report.written} images segmented{cost if report.written else ''}, {report.kept} kept,"
+            f" {len(report.skips)} skipped"
+        )
+    if report.written or report.kept:
+        typer.echo(f"now use --segmenter labels:{out}")
+
+
+def print_camera_check(name: str, found: CameraCheck) -> None:
+    """How well time and mounting of the camera fit the images; what does not on stderr."""
+    typer.echo(
+        f"{name}: {found.edges} depth edges in {found.images} images; image edges are there"
+        f" {found.agreement:.2f} times as strong as elsewhere, at best {found.best_agreement:.2f}"
+    )
+    typer.echo(
+        f"exposure minus image stamp: {1e3 * found.time_offset_s:.1f} +- {1e3 * found.time_offset_stddev_s:.1f} ms"
+        f" (the file says {1e3 * found.given_time_offset_s:.1f})"
+    )
+    turns = zip("xyz", found.rotation_deg, found.rotation_stddev_deg, strict=True)
+    typer.echo(
+        "camera turned about "
+        + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
+    )
+    warn(found.warnings)
+    if not found.warnings:
+        typer.echo("time and mounting fit the images")
 
 
 def _percent(share: float | None) -> str:

@@ -53,12 +53,8 @@ def usable_points_in_map(
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
     """
-    valid, p_map = np.zeros(len(points.xyz), np.bool_), np.empty(3 * len(points.xyz))
     stamps, knots = knots_of(points, stamp, trajectory, T_imu_lidar, nearest_m, farthest_m)
-    count = scan_kernels.to_map(
-        points.rows, stamps, nearest_m, farthest_m, KNOTS_PER_S, knots.first, knots.poses, valid, p_map
-    )
-    return p_map[: 3 * count].reshape(-1, 3), valid
+    return _moved(points, stamps, knots, nearest_m, farthest_m)
 
 
 def usable_points_at_stamp(
@@ -75,14 +71,21 @@ def usable_points_at_stamp(
     """
     T_map_lidar = trajectory.at([stamp], EXTRAPOLATE_S)[0] @ T_imu_lidar
     stamps, knots = knots_of(points, stamp, trajectory, T_imu_lidar, nearest_m, farthest_m)
-    from_here = knots.poses.copy()
-    from_here[:, :, 3] -= T_map_lidar[:3, 3]
-    from_here = T_map_lidar[:3, :3].T @ from_here
-    valid, p_lidar = np.zeros(len(points.xyz), np.bool_), np.empty(3 * len(points.xyz))
+    poses = knots.poses.copy()
+    poses[:, :, 3] -= T_map_lidar[:3, 3]
+    from_here = Knots(knots.first, T_map_lidar[:3, :3].T @ poses)
+    return _moved(points, stamps, from_here, nearest_m, farthest_m)[0], T_map_lidar
+
+
+def _moved(
+    points: Points, stamps: NDArray[np.float64], knots: Knots, nearest_m: float, farthest_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The usable points (m, 3) where the knots say, in the frame of their poses, and which those are (n,)."""
+    valid, moved = np.zeros(len(points.xyz), np.bool_), np.empty(3 * len(points.xyz))
     count = scan_kernels.to_map(
-        points.rows, stamps, nearest_m, farthest_m, KNOTS_PER_S, knots.first, from_here, valid, p_lidar
+        points.rows, stamps, nearest_m, farthest_m, KNOTS_PER_S, knots.first, knots.poses, valid, moved
     )
-    return p_lidar[: 3 * count].reshape(-1, 3), T_map_lidar
+    return moved[: 3 * count].reshape(-1, 3), valid
 
 
 def knots_of(

@@ -69,7 +69,9 @@ def semantics(counts: NDArray[np.int64], label_set: LabelSet) -> dict[str, Any]:
     """Accuracy TP / (TP + FP) and IoU TP / (TP + FP + FN) per class and on average, and coverage, all in 0..1.
 
     The figures are over labelled points, with the coverage beside them; under `strict` an unlabelled point is a miss of
-    its class. A class without any truth is left out of the mean, one that is never predicted counts as 0.
+    its class. A class without any truth is left out of the mean, one that is never predicted counts as 0. Accuracy,
+    which others call precision, looks at labelled points only, so its strict mean differs in one case: a class of
+    whose points none is labelled is left out of the mean, but counts as 0 in the strict one.
     """
     labelled = counts[:, :-1]
     observed = _figures(labelled, labelled.sum(axis=1), label_set)

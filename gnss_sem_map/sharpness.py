@@ -220,6 +220,15 @@ def _with_room(rows: Keys, count: int) -> Keys:
     return larger
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
+    """Row of a key, entered where it is new, and whether it is; one row must be empty."""
+    row = voxel_kernels.find_or_insert(rows, key)
+    is_new = rows[row, 0] == 0
+    rows[row, 0] = key
+    return row, is_new
+
+
 @njit(cache=True, nogil=True)
 def _gather(
     rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
@@ -229,12 +238,10 @@ def _gather(
     `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
     """
     for i in range(start, len(keys)):
-        row = voxel_kernels.find_or_insert(rows, keys[i])
-        if rows[row, 0] == 0:
-            if 2 * count >= len(rows):
-                return count, i
-            rows[row, 0] = keys[i]
-            count += 1
+        if 2 * count >= len(rows):
+            return count, i
+        row, is_new = _row_of(rows, keys[i])
+        count += is_new
         if rows[row, LAST_SCAN] != scan:
             rows[row, LAST_SCAN] = scan
             rows[row, SCANS] += 1
@@ -262,12 +269,10 @@ def _gather(
 def _occupy(rows: Keys, count: int, start: int, keys: Keys) -> tuple[int, int]:
     """Add keys from `start` on, until the table is half full; returns how many there are, and the first not added."""
     for i in range(start, len(keys)):
-        row = voxel_kernels.find_or_insert(rows, keys[i])
-        if rows[row, 0] == 0:
-            if 2 * count >= len(rows):
-                return count, i
-            rows[row, 0] = keys[i]
-            count += 1
+        if 2 * count >= len(rows):
+            return count, i
+        _, is_new = _row_of(rows, keys[i])
+        count += is_new
     return count, len(keys)
 
 

@@ -42,6 +42,8 @@ def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
     assert metrics["semantics"]["refined"]["mean_iou"] > metrics["semantics"]["raw"]["mean_iou"]
     assert set(metrics["dynamic"]) >= {"SA", "DA", "AA"}
     assert metrics["trajectory"]["ate_m"] < 2.0
+    for part in ("position", "orientation"):  # one short drive is one sample of three degrees of freedom
+        assert 0 < metrics["trajectory"][f"{part}_nees_per_dof"] < 10
     assert 0 <= metrics["calibration"]["ece"] < 0.2
 
 
@@ -51,6 +53,7 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
         "sidewalk",
         "moving vehicles removed",
         "trajectory",
+        "NEES per degree of freedom",
         "refinement",
         "mapping",
         "small network",
@@ -59,6 +62,31 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
     for name in ("perspective.png", "topview.png", "report.html", "viewer.html"):
         assert str(out / name) in printed
         assert (out / name).stat().st_size > 10_000
+    (costs,) = (line for line in printed.splitlines() if "mapping " in line)  # every stage once
+    for stage in ("simulate", "segment", "trajectory", "mapping", "refinement", "export"):
+        assert costs.count(f"{stage} ") == 1
+
+
+WITHOUT_TORCH = """
+import sys
+
+class Absent:
+    def find_spec(self, name, *_):
+        if name == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
+
+sys.meta_path.insert(0, Absent())
+from gnss_sem_map.cli import main
+main()
+"""
+
+
+def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", WITHOUT_TORCH, "demo", "-o", str(tmp_path / "demo")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "torch is not installed; pip install 'gnss-sem-map[segmentation]'" in done.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_corrupted_truth_can_stand_in_for_the_network(

@@ -63,6 +63,8 @@ def test_a_raw_drive_becomes_a_map_with_the_right_labels(raw_run: Path, small_dr
     assert agreement(raw_run, small_drive, 10) > 0.97
     about = json.loads((raw_run / "run.json").read_text())
     assert about["counts"]["scans"] == len(small_drive.frames)
+    assert about["trajectory"]["relative_poses"] >= len(small_drive.frames) - 1
+    assert about["trajectory"]["relative_poses_rejected"] == 0
     assert about["counts"]["points"] == sum(map(len, small_drive.scan_classes.values()))
     assert about["skips"]["count"] == 0
     assert about["epoch_ns"] == int(street.EPOCH.astype(np.int64)) - 20_000_000
@@ -184,11 +186,16 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
     ("arguments", "code", "says"),
     [
         (("run", "nowhere", "-o", "out"), 1, "nowhere: no such folder; expected a drive"),
-        (("run",), 2, "Missing argument"),
+        (("run",), 2, "Missing argument 'drive'; see gnss-sem-map run --help"),
+        (("rnu",), 2, "Did you mean 'run'?; see gnss-sem-map --help"),
+        (("run", "DRIVE", "-o", "out", "--segmneter", "none"), 2, "--segmneter (Possible options: --segmenter"),
+        (("run", "DRIVE", "-o", "out", "--workers", "0"), 2, "Invalid value for '--workers'"),
+        (("demo", "-o", "out", "--labels", "true"), 2, "Invalid value for '--labels'"),
         (("run", "DRIVE", "-o", "out", "--set", "mapping.voxl=1"), 1, "unknown setting 'mapping.voxl'"),
         (("run", "DRIVE", "-o", "out", "--frames", "3"), 2, "expected A:B"),
         (("run", "DRIVE", "-o", "out", "--format", "ros"), 2, "expected one of"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "magic"), 1, "unknown kind 'magic'"),
+        (("run", "DRIVE", "-o", "out", "--segmenter", "lables:x"), 1, "did you mean 'labels'?"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "labels:nowhere"), 1, "nowhere"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "none", "--frames", "100:200"), 1, "none of 0 scans can be used"),
         (("run", "DRIVE", "-o", "DRIVE"), 1, "exists and is no run folder"),
@@ -202,9 +209,57 @@ def test_a_mistake_is_answered_in_one_line(
     assert done.returncode == code
     assert says in " ".join(done.stderr.split())
     assert "Traceback" not in done.stderr
-    if code == 1:
-        assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("gnss-sem-map: ")
+    assert done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def refused(*arguments: str | Path) -> str:
+    """What a command says when it ends with an error of ours: one line."""
+    done = gnss_sem_map(*arguments)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1, done.stderr
+    return done.stderr
+
+
+def test_segmenting_again_says_that_nothing_was_to_do(small_drive: Street, tmp_path: Path) -> None:
+    arguments = ("segment", small_drive.drive, "--segmenter", f"labels:{small_drive.labels}", "-o", tmp_path)
+    images = len(list((small_drive.drive / "image_02/data").glob("*.png")))
+    first, second = gnss_sem_map(*arguments), gnss_sem_map(*arguments)
+    assert f"{images} images segmented" in first.stdout
+    assert "images/s" in first.stdout
+    assert f"nothing was to do: all {images} images are segmented" in second.stdout
+    assert "images/s" not in second.stdout
+    for done in (first, second):
+        assert f"now use --segmenter labels:{tmp_path}" in done.stdout
+
+
+def test_a_run_is_not_merged_with_itself(raw_run: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link"
+    link.symlink_to(raw_run)
+    for second in (raw_run, link):
+        assert "is the first run as well" in refused("merge", raw_run, second, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_cannot_be_evaluated_says_what_is_missing_and_what_to_do(
+    raw_run: Path, small_drive: Street, tmp_path: Path
+) -> None:
+    again, merged, track = (tmp_path / name for name in ("again", "merged", "track"))
+    shutil.copytree(raw_run, again)
+    assert gnss_sem_map("merge", raw_run, again, "-o", merged).returncode == 0
+    assert gnss_sem_map("trajectory", small_drive.drive, "-o", track).returncode == 0
+    shutil.rmtree(again / "labels")
+    for folder, missing, what_to_do in (
+        (merged, "a merged map has no labels", f"evaluate the runs that it was made of, {raw_run.name} and again"),
+        (track, "a trajectory without a map", "gnss-sem-map run ... --write-labels"),
+        (again, "no point labels in this run", "make it again with --write-labels"),
+        (tmp_path / "nowhere", "no run folder here", "expected the -o of an earlier `gnss-sem-map run`"),
+    ):  # fmt: skip
+        said = refused("evaluate", folder, "--truth", raw_run)
+        assert str(folder) in said
+        assert missing in said
+        assert what_to_do in said
 
 
 def test_a_drive_with_images_and_no_segmenter_is_told_its_choices(

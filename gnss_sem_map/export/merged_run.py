@@ -21,11 +21,15 @@ from gnss_sem_map.voxel_map import SemanticMap
 def merge_run_folders(first: Path, second: Path, out: Path) -> dict[str, Any]:
     """Write the merged run into `out`, refined with the settings of the first; returns the content of run.json.
 
-    Raises DataError for folders that hold no run, and for maps that do not fit together.
+    Raises DataError for folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
         if not (run / "run.json").is_file():
             raise DataError(f"{run}: no run folder here; expected the -o of an earlier `gnss-sem-map run`")
+    if first.resolve() == second.resolve():
+        raise DataError(
+            f"{second}: is the first run as well; merged with itself, all it saw would count twice; give another run"
+        )
     settings = config.load(first / "config.yaml")
     label_set = labels.label_set(settings.classes)
     static, removed, frame = merge_runs(first, second, label_set)

@@ -47,6 +47,9 @@ WORDS = {
     "SA_vehicle": "points on parked vehicles kept",
     "ece": "expected calibration error (ECE)",
     "ate_m": "absolute trajectory error (m)",
+    "chi2_per_dof": "squared residuals by what their standard deviations allow (chi2 per degree of freedom)",
+    "position_nees_per_dof": "squared position error by its claimed variance (NEES per degree of freedom)",
+    "orientation_nees_per_dof": "squared orientation error by its claimed variance (NEES per degree of freedom)",
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260

@@ -157,6 +157,8 @@ def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
         "iterations": solution.iterations,
         "fixes": len(solution.rejected),
         "fixes_rejected": int(solution.rejected.sum()),
+        "relative_poses": len(solution.relative_rejected),
+        "relative_poses_rejected": int(solution.relative_rejected.sum()),
         "time_offset_s": solution.calibration.time_offset_s,
         "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
     }

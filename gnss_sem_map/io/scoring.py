@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.accuracy import errors, relative_error
+from factor_graphs.accuracy import errors, pose_nees, relative_error
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import evaluation
+from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io.point_labels import label_files, read_labels, truth_folder
 from gnss_sem_map.labels import LabelSet
@@ -21,12 +21,17 @@ ONE_SECOND = 10
 """Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
 
 
-def score_run(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None = None) -> dict[str, Any]:
+def score_run(
+    out: Path, truth: Path, label_set: LabelSet | None = None, restrict_to: Path | None = None
+) -> dict[str, Any]:
     """Everything that can be scored of a run folder, as `metrics.json` holds it; also written there.
 
     `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
-    the imu in the map frame at the scans' stamps). `restrict_to`: only points labelled there. Raises DataError.
+    the imu in the map frame at the scans' stamps). `label_set` is that of the run's settings unless given.
+    `restrict_to`: only points labelled there. Raises DataError.
     """
+    _check_scorable(out)
+    label_set = label_set or labels.label_set(config.load(out / "config.yaml").classes)
     metrics = _known_metrics(out) | _score_points(out, truth, label_set, restrict_to)
     path = truth / "trajectory_lidar.tum"
     if path.is_file():
@@ -35,13 +40,35 @@ def score_run(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | N
     return metrics
 
 
+def _check_scorable(out: Path) -> None:
+    """Raise DataError for a folder that says nothing of single points, which are what is scored."""
+    about = _read_json(out / "run.json")
+    if "merged" in about:
+        raise DataError(
+            f"{out}: a merged map has no labels of single points; evaluate the runs that it was made of,"
+            f" {' and '.join(about['merged'])}"
+        )
+    if not (out / "map").is_dir():
+        raise DataError(
+            f"{out}: found a trajectory without a map; make the map with `gnss-sem-map run ... --write-labels`"
+        )
+    if not (out / "labels").is_dir():
+        raise DataError(f"{out / 'labels'}: no point labels in this run; make it again with --write-labels")
+
+
 def _known_metrics(out: Path) -> dict[str, Any]:
     """What the run itself measured without a truth."""
+    return _read_json(out / "metrics.json")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
     try:
-        known = json.loads((out / "metrics.json").read_text("utf-8"))
+        return dict(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError) as error:
-        raise DataError(f"{out / 'metrics.json'}: no run folder here ({error})") from None
-    return dict(known)
+        reason = error.strerror if isinstance(error, OSError) else "damaged"
+        raise DataError(
+            f"{path}: no run folder here ({reason}); expected the -o of an earlier `gnss-sem-map run`"
+        ) from None
 
 
 def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
@@ -77,8 +104,6 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
 
 def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32]]]:
     """Name and true ids of every scan that the run labelled; every one must have a truth, and at least one."""
-    if not predictions.is_dir():
-        raise DataError(f"{predictions}: no point labels in this run; make it again with --write-labels")
     wanted, known = label_files(predictions), label_files(truth)
     missing = sorted(set(wanted) - set(known))
     if missing:
@@ -89,19 +114,30 @@ def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
-    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second."""
+    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second.
+
+    Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom.
+    """
     error = errors(estimate, truth)
     stamps = error.stamps
     relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
-    return {
+    scores = {
         "ate_m": error.ate_m,
         "horizontal_rms_m": error.horizontal_rms_m,
         "vertical_rms_m": error.vertical_rms_m,
         "heading_rms_deg": error.heading_rms_deg,
+        "tilt_rms_deg": error.tilt_rms_deg,
         "ate_aligned_m": _aligned_rms(estimate.at(stamps)[:, :3, 3], truth.at(stamps)[:, :3, 3]),
         "rpe_translation_m": relative.translation_m,
         "rpe_translation_share": relative.translation_share,
         "rpe_rotation_deg": relative.rotation_deg,
+    }
+    if estimate.covariances is None:
+        return scores
+    position, orientation = pose_nees(estimate, truth)
+    return scores | {
+        "position_nees_per_dof": float(position.mean()) / 3,
+        "orientation_nees_per_dof": float(orientation.mean()) / 3,
     }
 
 

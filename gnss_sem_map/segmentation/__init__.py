@@ -5,6 +5,7 @@ Cheap to import: torch, transformers and onnxruntime are imported by the segment
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -120,8 +121,10 @@ def open_segmenter(
             with _needs("segmentation", spec):
                 from gnss_sem_map.segmentation.checkpoints import open_refinenet
             return open_refinenet(DEMO_NETWORK, label_set, device, **options)
+    close = difflib.get_close_matches(scheme, SCHEMES, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
     raise ConfigError(
-        f"segmenter {spec!r}: unknown kind {scheme!r}; expected one of {list(SCHEMES.values())}"
+        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected one of {list(SCHEMES.values())}"
     )
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.accuracy import anees_band, errors, nees, relative_error, state_error
+from factor_graphs.accuracy import anees_band, errors, nees, pose_nees, relative_error, state_error
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 
@@ -83,6 +83,44 @@ def test_nees_of_honest_errors_has_the_mean_of_their_dimension():
     low, high = anees_band(15, 20000, confidence=0.999)
     assert low < nees(e, P).mean() < high
     assert not low < nees(2 * e, P).mean() < high
+
+
+def honest_pair(seed: int, k: int = 4000) -> tuple[Trajectory, Trajectory]:
+    """An estimate, and a truth that differs from it by errors drawn from the covariances that the estimate claims."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(k) * 0.1
+    T = np.tile(np.eye(4), (k, 1, 1))
+    T[:, :3, 3] = np.cumsum(rng.standard_normal((k, 3)), axis=0)
+    T[:, :3, :3] = Rotation.random(k, random_state=seed).as_matrix()
+    root = rng.standard_normal((6, 6)) * [[1e-3], [2e-3], [5e-3], [0.1], [0.5], [2.0]]  # no axis like another
+    tangent = rng.standard_normal((k, 6)) @ root.T
+    off = np.tile(np.eye(4), (k, 1, 1))
+    off[:, :3, :3], off[:, :3, 3] = Rotation.from_rotvec(tangent[:, :3]).as_matrix(), tangent[:, 3:]
+    claimed = np.broadcast_to(root @ root.T, (k, 6, 6))
+    return Trajectory(stamps, T, covariances=claimed), Trajectory(stamps, T @ off)
+
+
+def test_nees_of_an_honest_trajectory_is_its_degrees_of_freedom_whichever_way_it_looks():
+    estimate, truth = honest_pair(1)
+    low, high = anees_band(3, len(truth), confidence=0.999)
+    for found in pose_nees(estimate, truth):
+        assert low < found.mean() < high
+    boast = Trajectory(estimate.stamps, estimate.T_map_imu, covariances=estimate.covariances / 4)
+    for found, honest in zip(pose_nees(boast, truth), pose_nees(estimate, truth), strict=True):
+        np.testing.assert_allclose(found, 4 * honest)
+
+
+def test_nees_takes_the_covariance_of_the_nearest_stamp():
+    T = np.tile(np.eye(4), (3, 1, 1))
+    covariances = np.array([1.0, 4.0, 16.0])[:, None, None] * np.eye(6)
+    estimate = Trajectory(np.array([0.0, 1.0, 2.0]), T, covariances=covariances)
+    moved = np.tile(np.eye(4), (5, 1, 1))
+    moved[:, 0, 3] = 4.0
+    position, orientation = pose_nees(estimate, Trajectory(np.array([0.0, 0.4, 0.6, 1.4, 2.0]), moved))
+    np.testing.assert_allclose(position, [16.0, 16.0, 4.0, 4.0, 1.0])
+    np.testing.assert_allclose(orientation, 0.0)
+    with pytest.raises(MeasurementError, match="no covariances"):
+        pose_nees(Trajectory(estimate.stamps, T), estimate)
 
 
 def test_a_state_without_error_has_none_and_a_turned_one_has_the_turn():

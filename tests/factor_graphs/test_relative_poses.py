@@ -14,7 +14,7 @@ from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import Motion, follow, simulate_gnss
-from factor_graphs.smoothing import Solution, smooth
+from factor_graphs.smoothing import NOTABLE_REJECTION, Solution, smooth
 from factor_graphs.streaming import StreamingSmoother
 
 Array = NDArray[np.float64]
@@ -93,13 +93,27 @@ def test_wrong_relative_poses_lose_their_weight(simulate):
     assert error < worst
 
 
+def test_a_single_wrong_relative_pose_is_rejected_without_a_word(simulate):
+    """To reject one of many is what a robust loss is for; the test above has one in forty, which is a note."""
+    drive = simulate(33, seconds=60.0, noise=ImuNoise())
+    right = measured(drive.motion, 0.5, 59.0, np.random.default_rng(0))
+    T = right.T_imu_imu.copy()
+    T[20, :3, 3] += [0.8, -0.5, 0.2]
+    spoilt = RelativePoses(right.stamps, T, right.covariances)
+    solution = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, relative_poses=spoilt)
+    assert solution.relative_rejected[20]
+    assert 0 < solution.relative_rejected.sum() <= NOTABLE_REJECTION * len(T)
+    assert not any("relative poses rejected" in note for note in solution.notes)
+
+
 def test_relative_poses_outside_the_imu_have_no_weight(simulate):
     drive = simulate(34, seconds=30.0, noise=ImuNoise())
     relative = measured(drive.motion, 0.5, 29.0, np.random.default_rng(0))
     late = RelativePoses(relative.stamps + 20.0, relative.T_imu_imu, relative.covariances)
     beyond = late.stamps[:, 1] > drive.imu.stamps[-1]
-    weights = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, relative_poses=late[beyond]).relative_weights
-    assert weights.tolist() == [0.0] * int(beyond.sum())
+    solution = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, relative_poses=late[beyond])
+    assert solution.relative_weights.tolist() == [0.0] * int(beyond.sum())
+    assert solution.relative_rejected.all()
 
 
 def test_a_short_curved_track_of_drifting_fixes_does_not_turn_the_heading():

@@ -103,6 +103,8 @@ def test_a_file_that_is_no_trajectory_is_refused(tmp_path):
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    with pytest.raises(MeasurementError, match="no such file; expected a saved trajectory"):
+        Trajectory.load(tmp_path / "nowhere.parquet")
     (tmp_path / "text.parquet").write_text("no")
     with pytest.raises(MeasurementError, match="not a Parquet file"):
         Trajectory.load(tmp_path / "text.parquet")

@@ -52,6 +52,15 @@ def test_accuracy_and_iou_are_scikit_learn_s_precision_and_jaccard() -> None:
     assert found["coverage"] == pytest.approx((guess[true >= 0] < 5).mean())
 
 
+def test_a_class_that_no_point_is_labelled_of_is_left_out_of_the_mean_and_a_miss_of_the_strict_one() -> None:
+    prediction, truth = ids(40, 40, 10, 0, 0), ids(40, 40, 10, 48, 48)  # all of the sidewalk is unlabelled
+    found = semantics(confusion(prediction, truth, TABLES, "here"), URBAN)
+    assert (found["mean_accuracy"], found["mean_iou"]) == (1.0, 1.0)
+    assert found["strict"] == {"mean_accuracy": pytest.approx(2 / 3), "mean_iou": pytest.approx(2 / 3)}
+    half = semantics(confusion(ids(40, 40, 10, 48, 0), truth, TABLES, "here"), URBAN)
+    assert half["strict"] == {"mean_accuracy": half["mean_accuracy"], "mean_iou": pytest.approx(2.5 / 3)}
+
+
 def test_figures_agree_with_the_independent_scorer_to_the_last_digit(real_data: Path) -> None:
     spec = importlib.util.spec_from_file_location("score", real_data.parent / "score.py")
     assert spec is not None

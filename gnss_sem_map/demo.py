@@ -1,0 +1,98 @@
+"""The demo: a simulated drive, its images segmented, mapped, and scored against the exact truth.
+
+What `simulate`, `segment`, `run` and `evaluate` do one after another, and how to do it from Python.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from gnss_sem_map import config, labels, pipeline
+from gnss_sem_map.account import Account, Progress, silent
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.report import write_report
+from gnss_sem_map.export.run_folder import check_replaceable, write_run
+from gnss_sem_map.io import open_drive
+from gnss_sem_map.io.scoring import score_run
+from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
+from gnss_sem_map.segmentation.cache import write_cache
+from gnss_sem_map.simulation import simulate, write_corrupted_labels
+from gnss_sem_map.simulation.drive import DATE
+
+PROBABILITIES = "probabilities"
+"""Folder of the class probabilities, beside the drive."""
+LABELS = {
+    "network": "of the small network that was trained on simulated streets of seeds 1 to 100; no use on real images",
+    "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
+}
+"""Where the demo's class probabilities come from."""
+PICTURES = ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html")
+
+
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """What a demo came to."""
+
+    about: dict[str, Any]
+    """As run.json, with the seconds of simulation and segmentation before those of the run."""
+    metrics: dict[str, Any]
+    pictures: tuple[Path, ...]
+
+
+def demonstrate(
+    out: Path,
+    seconds: float = 30.0,
+    seed: int = 0,
+    source: Literal["network", "corrupted"] = "network",
+    progress: Progress = silent,
+) -> Demo:
+    """Simulate a drive into `<out>_drive`, segment it, map it into `out` and score it, with `source` one of `LABELS`.
+
+    Earlier demos in both folders are replaced. Raises DataError when either holds what no demo wrote, and ConfigError
+    when the network needs a package that is not installed.
+    """
+    world = out.with_name(f"{out.name}_drive")
+    check_replaceable(out)
+    _check_drive_replaceable(world)
+    label_set = labels.label_set()
+    # what is missing is said now, not after the simulation
+    network = open_segmenter("demo", label_set) if source == "network" else None
+    settings = config.load(overrides=[f"calibration={DEMO_CALIBRATION}"] if network else [])
+
+    account, probabilities = Account(), world / PROBABILITIES
+    shutil.rmtree(world, ignore_errors=True)
+    with account.stage("simulate"):
+        drive = simulate(world, seconds, seed, lambda done, total: progress("simulate", done, total))
+    log = open_drive(drive)
+    with account.stage("segment"):
+        if network is not None:
+            write_cache(log.images, network, label_set, probabilities, "demo", 1, progress)
+        else:
+            write_corrupted_labels(
+                drive, probabilities, seed, lambda done, total: progress("segment", done, total)
+            )
+
+    spec = f"labels:{probabilities}"
+    segmenter = open_segmenter(spec, label_set, expected_size=log.calibration.image_size)
+    result = pipeline.run(log, segmenter, settings, progress)
+    about = write_run(out, drive, log, result, settings, write_labels=True, segmenter=spec)
+    metrics = score_run(out, drive / "truth")
+    write_report(out, about, metrics)
+    return Demo(
+        about | {"seconds": account.seconds | about["seconds"]},
+        metrics,
+        tuple(out / name for name in PICTURES if (out / name).is_file()),
+    )
+
+
+def _check_drive_replaceable(world: Path) -> None:
+    """Raise DataError when the folder holds anything that no demo wrote."""
+    foreign = {path.name for path in world.iterdir()} - {DATE, PROBABILITIES} if world.is_dir() else set()
+    if foreign or world.is_file():
+        raise DataError(
+            f"{world}: the demo's drive goes here, but it holds {sorted(foreign)[:3] or 'a file'}; choose another -o"
+            " or move that away"
+        )

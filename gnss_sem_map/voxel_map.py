@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -325,12 +325,15 @@ def pack(indices: NDArray[np.integer]) -> NDArray[np.int64]:
     return np.asarray((x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z)
 
 
+@cache
 def log_table(number_of_classes: int, floor_percent: int, share: float = 1.0) -> NDArray[np.int32]:
-    """round(1024 share ln i) for every integer that a floored, normalised uint8 probability can meet."""
+    """round(1024 share ln i) for every integer that a floored, normalised uint8 probability can meet; read-only."""
     largest = number_of_classes * max(100 * 255, floor_percent * 255 * number_of_classes)
     numbers = np.arange(largest + 1, dtype=np.float64)
     numbers[0] = 1.0
-    return np.asarray(np.rint(share * UNITS_PER_NAT * np.log(numbers)), np.int32)
+    table = np.asarray(np.rint(share * UNITS_PER_NAT * np.log(numbers)), np.int32)
+    table.flags.writeable = False
+    return table
 
 
 def answer_table(answers: NDArray[np.float64] | None, number_of_classes: int) -> NDArray[np.int32]:

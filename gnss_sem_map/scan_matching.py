@@ -7,6 +7,7 @@ and a verdict on every match. Positions drift, steps do not: the graph takes the
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import usable_points_at_stamp
+from gnss_sem_map.downsampling import one_per_cube
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
@@ -41,6 +43,7 @@ SETTLED = 0.5
 COARSE_M, FINE_M = 0.01, 0.001
 # A point's plane is that of so many neighbours: ten and twenty tilt it at edges, and roll the sweep with it.
 NEIGHBOURS = 6
+THREADS = min(os.cpu_count() or 1, 4)
 
 
 class ScanMatchingSettings(BaseModel):
@@ -170,22 +173,20 @@ def _prepare(
 
 
 def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings) -> _Sweep:
-    """Deskew a sweep, keep one point per cube, and fit a plane to each.
-
-    By one thread: two keep other points every time.
-    """
+    """Deskew a sweep, keep one point per cube, and fit a plane to each."""
     raw, nearest_m, farthest_m = scan.read(), settings.nearest_m, settings.farthest_m
     cloud, T_map_lidar = usable_points_at_stamp(
         raw, scan.stamp, trajectory, T_imu_lidar, nearest_m, farthest_m
     )
     if not len(cloud):
         raise DataError(f"no point between {nearest_m:g} and {farthest_m:g} m of {len(raw.xyz)}")
-    points = small_gicp.voxelgrid_sampling(cloud, settings.downsampling_m)
+    points = small_gicp.PointCloud(one_per_cube(cloud, settings.downsampling_m))
     if points.size() < settings.min_points:
         raise _NoMatch(
             f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
         )
-    small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS)
+    # small_gicp holds Python's lock: its own threads are all that helps, where each point is for itself
+    small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS, num_threads=THREADS)
     return _Sweep(points, T_map_lidar)
 
 

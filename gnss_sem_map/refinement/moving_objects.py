@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.ahead import ahead
+from gnss_sem_map.distinct import distinct
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement import range_images
-from gnss_sem_map.refinement.distinct import distinct
 from gnss_sem_map.refinement.scan_grid import height_over_ground, near, reached, within
 from gnss_sem_map.refinement.segments import Segments, find_segments, take_apart
 from gnss_sem_map.refinement.tracks import Segment

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from gnss_sem_map.distinct import distinct
 from gnss_sem_map.refinement.dbscan import dbscan
-from gnss_sem_map.refinement.distinct import distinct
 from gnss_sem_map.voxel_map import keys_of, unpack
 
 VOXEL_M = 0.2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnss_sem_map.refinement.distinct import distinct
+from gnss_sem_map.distinct import distinct
 from gnss_sem_map.voxel_map import keys_of
 
 

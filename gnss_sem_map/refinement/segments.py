@@ -21,9 +21,10 @@ CLOSER = 0.5
 """What may be two vehicles is taken apart at this share of the distance."""
 PART_M = 0.2
 """A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
-LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.6
+LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.5
 """What is longer than the first is perhaps two vehicles. A segment that reaches beyond what the image shows is no
-larger than the next two, a lorry or a bus, and one that no image shows no lower than the last."""
+larger than the next two, a lorry or a bus, and one that no image shows no lower than the last: what comes back of a car
+behind is its front, without the windscreen."""
 LEAST_POINTS = 20
 """A segment that no image shows has at least so many points."""
 MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200

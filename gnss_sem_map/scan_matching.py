@@ -127,7 +127,7 @@ def match_scans(
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips = []
-    # the next sweeps are prepared on a second core while one is matched
+    # the next sweeps are read, moved and thinned out on a second core while one is matched
     prepare = partial(
         _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
     )

@@ -3,9 +3,10 @@
     python benchmarks/mapping.py DRIVE SEGMENTER [DRIVE SEGMENTER ...] [--scans 240] [--large]
 
 prints the figures and writes benchmarks/results/mapping.json. SEGMENTER as in `gnss-sem-map run`, such as
-labels:DRIVE/truth/train_ids. Times are CPU time of this process, each tool in turn on every scan, medians over the
-scans after the first; what counts is their ratio. Peers (open3d, kiss-icp, pandas, duckdb, polars) that are not
-installed are left out and named. `--large` adds the table of fifty million voxels (5 GB of memory, minutes).
+labels:DRIVE/truth/train_ids. Of a drive with more scans than `--scans`, every so manieth is used. Times are CPU time of
+this process, each tool in turn on every scan, medians over the scans after the first; what counts is their ratio. Peers
+(open3d, kiss-icp, pandas, duckdb, polars) that are not installed are left out and named. `--large` adds the table of
+fifty million voxels (5 GB of memory, minutes).
 """
 
 from __future__ import annotations
@@ -70,14 +71,15 @@ class Race:
 
 
 def open_job(drive: Path, spec: str, scans: int) -> Drive:
-    """A drive with the trajectory that its own navigation system reports."""
+    """A drive with the trajectory that its own navigation system reports, and so many scans from all along it."""
     log = open_drive(drive)
     segmenter = open_segmenter(spec, URBAN, expected_size=log.calibration.image_size)
     trajectory = log.given or log.reference
     if trajectory is None:
         raise SystemExit(f"{drive}: has no trajectory of its own")
     with_image = [scan for scan in log.scans if log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)]
-    return Drive(_only(log, with_image[:scans]), trajectory, segmenter, SETTINGS)
+    evenly = with_image[:: max(len(with_image) // scans, 1)][:scans]
+    return Drive(_only(log, evenly), trajectory, segmenter, SETTINGS)
 
 
 def _only(log: SensorLog, scans: Sequence[Scan]) -> SensorLog:

@@ -219,15 +219,16 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.
     (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
     (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
     _write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
-    _write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids)
+    unfiltered = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)  # ids are read four times as fast so
+    _write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids, *unfiltered)
     alone = seen_alone(image, *simulation.project(k, scan))
     (drive / "truth" / "single_frame" / f"{name}.label").write_bytes(alone.astype("<u4").tobytes())
     numbers, counts = np.unique(image.instances, return_counts=True)
     return numbers[(numbers > 0) & (counts >= 60)]
 
 
-def _write_png(path: Path, pixels: npt.NDArray[Any]) -> None:
-    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+def _write_png(path: Path, pixels: npt.NDArray[Any], *options: int) -> None:
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1, *options])
     if not ok:
         raise DataError(f"{path}: the image could not be encoded")
     path.write_bytes(data.tobytes())

@@ -37,7 +37,9 @@ class MappingSettings(BaseModel):
 
     voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
     nearest_m: float = Field(
-        1.0, ge=0, description="Returns nearer to the LiDAR than this are left out (the car itself)."
+        2.4,
+        ge=0,
+        description="Returns nearer to the LiDAR than this are left out: the car itself (KITTI's reaches that far).",
     )
     farthest_m: float = Field(
         120.0, gt=0, description="Returns farther from the LiDAR than this are left out."

@@ -325,3 +325,16 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
         np.testing.assert_array_equal(seen.classes, classes.rows[pixels[pixels >= 0]])
         plain.add(numpy_chain.keys_of(p_map, settings.mapping.voxel_size_m), pixels, classes.rows)
     assert_same(plain.to_map(), at_once[0].static)
+
+
+def test_the_car_itself_is_not_mapped(real_data: Path) -> None:
+    """A real car shows itself in every sweep, at the corners of its roof: a ghost beside the whole track, if kept."""
+    log = open_drive(real_data / "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync")
+    assert log.reference is not None
+    there, kept = 0, 0
+    for seen in seen_scans(Drive(log, log.reference, None, Settings())):
+        x, y, z = seen.points.xyz.T
+        of_the_car = (np.abs(x) < 2) & (np.abs(y) < 1.5) & (z > -1.2)
+        there, kept = there + int(of_the_car.sum()), kept + int(of_the_car[seen.valid].sum())
+    assert there > 1000
+    assert kept == 0

@@ -12,6 +12,7 @@ import typer
 from gnss_sem_map.console import (
     print_cache,
     print_camera_check,
+    print_merged,
     print_metrics,
     print_run,
     progress_bars,
@@ -114,6 +115,10 @@ def merge(
     first: Annotated[Path, typer.Argument(help="Folder of a run; the merged map has its frame.")],
     second: Annotated[Path, typer.Argument(help="Folder of another run, of the same place.")],
     out: Out,
+    match: Annotated[
+        bool,
+        typer.Option(help="Lay the surfaces of the second onto those of the first: positions of both err."),
+    ] = True,
     as_json: Json = False,
 ) -> None:
     """One map of two runs of the same place, refined again."""
@@ -121,11 +126,11 @@ def merge(
     from gnss_sem_map.export.merged_run import merge_run_folders
 
     run_folder.check_replaceable(out)
-    about = merge_run_folders(first, second, out)
+    about = merge_run_folders(first, second, out, match)
     if as_json:
         typer.echo(json.dumps(about))
     else:
-        typer.echo(f"{about['name']}: {about['map']['voxels']} voxels\nresults in {out}")
+        print_merged(about, out)
 
 
 @app.command()

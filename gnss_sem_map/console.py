@@ -55,6 +55,22 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
     typer.echo(f"results in {out}")
 
 
+def print_merged(about: dict[str, Any], out: Path) -> None:
+    """What came of two runs, and how the second came to lie on the first; what does not fit on stderr."""
+    match, (first, second) = about["match"], about["merged"]
+    before, now = (_percent(match["coinciding"][moment]) for moment in ("by_georeference", "now"))
+    typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
+    if match["shift_m"] is not None:
+        typer.echo(
+            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {now} % of its voxels fall"
+            f" on {first}, {before} % did by georeference"
+        )
+    else:
+        typer.echo(f"{second} lies by georeference: {now} % of its voxels fall on {first}")
+        warn([f"{second} could not be laid onto {first}: {match['reason']}"] if match["reason"] else [])
+    typer.echo(f"results in {out}")
+
+
 def print_metrics(metrics: dict[str, Any]) -> None:
     """One table: accuracy and IoU per class before and after refinement, then the single figures."""
     from rich.console import Console

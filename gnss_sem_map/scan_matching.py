@@ -17,12 +17,12 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import registration
 from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import usable_points_at_stamp
@@ -32,10 +32,6 @@ from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
 Array = NDArray[np.float64]
 
-# small_gicp takes every point for a small plane of variances (1e-3, 1, 1) m² along and across its normal. Two of
-# them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
-TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
-MAX_ITERATIONS = 30
 # Once a sweep is in its place, so much of a voxel's edge is far enough to look for a point's surface. What is farther
 # has moved: a car ahead, half a metre on since the last sweep, would drag the sweep along with it.
 SETTLED = 0.5
@@ -223,15 +219,16 @@ class _Odometry:
             )
         settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m, FINE_M)
         # the coarse match knows what holds the sweep: what moves makes its residuals larger, and it less sure
-        information, weight = _information(coarse, points)
+        information, weight = registration.information(coarse, points)
         length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
-        T, covariance, is_open = _close_open_directions(
-            guess, _rigid(settled.T_target_source), information, weight, length, settings
-        )
+        T, covariance, is_open = registration.close_open_directions(
+            guess, registration.rigid(settled.T_target_source), information, weight, length,
+            settings.degenerate_share, settings.degenerate_stddev_m,
+        )  # fmt: skip
         # at its limit, not stuck at a minimum; where a direction is open, sliding along it does no harm
-        if not is_open and not all(_has_converged(result) for result in (coarse, settled)):
-            raise _NoMatch(f"the registration did not converge in {MAX_ITERATIONS} iterations")
-        _refuse_divergence(_inverse(guess) @ T, settings)
+        if not is_open and not all(registration.has_converged(result) for result in (coarse, settled)):
+            raise _NoMatch(f"the registration did not converge in {registration.MAX_ITERATIONS} iterations")
+        _refuse_divergence(registration.inverse(guess) @ T, settings)
         return T, covariance, is_open
 
     def _align(
@@ -243,61 +240,19 @@ class _Odometry:
             points,
             guess,
             max_correspondence_distance=within_m,
-            max_iterations=MAX_ITERATIONS,
+            max_iterations=registration.MAX_ITERATIONS,
             translation_epsilon=step_m,
         )
 
 
-def _has_converged(result: small_gicp.RegistrationResult) -> bool:
-    return bool(result.converged or result.iterations < MAX_ITERATIONS - 1)
-
-
 def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> None:
     shift = float(np.linalg.norm(correction[:3, 3]))
-    turn = float(np.degrees(Rotation.from_matrix(correction[:3, :3]).magnitude()))
+    turn = registration.turn_deg(correction)
     if shift > settings.max_correction_m or turn > settings.max_correction_deg:
         raise _NoMatch(
             f"the registration went {shift:.2f} m and {turn:.1f}° from its start, expected at most"
             f" {settings.max_correction_m:g} m and {settings.max_correction_deg:g}°"
         )
-
-
-def _information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
-    """What the planes of the scene tell of the pose: (6, 6), lidar axes, and the weight of one point across its plane.
-
-    The registration's own Hessian also holds the weight that it gives along the planes. That is no knowledge of the
-    pose: the centre of a voxel's points lies anywhere on its wall. So it is taken off, for T p with
-    T Exp(r, t): J = [-R [p]x, R]. Residuals of another size than small_gicp presumes rescale the rest.
-    """
-    p = np.asarray(points.points())[:, :3]
-    along = np.zeros((6, 6))
-    along[:3, :3] = np.sum(p * p) * np.eye(3) - p.T @ p
-    along[:3, 3:] = _cross_matrix(p.sum(axis=0))
-    along[3:, :3] = along[:3, 3:].T
-    along[3:, 3:] = len(p) * np.eye(3)
-    planes = result.H - TANGENTIAL_WEIGHT * result.num_inliers / len(p) * along
-    scale = result.num_inliers / max(2 * result.error, 1e-9)  # 1 / mean squared whitened residual
-    return scale * planes, scale * NORMAL_WEIGHT * result.num_inliers
-
-
-def _close_open_directions(
-    guess: Array, T: Array, information: Array, weight: float, length: float, settings: ScanMatchingSettings
-) -> tuple[Array, Array, bool]:
-    """Pose and covariance (6, 6) of a match; along directions that the scene leaves open, the guess stays.
-
-    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length`, so that they
-    compare with translations. A direction is open when its information is below a share of `weight`, that of all
-    points across their planes; its standard deviation is then the setting's.
-    """
-    scale = np.repeat([length, 1.0], 3)
-    eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
-    is_open = eigenvalues < settings.degenerate_share * weight
-    variances = np.where(is_open, settings.degenerate_stddev_m**2, 1 / np.where(is_open, 1.0, eigenvalues))
-    covariance = (axes * variances) @ axes.T / np.outer(scale, scale)
-    if is_open.any():
-        held = axes[:, ~is_open]
-        T = guess @ _exp(held @ (held.T @ (scale * _log(np.linalg.inv(guess) @ T))) / scale)
-    return T, covariance, bool(is_open.any())
 
 
 def _pairs(matches: list[_Match], step: int) -> Iterator[tuple[_Match, _Match]]:
@@ -317,51 +272,14 @@ def _relative_poses(
 ) -> RelativePoses:
     """Pairs of matches as motion of the imu. Both ends err against the local map, and no less than the floor."""
     T_lidar_imu = np.linalg.inv(T_imu_lidar)
-    to_imu = _adjoint(T_imu_lidar)
+    to_imu = registration.adjoint(T_imu_lidar)
     floor = np.diag(np.repeat([settings.rotation_stddev_rad**2, settings.translation_stddev_m**2], 3))
     T, covariances = np.zeros((len(pairs), 4, 4)), np.zeros((len(pairs), 6, 6))
     for k, (earlier, later) in enumerate(pairs):
-        T_earlier_later = _rigid(np.linalg.inv(earlier.T_local_lidar) @ later.T_local_lidar)
-        back = _adjoint(_inverse(T_earlier_later))
+        T_earlier_later = registration.rigid(np.linalg.inv(earlier.T_local_lidar) @ later.T_local_lidar)
+        back = registration.adjoint(registration.inverse(T_earlier_later))
         in_lidar = later.covariance + back @ earlier.covariance @ back.T
-        T[k] = _rigid(T_imu_lidar @ T_earlier_later @ T_lidar_imu)
+        T[k] = registration.rigid(T_imu_lidar @ T_earlier_later @ T_lidar_imu)
         covariances[k] = to_imu @ in_lidar @ to_imu.T + floor
     stamps = np.array([(a.scan.stamp, b.scan.stamp) for a, b in pairs]).reshape(-1, 2)
     return RelativePoses(stamps, T, (covariances + np.swapaxes(covariances, 1, 2)) / 2)
-
-
-def _rigid(T: Array) -> Array:
-    """The nearest rigid transform: products of many drift off the rotations by rounding."""
-    rigid = np.eye(4)
-    rigid[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
-    rigid[:3, 3] = T[:3, 3]
-    return rigid
-
-
-def _inverse(T: Array) -> Array:
-    return np.asarray(np.linalg.inv(T), np.float64)
-
-
-def _cross_matrix(v: Array) -> Array:
-    return np.cross(v, np.eye(3)).T
-
-
-def _adjoint(T: Array) -> Array:
-    """(6, 6) with T Exp(x) T⁻¹ = Exp(adjoint x), x = (rotation, translation)."""
-    R = T[:3, :3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[3:, :3] = _cross_matrix(T[:3, 3]) @ R
-    return adjoint
-
-
-def _log(T: Array) -> Array:
-    """Rotation vector and translation of a small motion, (6,)."""
-    return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
-
-
-def _exp(x: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix()
-    T[:3, 3] = x[3:]
-    return T

@@ -7,21 +7,24 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, label_calibration, labels, tiles
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.pictures import write_topview
+from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.run_folder import new_folder
-from gnss_sem_map.merging import merge_runs
+from gnss_sem_map.export.viewer import write_viewer
+from gnss_sem_map.merging import Laid, merge_runs
 from gnss_sem_map.refinement import refine
 from gnss_sem_map.voxel_map import SemanticMap
 
 
-def merge_run_folders(first: Path, second: Path, out: Path) -> dict[str, Any]:
+def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:
     """Write the merged run into `out`, refined with the settings of the first; returns the content of run.json.
 
-    Raises DataError for folders that hold no run, a run with itself, and maps that do not fit together.
+    The second is laid onto the first where the two `match`; pictures show the track of the first. Raises DataError for
+    folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
         if not (run / "run.json").is_file():
@@ -32,15 +35,17 @@ def merge_run_folders(first: Path, second: Path, out: Path) -> dict[str, Any]:
         )
     settings = config.load(first / "config.yaml")
     label_set = labels.label_set(settings.classes)
-    static, removed, frame = merge_runs(first, second, label_set)
+    merged = merge_runs(first, second, label_set, match)
     calibration = label_calibration.opened(settings.calibration, label_set)
-    refined, _ = refine(static, settings.refinement, removed, calibration=calibration)
-    raw = SemanticMap.of(static + removed)
+    refined, _ = refine(merged.stands, settings.refinement, merged.removed, calibration=calibration)
+    raw, frame = SemanticMap.of(merged.stands + merged.removed), merged.frame
+    driven = Trajectory.load(first / "trajectory.parquet")
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
         "local_frame": asdict(frame),
         "map": {"voxels": len(raw), "points": int(raw.voxels.hits.sum())},
+        "match": _about(merged.laid),
     }
     with new_folder(out) as folder:
         tiles.write(raw, folder / "map", frame)
@@ -48,7 +53,21 @@ def merge_run_folders(first: Path, second: Path, out: Path) -> dict[str, Any]:
         write_ply(refined, folder / "map.ply", frame)
         write_laz(refined, frame, folder / "map.laz")
         write_topview_geotiff(refined, frame, folder / "topview_class.tif")
-        write_topview(refined, folder / "topview.png", title=str(about["name"]))
+        write_topview(refined, folder / "topview.png", driven, title=str(about["name"]))
+        write_perspective(refined, folder / "perspective.png", driven)
+        write_viewer(refined, driven, folder / "viewer.html", title=str(about["name"]))
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         (folder / "run.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
     return about
+
+
+def _about(laid: Laid) -> dict[str, Any]:
+    """How the second map came to lie on the first, for run.json."""
+    found = laid.match
+    return {
+        "shift_m": None if found is None else round(found.shift_m, 3),
+        "turn_deg": None if found is None else round(found.turn_deg, 3),
+        "T_first_second": None if found is None else found.T_target_source.tolist(),
+        "reason": laid.reason,
+        "coinciding": dict(zip(("by_georeference", "now"), laid.coinciding, strict=True)),
+    }

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import tiles
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import label_set
-from gnss_sem_map.merging import into_frame, merge, merge_runs
+from gnss_sem_map.merging import into_frame, lay_onto, merge, merge_runs
 from gnss_sem_map.refinement import refine
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
 
@@ -61,8 +63,9 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
         assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
         tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
         tiles.write(refined, tmp_path / name / "refined", frame)
-    stands, removed, frame = merge_runs(tmp_path / "a", tmp_path / "b")
-    assert frame == HERE
+    runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
+    stands, removed = runs.stands, runs.removed
+    assert runs.frame == HERE
     assert stands.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
     assert URBAN.index("building") not in stands.labels
@@ -70,6 +73,85 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
     assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
         stands.places(removed.keys) < 0
     )
+
+
+def corner(seed: int, length_m: float = 60.0) -> NDArray[np.float64]:
+    """Points on a road between two facades, and on one across its end; other ones for every seed."""
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 0.01, (4, 20_000))
+    along = rng.uniform(0, length_m, (3, 20_000))
+    up, across = rng.uniform(0, 8, (3, 20_000)), rng.uniform(-8, 8, (2, 20_000))
+    return np.vstack(
+        [
+            np.column_stack([along[0], across[0], 0.1 + noise[0]]),
+            np.column_stack([along[1], -8.1 + noise[1], up[0]]),
+            np.column_stack([along[2], 8.1 + noise[2], up[1]]),
+            np.column_stack([length_m + 0.1 + noise[3], across[1], up[2]]),
+        ]
+    )
+
+
+def voxels_of(p_map: NDArray[np.float64], label: str = "building") -> VoxelMap:
+    table = VoxelTable(0.2, URBAN)
+    classes = np.ones((1, 6), np.uint8)
+    classes[0, URBAN.index(label)] = 250
+    table.add(keys_of(p_map, 0.2), np.zeros(len(p_map), np.int32), classes)
+    return table.to_map()
+
+
+OFF = np.eye(4)
+OFF[:3, :3] = Rotation.from_euler("zx", [0.3, 0.1], degrees=True).as_matrix()
+OFF[:3, 3] = 0.6, -0.4, 0.3
+
+
+def test_the_second_map_is_laid_onto_the_first() -> None:
+    """Two drives of one place, the second's positions off by 0.8 m: its surfaces come back to a few centimetres."""
+    there = (corner(1) - OFF[:3, 3]) @ OFF[:3, :3]  # OFF brings it back
+    first, second = voxels_of(corner(0)), voxels_of(there)
+    laid = lay_onto(first, second, HERE, HERE)
+    assert laid.match is not None, laid.reason
+    back = there @ laid.match.T_target_source[:3, :3].T + laid.match.T_target_source[:3, 3]
+    assert np.abs(back - corner(1)).max() < 0.05
+    assert laid.coinciding[1] > laid.coinciding[0] + 0.3
+    together = merge(first, second, HERE, HERE, laid.match.T_target_source)
+    assert len(together) < 0.75 * len(merge(first, second, HERE, HERE))
+    assert together.hits.sum() == first.hits.sum() + second.hits.sum()
+
+
+def test_a_street_without_an_end_is_not_moved_along_itself() -> None:
+    """Nothing tells how far along: there the georeference stays, across the street the facades decide."""
+    street = corner(0)[:60_000]  # without the facade across
+    middle = (street[:, 0] > 10) & (street[:, 0] < 50)  # its ends would tell
+    second = voxels_of(corner(1)[:60_000][middle] + np.array([0.5, 0.5, 0.2]))
+    laid = lay_onto(voxels_of(street), second, HERE, HERE)
+    assert laid.match is not None, laid.reason
+    np.testing.assert_allclose(laid.match.T_target_source[:3, :3], np.eye(3), atol=2e-3)
+    centre = np.append(second.centres.mean(axis=0), 1)
+    moved = laid.match.T_target_source @ centre - centre
+    assert abs(moved[0]) < 0.05
+    np.testing.assert_allclose(moved[1:3], [-0.5, -0.2], atol=0.05)
+
+
+def test_parked_cars_do_not_hold_a_map() -> None:
+    """Cars that were parked elsewhere the second time are not what it is laid onto."""
+    rng = np.random.default_rng(5)
+    cars = [rng.uniform([10 * k, 3, 0], [10 * k + 4, 5, 1.5], (4_000, 3)) for k in range(1, 5)]
+    first, second = (
+        voxels_of(corner(seed)) + voxels_of(np.vstack(cars) + np.array([shift, 0, 0]), "vehicle")
+        for seed, shift in ((0, 0.0), (1, 1.0))
+    )
+    laid = lay_onto(first, second, HERE, HERE)
+    assert laid.match is None or laid.match.shift_m < 0.02
+
+
+def test_maps_that_share_nothing_lie_by_their_georeference() -> None:
+    elsewhere = voxels_of(corner(1) + np.array([300, 0, 0]))
+    laid = lay_onto(voxels_of(corner(0)), elsewhere, HERE, HERE)
+    assert laid.match is None
+    assert "lie within" in laid.reason
+    assert laid.coinciding == (0.0, 0.0)
+    few = lay_onto(voxels_of(corner(0)[:100]), elsewhere, HERE, HERE)
+    assert "less than 300 voxels" in few.reason
 
 
 def test_maps_that_do_not_fit_together_are_refused() -> None:

@@ -69,7 +69,7 @@ def test_two_halves_of_a_drive_merge_into_the_whole(small_drive: Street, whole: 
     for name, frames in (("a", "0:6"), ("b", "6:12"), ("both", "0:12")):
         done = run(*run_of(small_drive, tmp_path / name, "--frames", frames, *off))
         assert done.returncode == 0, done.stderr
-    done = run("merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "merged", "--json")
+    done = run("merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "merged", "--no-match", "--json")
     assert done.returncode == 0, done.stderr
     both, merged = (tiles.read(tmp_path / name / "map").voxels for name in ("both", "merged"))
     for name in ("keys", "evidence", "hits"):

@@ -1,0 +1,108 @@
+"""What a registration by `small_gicp` is worth: which directions the scene holds, and which it leaves open."""
+
+from __future__ import annotations
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+# small_gicp takes every point for a small plane of variances (1e-3, 1, 1) m² along and across its normal. Two of
+# them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
+TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
+MAX_ITERATIONS = 30
+
+
+def has_converged(result: small_gicp.RegistrationResult) -> bool:
+    """Whether it ended at a minimum, or at its limit, not stuck before."""
+    return bool(result.converged or result.iterations < MAX_ITERATIONS - 1)
+
+
+def information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
+    """What the planes of the scene tell of the pose: (6, 6), source axes, and the weight of one point across its plane.
+
+    The registration's own Hessian also holds the weight that it gives along the planes. That is no knowledge of the
+    pose: the centre of a voxel's points lies anywhere on its wall. So it is taken off, for T p with
+    T Exp(r, t): J = [-R [p]x, R]. Residuals of another size than small_gicp presumes rescale the rest.
+    """
+    p = np.asarray(points.points())[:, :3]
+    along = np.zeros((6, 6))
+    along[:3, :3] = np.sum(p * p) * np.eye(3) - p.T @ p
+    along[:3, 3:] = cross_matrix(p.sum(axis=0))
+    along[3:, :3] = along[:3, 3:].T
+    along[3:, 3:] = len(p) * np.eye(3)
+    planes = result.H - TANGENTIAL_WEIGHT * result.num_inliers / len(p) * along
+    scale = result.num_inliers / max(2 * result.error, 1e-9)  # 1 / mean squared whitened residual
+    return scale * planes, scale * NORMAL_WEIGHT * result.num_inliers
+
+
+def close_open_directions(
+    guess: Array,
+    T: Array,
+    information: Array,
+    weight: float,
+    length_m: float,
+    degenerate_share: float,
+    degenerate_stddev_m: float,
+) -> tuple[Array, Array, bool]:
+    """Pose and covariance (6, 6) of a match, and whether any direction is open: along those the guess stays.
+
+    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length_m`, so that they
+    compare with translations. A direction is open when its information is below a share of `weight`, that of all
+    points across their planes; its standard deviation is then the given one.
+    """
+    scale = np.repeat([length_m, 1.0], 3)
+    eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
+    is_open = eigenvalues < degenerate_share * weight
+    variances = np.where(is_open, degenerate_stddev_m**2, 1 / np.where(is_open, 1.0, eigenvalues))
+    covariance = (axes * variances) @ axes.T / np.outer(scale, scale)
+    if is_open.any():
+        held = axes[:, ~is_open]
+        T = guess @ _exp(held @ (held.T @ (scale * _log(inverse(guess) @ T))) / scale)
+    return T, covariance, bool(is_open.any())
+
+
+def rigid(T: Array) -> Array:
+    """The nearest rigid transform: products of many drift off the rotations by rounding."""
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
+    result[:3, 3] = T[:3, 3]
+    return result
+
+
+def inverse(T: Array) -> Array:
+    """Of a transform (4, 4)."""
+    return np.asarray(np.linalg.inv(T), np.float64)
+
+
+def turn_deg(T: Array) -> float:
+    """Angle of the rotation of a transform (4, 4)."""
+    return float(np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude()))
+
+
+def adjoint(T: Array) -> Array:
+    """(6, 6) with T Exp(x) T⁻¹ = Exp(adjoint x), x = (rotation, translation)."""
+    R = T[:3, :3]
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[3:, :3] = cross_matrix(T[:3, 3]) @ R
+    return result
+
+
+def cross_matrix(v: Array) -> Array:
+    """(3, 3) with cross_matrix(v) @ w = v x w."""
+    return np.cross(v, np.eye(3)).T
+
+
+def _log(T: Array) -> Array:
+    """Rotation vector and translation of a small motion, (6,)."""
+    return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+
+
+def _exp(x: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix()
+    T[:3, 3] = x[3:]
+    return T

@@ -9,13 +9,8 @@ from gnss_sem_map import labels
 from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import EXTRAPOLATE_S
-from gnss_sem_map.refinement.moving_objects import (
-    THREADS,
-    MovingObjectDetector,
-    MovingObjects,
-    Observation,
-    observe,
-)
+from gnss_sem_map.refinement.moving_objects import MovingObjectDetector, MovingObjects, Observation, observe
+from gnss_sem_map.refinement.testimony import THREADS
 from gnss_sem_map.refinement.verdicts import TrackedObject
 from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
 
@@ -42,7 +37,7 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
         progress("motion", done, total)
     rest = detector.decide()
     progress("motion", total, total)
-    return MovingObjects(points | dict(rest.points), (*objects, *rest.objects))
+    return MovingObjects(points | dict(rest.points), (*objects, *rest.objects), detector.witnesses)
 
 
 def told(

@@ -29,7 +29,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import build_maps
 from gnss_sem_map.motion import find_moving
 from gnss_sem_map.refinement import RefinementReport, refine
-from gnss_sem_map.refinement.verdicts import TrackedObject
+from gnss_sem_map.refinement.moving_objects import MovingObjects
 from gnss_sem_map.remembering import RememberedSegmenter
 from gnss_sem_map.scan_matching import match_scans
 from gnss_sem_map.seen_scans import Drive
@@ -89,7 +89,7 @@ def run(
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
     with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
         whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
-        drive, tracked = _without_moving(whole, Path(folder), account, progress)
+        drive, found = _without_moving(whole, Path(folder), account, progress)
         with account.stage("mapping"):
             maps = build_maps(
                 drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -97,7 +97,10 @@ def run(
     with account.stage("refinement"):
         progress("refinement", 0, 1)
         calibration = label_calibration.opened(settings.calibration, maps.static.label_set)
-        refined, refinement = refine(maps.static, settings.refinement, maps.removed, tracked, calibration)
+        witnesses = found.witnesses if drive.matched else None
+        refined, refinement = refine(
+            maps.static, settings.refinement, maps.removed, found.objects, calibration, witnesses
+        )
         progress("refinement", 1, 1)
     raw = SemanticMap.of(maps.static + maps.removed)
     return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness)
@@ -113,11 +116,11 @@ def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Setting
 
 def _without_moving(
     drive: Drive, folder: Path, account: Account, progress: Progress
-) -> tuple[Drive, tuple[TrackedObject, ...]]:
+) -> tuple[Drive, MovingObjects]:
     """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
     log, settings = drive.log, drive.settings
     if settings.refinement.vehicles != "evidence":
-        return drive, ()
+        return drive, MovingObjects({}, ())
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
         label_set = labels.label_set(settings.classes)
@@ -126,7 +129,7 @@ def _without_moving(
     with account.stage("motion"):
         moving = find_moving(drive, progress)
     account.counts["points of moving objects"] += sum(map(len, moving.points.values()))
-    return replace(drive, moving=moving.points), moving.objects
+    return replace(drive, moving=moving.points), moving
 
 
 def _is_matched(log: SensorLog, account: Account) -> bool:

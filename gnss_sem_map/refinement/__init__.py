@@ -16,12 +16,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from gnss_sem_map.label_calibration import LabelCalibration
 from gnss_sem_map.labels import UNLABELLED, LabelSet
 from gnss_sem_map.refinement import count_grid, vehicles
+from gnss_sem_map.refinement.clearing import ClearingSettings, seen_through
 from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
 from gnss_sem_map.refinement.recapture import doubted, systematic_errors
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
+from gnss_sem_map.refinement.testimony import Witnesses
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
 from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
 from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
@@ -36,6 +38,7 @@ NAT_PER_LOOK = 1.3
 """Between a look that says nothing (1) and one that is sure (1.6 for five classes and a floor of 5 %)."""
 SWITCHED_OFF, LACKING = "switched off", "the class set lacks one of them"
 NO_ROAD = "the map has no road to stand on"
+NO_WITNESS = "no scans with poses held by scan matching"
 
 
 class RefinementSettings(BaseModel):
@@ -81,6 +84,10 @@ class RefinementSettings(BaseModel):
     smoothing: Literal["mean_field", "off"] = Field(
         default="mean_field", description="Neighbouring voxels as evidence for each other."
     )
+    clearing: Literal["evidence", "off"] = Field(
+        default="evidence",
+        description="Voxels that scan after scan looks through are what moved, where scan matching holds the poses.",
+    )
     heights: GeometrySettings = Field(
         default=GeometrySettings(), description="Numbers of the geometry rules."
     )
@@ -90,6 +97,7 @@ class RefinementSettings(BaseModel):
         default=SmoothingSettings(), description="Numbers of the smoothing."
     )
     motion: MotionSettings = Field(default=MotionSettings(), description="Numbers of the evidence of motion.")
+    emptiness: ClearingSettings = Field(default=ClearingSettings(), description="Numbers of the clearing.")
 
 
 @dataclass(frozen=True)
@@ -126,19 +134,22 @@ def refine(
     removed: VoxelMap | None = None,
     tracked: tuple[TrackedObject, ...] = (),
     calibration: LabelCalibration | None = None,
+    witnesses: Witnesses | None = None,
 ) -> tuple[SemanticMap, RefinementReport]:
     """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled.
 
     `removed` holds the points of moving objects that were kept out of `voxels`; they come back as a layer of REMOVED
     voxels wherever nothing else stands. `tracked` says why, for the report. A `calibration` brings where the classes
-    were found to stand, instead of rules, and its own temperature.
+    were found to stand, instead of rules, and its own temperature. `witnesses` are scans that say what is empty; None:
+    nobody knows, or poses are not sharp enough for it.
     """
     settings = settings or RefinementSettings()
     weighed = weigh(voxels, settings, calibration)
+    moving, cleared = _clear(voxels, weighed, settings, witnesses)
     scores, inferred, spread = _infer(voxels, weighed.scores, settings)
     temperature = settings.confidence_temperature if calibration is None else calibration.temperature
-    refined = _decide(voxels, scores, weighed.moving, inferred, temperature, weighed.systematic_errors)
-    steps = [*weighed.steps, spread]
+    refined = _decide(voxels, scores, moving, inferred, temperature, weighed.systematic_errors)
+    steps = [*weighed.steps, spread, cleared]
     if removed is not None:
         refined, layered = _with_layer(refined, removed)
         steps.append(layered)
@@ -314,6 +325,18 @@ def _infer(
     labels = _labels(voxels, scores)
     after = np.where(inferred, spread.argmax(axis=1), labels).astype(np.int8)
     return spread, inferred, Step(name, _changes(voxels.label_set, labels, after))
+
+
+def _clear(
+    voxels: VoxelMap, weighed: Weighed, settings: RefinementSettings, witnesses: Witnesses | None
+) -> tuple[NDArray[np.bool_], Step]:
+    """What moved (v,): as weighed, and what witnesses look through."""
+    name = "seen through"
+    if settings.clearing == "off" or witnesses is None:
+        return weighed.moving, Step(name, {}, SWITCHED_OFF if settings.clearing == "off" else NO_WITNESS)
+    empty = seen_through(voxels, witnesses, settings.emptiness, settings.motion)
+    labels = _labels(voxels, weighed.scores)
+    return weighed.moving | empty, Step(name, _changes(voxels.label_set, labels, labels, empty))
 
 
 def _decide(

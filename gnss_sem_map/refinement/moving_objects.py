@@ -7,7 +7,6 @@ to something that moved.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -20,6 +19,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement import range_images
 from gnss_sem_map.refinement.scan_grid import height_over_ground, near, reached, within
 from gnss_sem_map.refinement.segments import Segments, find_segments, take_apart
+from gnss_sem_map.refinement.testimony import THREADS, Witnesses, testify
 from gnss_sem_map.refinement.tracks import Segment
 from gnss_sem_map.refinement.verdicts import GONE, MotionSettings, TrackedObject, judge
 
@@ -28,12 +28,10 @@ FOOT_M, BODY_M = 0.05, 0.2
 FOOT_REACH_M = 0.2
 HIDING_M = 0.5
 """What is nearer by this hides the side of an object."""
-THREADS = min(os.cpu_count() or 1, 4)
-"""More would wait for the one that reads, each with two scans in memory."""
 WINDOWS_HELD = 3
 """Of scans that are not decided: with more, fewer are looked at twice, and more memory is taken."""
-PLACES_AT_ONCE = 1 << 14
-"""Places that one thread looks at before it takes the next."""
+WITNESS_M, WITNESS_S = 1.0, 1.0
+"""Of all scans those so far apart, in either, are kept to testify on the whole map: they take no more than it does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +41,8 @@ class MovingObjects:
     points: Mapping[int, NDArray[np.int64]]
     """Frame number -> places of those points among the points that were observed."""
     objects: tuple[TrackedObject, ...]
+    witnesses: Witnesses | None = None
+    """Scans from all along the drive; None: there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +73,14 @@ class MovingObjectDetector:
         self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
         """Range images and poses of settled scans, which still testify."""
         self._last_stamp = -np.inf
+        self._witnesses: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
+        self._witnessed: tuple[float, NDArray[np.float64]] | None = None
+        """When and where the last witness was."""
+
+    @property
+    def witnesses(self) -> Witnesses | None:
+        """Scans from all along the drive, WITNESS_M or WITNESS_S apart."""
+        return Witnesses.of(self._witnesses) if self._witnesses else None
 
     def add(self, seen: Observation) -> None:
         """Take in one scan; raises DataError when the stamps do not increase."""
@@ -83,6 +91,13 @@ class MovingObjectDetector:
             )
         self._last_stamp = seen.stamp
         self._observations.append(seen)
+        stood = np.asarray(np.linalg.inv(seen.T_lidar_map)[:3, 3], np.float64)
+        if self._witnessed is None or (
+            seen.stamp - self._witnessed[0] >= WITNESS_S
+            or np.linalg.norm(stood - self._witnessed[1]) >= WITNESS_M
+        ):
+            self._witnesses.append((seen.image, seen.T_lidar_map))
+            self._witnessed = seen.stamp, stood
 
     def settle(self) -> MovingObjects:
         """Decide about the scans that a whole window of later ones has testified on: mostly none, then many at once.
@@ -131,27 +146,14 @@ class MovingObjectDetector:
 
     def _testimony(self) -> list[NDArray[np.int32]]:
         """For each scan, how often every voxel of its segments was hit and seen through by other scans: (2, v)."""
-        settings, observations = self._settings, self._observations
+        observations = self._observations
         parts = [seen.segments.parts for seen in observations]
-        keys, place = distinct(np.concatenate([seen.segments.keys for seen in observations]))
+        _, place = distinct(np.concatenate([seen.segments.keys for seen in observations]))
         points = np.bincount(place, np.concatenate([part.points for part in parts]))
         sums = np.concatenate([part.sums for part in parts])
         centroids = np.stack([np.bincount(place, sums[:, axis]) / points for axis in range(3)], axis=1)
-        looks = np.zeros((2, len(keys)), np.int32)
-        witnesses = self._past + [(seen.image, seen.T_lidar_map) for seen in observations]
-        images, poses = zip(*witnesses, strict=True)
-        looking = np.stack(images), np.stack(poses)
-
-        def look(part: slice) -> None:
-            range_images.look_at(
-                centroids[part], *looking,
-                settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
-                *looks[:, part],
-            )  # fmt: skip
-
-        starts = range(0, len(keys), PLACES_AT_ONCE)
-        for _ in ahead(look, (slice(start, start + PLACES_AT_ONCE) for start in starts), THREADS):
-            pass
+        here = [(seen.image, seen.T_lidar_map) for seen in observations]
+        looks = testify(centroids, Witnesses.of(self._past + here), self._settings)
         looks[0] = np.maximum(looks[0] - 1, 0)  # less the scan that found it
         return np.split(looks[:, place], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
 

@@ -191,7 +191,7 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
 def _read_sweep(path: Path, start: float, end: float) -> Points:
     """A sweep with the stamp of every point, from its azimuth: rear, left, front, right, rear."""
     rows = frames.read_points(path)
-    azimuths = np.arctan2(rows[:, 1], rows[:, 0], dtype=np.float64)  # twice as fast as in float32
+    azimuths = np.arctan2(rows[:, 1], rows[:, 0], dtype=np.float64)
     stamps = azimuths * ((start - end) / (2 * np.pi))
     stamps += (start + end) / 2
     return Points(rows[:, :3], rows[:, 3], stamps)

@@ -29,6 +29,7 @@ from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.mapping import label_points
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement import RefinementReport
+from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
 from gnss_sem_map.sensor_log import SensorLog
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
@@ -217,6 +218,7 @@ def _about_map(result: Result) -> dict[str, Any]:
 
 
 def _about_refinement(report: RefinementReport) -> dict[str, Any]:
+    followed = [thing for thing in report.tracked if thing.points >= LEAST_TRACKED_POINTS]
     return {
         "steps": [
             {
@@ -239,8 +241,9 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
                 "last_stamp": thing.last_stamp,
                 "path": thing.path.round(2).tolist(),
             }
-            for thing in report.tracked
+            for thing in followed
         ],
+        "specks": len(report.tracked) - len(followed),
     }
 
 

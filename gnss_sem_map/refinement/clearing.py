@@ -34,7 +34,7 @@ class ClearingSettings(BaseModel):
         description="Farther scans do not testify, m: a voxel needs no outline, as objects do.",
     )
     over_m: tuple[float, float] = Field(
-        default=(0.6, 3.0), description="Only what stands over something, so far at least and at most, m."
+        default=(0.4, 3.0), description="Only what stands over something, so far at least and at most, m."
     )
 
 

@@ -25,7 +25,7 @@ from gnss_sem_map.simulation.drive import DATE
 PROBABILITIES = "probabilities"
 """Folder of the class probabilities, beside the drive."""
 LABELS = {
-    "network": "of the small network that was trained on simulated streets of other seeds (none of 0, 101 to 105); no use on real images",
+    "network": "of the small network trained on simulated streets (not of seeds 0, 101 to 105); no use on real images",
     "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
 }
 """Where the demo's class probabilities come from."""

@@ -171,7 +171,7 @@ class PointLabels:
     confidence: NDArray[np.float32]
     """(n,) probability of that class, 0 where nothing is known."""
     removed: NDArray[np.bool_]
-    """(n,) part of a moving vehicle."""
+    """(n,) part of something that moved."""
 
 
 def label_points(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import tiles
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import UNLABELLED, LabelSet
+from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.map_matching import MapMatch, NoMatch, match_maps
 from gnss_sem_map.voxel_kernels import EVIDENCE_LIMIT, HITS_LIMIT
 from gnss_sem_map.voxel_map import State, VoxelMap, keys_of
@@ -106,17 +106,14 @@ def lay_onto(
 
 def _stays(voxels: VoxelMap) -> NDArray[np.bool_]:
     names = voxels.label_set.names
-    vehicle = names.index(PARKED) if PARKED in names else UNLABELLED
-    return np.asarray((voxels.labels == UNLABELLED) | (voxels.labels != vehicle))
+    return np.asarray(voxels.labels != (names.index(PARKED) if PARKED in names else len(names)))
 
 
 def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
     """Share of the points (n, 3) that lie in a voxel of the map."""
-    return (
-        float((voxels.places(np.sort(keys_of(p_map, voxels.voxel_size_m))) >= 0).mean())
-        if len(p_map)
-        else 0.0
-    )
+    if not len(p_map):
+        return 0.0
+    return float((voxels.places(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
 
 
 def _known(frame: LocalFrame | None) -> LocalFrame:

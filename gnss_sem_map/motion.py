@@ -10,7 +10,7 @@ from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.deskew import EXTRAPOLATE_S
 from gnss_sem_map.refinement.moving_objects import MovingObjectDetector, MovingObjects, Observation, observe
-from gnss_sem_map.refinement.testimony import THREADS
+from gnss_sem_map.refinement.testimony import THREADS, AlongTheDrive
 from gnss_sem_map.refinement.verdicts import TrackedObject
 from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
 
@@ -24,6 +24,7 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     What no image shows is followed too, but is only said to have moved when it was seen to go elsewhere.
     """
     detector = MovingObjectDetector(drive.settings.refinement.motion, drive.matched)
+    along = AlongTheDrive()
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []
     total = len(drive.log.scans)
@@ -31,13 +32,14 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
         ahead(_observed, seen_scans(drive, keep_points=True), THREADS), 1
     ):
         detector.add(observation)
+        along.add(observation.stamp, observation.image, observation.T_lidar_map)
         settled = detector.settle()
         points.update(settled.points)
         objects += settled.objects
         progress("motion", done, total)
     rest = detector.decide()
     progress("motion", total, total)
-    return MovingObjects(points | dict(rest.points), (*objects, *rest.objects), detector.witnesses)
+    return MovingObjects(points | dict(rest.points), (*objects, *rest.objects), along.witnesses())
 
 
 def told(

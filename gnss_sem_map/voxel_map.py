@@ -58,7 +58,7 @@ class State(IntEnum):
     REFINED = 3
     """Refinement changed the label that the images gave."""
     REMOVED = 4
-    """Part of a moving vehicle: kept as a layer, not shown in the map."""
+    """Part of something that moved: kept as a layer, not shown in the map."""
 
 
 @dataclass(frozen=True, eq=False)

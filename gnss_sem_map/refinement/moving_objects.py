@@ -30,8 +30,6 @@ HIDING_M = 0.5
 """What is nearer by this hides the side of an object."""
 WINDOWS_HELD = 3
 """Of scans that are not decided: with more, fewer are looked at twice, and more memory is taken."""
-WITNESS_M, WITNESS_S = 1.0, 1.0
-"""Of all scans those so far apart, in either, are kept to testify on the whole map: they take no more than it does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +40,7 @@ class MovingObjects:
     """Frame number -> places of those points among the points that were observed."""
     objects: tuple[TrackedObject, ...]
     witnesses: Witnesses | None = None
-    """Scans from all along the drive; None: there are none."""
+    """Scans from all along the drive; None: nobody was asked to keep any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +71,6 @@ class MovingObjectDetector:
         self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
         """Range images and poses of settled scans, which still testify."""
         self._last_stamp = -np.inf
-        self._witnesses: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
-        self._witnessed: tuple[float, NDArray[np.float64]] | None = None
-        """When and where the last witness was."""
-
-    @property
-    def witnesses(self) -> Witnesses | None:
-        """Scans from all along the drive, WITNESS_M or WITNESS_S apart."""
-        return Witnesses.of(self._witnesses) if self._witnesses else None
 
     def add(self, seen: Observation) -> None:
         """Take in one scan; raises DataError when the stamps do not increase."""
@@ -91,13 +81,6 @@ class MovingObjectDetector:
             )
         self._last_stamp = seen.stamp
         self._observations.append(seen)
-        stood = np.asarray(np.linalg.inv(seen.T_lidar_map)[:3, 3], np.float64)
-        if self._witnessed is None or (
-            seen.stamp - self._witnessed[0] >= WITNESS_S
-            or np.linalg.norm(stood - self._witnessed[1]) >= WITNESS_M
-        ):
-            self._witnesses.append((seen.image, seen.T_lidar_map))
-            self._witnessed = seen.stamp, stood
 
     def settle(self) -> MovingObjects:
         """Decide about the scans that a whole window of later ones has testified on: mostly none, then many at once.

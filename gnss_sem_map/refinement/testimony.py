@@ -19,6 +19,8 @@ THREADS = min(os.cpu_count() or 1, 4)
 """More would wait for the one that reads, each with two scans in memory."""
 PLACES_AT_ONCE = 1 << 14
 """Places that one thread looks at before it takes the next."""
+APART_M, APART_S = 1.0, 1.0
+"""Of a whole drive those scans are kept that are so far apart, in either: they take no more memory than its map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,25 @@ class Witnesses:
         outside = np.maximum(places.min(axis=0) - stood, stood - places.max(axis=0)).max(axis=1)
         close = outside <= reach_m
         return self if close.all() else Witnesses(self.images[close], self.T_lidar_map[close])
+
+
+class AlongTheDrive:
+    """Collects witnesses from all along a drive, however long it stands and however fast it goes."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
+        self._stamp, self._stood = -np.inf, np.full(3, np.inf)
+
+    def add(self, stamp: float, image: NDArray[np.uint16], T_lidar_map: NDArray[np.float64]) -> None:
+        """Keep a scan that is APART_S or APART_M from the last one that was kept."""
+        stood = np.linalg.inv(T_lidar_map)[:3, 3]
+        if stamp - self._stamp >= APART_S or np.linalg.norm(stood - self._stood) >= APART_M:
+            self._kept.append((image, T_lidar_map))
+            self._stamp, self._stood = stamp, stood
+
+    def witnesses(self) -> Witnesses | None:
+        """All that were kept; None without a scan."""
+        return Witnesses.of(self._kept) if self._kept else None
 
 
 def testify(places: NDArray[np.float64], witnesses: Witnesses, settings: MotionSettings) -> NDArray[np.int32]:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.labels import label_set
 from gnss_sem_map.refinement import RefinementSettings, range_images, refine, testimony
 from gnss_sem_map.refinement.clearing import ClearingSettings, seen_through
-from gnss_sem_map.refinement.moving_objects import MovingObjectDetector, observe
-from gnss_sem_map.refinement.testimony import PLACES_AT_ONCE, Witnesses
+from gnss_sem_map.refinement.testimony import PLACES_AT_ONCE, AlongTheDrive, Witnesses
 from gnss_sem_map.refinement.verdicts import MotionSettings
 from gnss_sem_map.voxel_map import State, VoxelMap, VoxelTable, keys_of
 
@@ -118,12 +117,12 @@ def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
 
 def test_witnesses_are_a_metre_or_a_second_apart() -> None:
     """However long the drive stands or how fast it goes, they take no more memory than the map that they are for."""
-    nothing = np.zeros(0, np.bool_)
     stood = [0.0] * 20 + [0.5 * k for k in range(1, 11)]
-    detector = MovingObjectDetector()
-    assert detector.witnesses is None
+    along = AlongTheDrive()
+    assert along.witnesses() is None
     for k, x in enumerate(stood):
-        detector.add(observe(k, 0.1 * k, np.zeros((0, 3)), pose(x), nothing, nothing, MOTION))
-    assert detector.witnesses is not None
-    x = np.linalg.inv(detector.witnesses.T_lidar_map)[:, 0, 3]
+        along.add(0.1 * k, range_images.empty_image(), np.linalg.inv(pose(x)))
+    kept = along.witnesses()
+    assert kept is not None
+    x = np.linalg.inv(kept.T_lidar_map)[:, 0, 3]
     np.testing.assert_allclose(x, [0, 0, 0.5, 1.5, 2.5, 3.5, 4.5], atol=1e-9)

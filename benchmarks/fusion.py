@@ -30,7 +30,7 @@ from gnss_sem_map.io import open_drive
 from gnss_sem_map.io.calibrating import fit_temperature, measure
 from gnss_sem_map.io.point_labels import label_files, read_labels
 from gnss_sem_map.label_calibration import LabelCalibration
-from gnss_sem_map.mapping import label_points
+from gnss_sem_map.point_labels import label_points
 from gnss_sem_map.seen_scans import Drive, seen_scans
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-import os
 import pickle
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,18 +22,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels
 from gnss_sem_map.account import Account, Progress, silent
-from gnss_sem_map.ahead import ahead
 from gnss_sem_map.chunks import ChunkStore, open_store
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.seen_scans import Drive, look_at, map_points
+from gnss_sem_map.seen_scans import Drive, look_at
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
+from gnss_sem_map.voxel_map import VoxelMap, VoxelTable
 
 SCANS_PER_CHUNK = 100
 STATIC, REMOVED = "static", "removed"
@@ -160,75 +157,6 @@ def _table(settings: Settings) -> VoxelTable:
         None if calibration is None else calibration.log_likelihoods,
         settings.labelling.abstain,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class PointLabels:
-    """What a map says of every original point of one scan."""
-
-    labels: NDArray[np.int8]
-    """(n,) class index, -1 where nothing is known."""
-    confidence: NDArray[np.float32]
-    """(n,) probability of that class, 0 where nothing is known."""
-    removed: NDArray[np.bool_]
-    """(n,) part of something that moved."""
-
-
-def label_points(
-    log: SensorLog,
-    trajectory: Trajectory,
-    maps: Sequence[SemanticMap],
-    settings: Settings,
-    moving: Mapping[int, NDArray[np.int64]] | None = None,
-) -> Iterator[tuple[Scan, list[PointLabels]]]:
-    """For every usable scan, what each of the maps says of its original points.
-
-    `moving` (see `Drive`) are points that the last map, the refined one, has removed: vehicles, whatever stands there.
-    """
-    one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
-
-    def look(scan: Scan) -> list[PointLabels] | None:
-        try:
-            points = scan.read()
-            p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
-        except (DataError, MeasurementError):
-            return None  # counted when the map was built
-        keys = keys_of(p_map, settings.mapping.voxel_size_m)
-        places = [m.voxels.places(keys) for m in (maps[:1] if one_grid else maps)]
-        places *= len(maps) // len(places)
-        found = [
-            _look_up(semantic_map, place, valid) for semantic_map, place in zip(maps, places, strict=True)
-        ]
-        if moving is not None and scan.number in moving:
-            _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
-        return found
-
-    for scan, found in ahead(look, log.scans, threads=os.cpu_count() or 1):
-        if found is not None:
-            yield scan, found
-
-
-def _remove(found: PointLabels, places: NDArray[np.int64], semantic_map: SemanticMap) -> None:
-    names = semantic_map.voxels.label_set.names
-    if "vehicle" in names:
-        changed = places[found.labels[places] != names.index("vehicle")]
-        found.labels[changed], found.confidence[changed] = names.index("vehicle"), 0.5
-    found.removed[places] = True
-
-
-def _look_up(semantic_map: SemanticMap, places: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:
-    known = valid.copy()
-    known[valid] = places >= 0
-    places = places[places >= 0]
-    found = PointLabels(
-        labels=np.full(len(valid), labels.UNLABELLED, np.int8),
-        confidence=np.zeros(len(valid), np.float32),
-        removed=np.zeros(len(valid), np.bool_),
-    )
-    found.labels[known] = semantic_map.labels[places]
-    found.confidence[known] = semantic_map.confidence[places]
-    found.removed[known] = semantic_map.states[places] == State.REMOVED
-    return found
 
 
 def _warn(drive: Drive, account: Account) -> None:

@@ -26,8 +26,8 @@ from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.mapping import label_points
 from gnss_sem_map.pipeline import Result
+from gnss_sem_map.point_labels import label_points
 from gnss_sem_map.refinement import RefinementReport
 from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
 from gnss_sem_map.sensor_log import SensorLog

@@ -21,6 +21,7 @@ from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.kerbs import KerbSettings
 from gnss_sem_map.refinement.recapture import doubted, systematic_errors
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
 from gnss_sem_map.refinement.testimony import Witnesses
@@ -88,6 +89,10 @@ class RefinementSettings(BaseModel):
         default="evidence",
         description="Voxels that scan after scan looks through are what moved, where scan matching holds the poses.",
     )
+    kerbs: Literal["evidence", "off"] = Field(
+        default="evidence",
+        description="Points where road meets sidewalk, which are finer than voxels, go by their own place and height.",
+    )
     heights: GeometrySettings = Field(
         default=GeometrySettings(), description="Numbers of the geometry rules."
     )
@@ -98,6 +103,7 @@ class RefinementSettings(BaseModel):
     )
     motion: MotionSettings = Field(default=MotionSettings(), description="Numbers of the evidence of motion.")
     emptiness: ClearingSettings = Field(default=ClearingSettings(), description="Numbers of the clearing.")
+    levels: KerbSettings = Field(default=KerbSettings(), description="Numbers of the kerbs.")
 
 
 @dataclass(frozen=True)

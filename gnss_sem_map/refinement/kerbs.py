@@ -1,0 +1,192 @@
+"""Kerbs: a voxel where road meets sidewalk holds both, and every point in it says by place and height which it is.
+
+A voxel is wider than a kerb and higher than its step. Whatever the map calls it, some of its points are the other one;
+they stand on the right level all the same, and on the right side of where the map's two classes meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import expit
+
+from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.voxel_kernels import AXIS_BITS
+from gnss_sem_map.voxel_map import SemanticMap
+
+REACH = 3
+"""Levels of road and sidewalk are those within so many voxels to each side of a kerb."""
+SUREST = 0.98
+"""No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
+
+
+class KerbSettings(BaseModel):
+    """How the points of a kerb are told apart."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    height_stddev_m: float = Field(
+        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
+    )
+    face_begins: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="Share of the step, from the road up, where a point is as likely the kerb's face, so sidewalk.",
+    )
+    least_step_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="What is lower is no kerb: the voxel's class is all that is known there.",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Kerbs:
+    """The e voxels of a map where road and sidewalk meet at a step, in order."""
+
+    settings: KerbSettings
+    voxel_size_m: float
+    classes: tuple[int, int]
+    """Road and sidewalk."""
+    rows: NDArray[np.int32]
+    """(v,) place of every voxel of the map among the e, -1 where no kerb is."""
+    leaning: NDArray[np.float32]
+    """(e, 3, 3) probability of road minus that of sidewalk in the voxel and those beside it in x and y, 0 elsewhere."""
+    known: NDArray[np.bool_]
+    """(e, 3, 3) which of those are either of the two."""
+    levels: NDArray[np.float64]
+    """(2, e) m, height of the road and of the sidewalk here."""
+
+    def decide(
+        self, places: NDArray[np.int64], p_map: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int8], NDArray[np.float32]]:
+        """Which of the points (n, 3) m lie in a kerb (k,), the class of each (k,), and how probable that is (k,).
+
+        `places` (n,) are the points' voxels in the map, -1 for none. Two witnesses, independent of each other: log odds
+        of the place, bilinear between the centres of the voxels of one layer, and of the height, two normal
+        distributions around the levels.
+        """
+        rows = np.where(places >= 0, self.rows[places], -1)
+        inside = np.flatnonzero(rows >= 0)
+        rows, p_map = rows[inside], p_map[inside]
+        log_odds = self._of_place(rows, p_map) + self._of_height(rows, p_map[:, 2])
+        road, sidewalk = self.classes
+        chosen = np.where(log_odds >= 0, road, sidewalk).astype(np.int8)
+        return inside, chosen, np.asarray(expit(np.abs(log_odds)), np.float32)
+
+    def _of_place(self, rows: NDArray[np.int32], p_map: NDArray[np.float64]) -> NDArray[np.float64]:
+        from_centre = np.mod(p_map[:, :2] / self.voxel_size_m, 1) - 0.5
+        (x, y), (a, b) = np.where(from_centre < 0, 0, 2).T, np.abs(from_centre).T
+        corners = (
+            (1, 1, (1 - a) * (1 - b)), (x, 1, a * (1 - b)), (1, y, (1 - a) * b), (x, y, a * b)
+        )  # fmt: skip
+        leaning = sum(weight * self.leaning[rows, i, j] for i, j, weight in corners)
+        known = sum(weight * self.known[rows, i, j] for i, j, weight in corners)
+        return np.asarray(2 * np.arctanh(np.clip(leaning / known, -SUREST, SUREST)))
+
+    def _of_height(self, rows: NDArray[np.int32], z: NDArray[np.float64]) -> NDArray[np.float64]:
+        road, sidewalk = self.levels[:, rows]
+        step = sidewalk - road
+        turning = road + self.settings.face_begins * step
+        return np.asarray(step * (turning - z) / self.settings.height_stddev_m**2)
+
+
+def find_kerbs(
+    semantic_map: SemanticMap,
+    sweeps: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+    settings: KerbSettings,
+) -> Kerbs | None:
+    """Where road and sidewalk of a map meet at a step, and how high both lie; None where they never do.
+
+    `sweeps`: scans in the map, the voxel of every point (n,), -1 for none, and its height (n,) m. They are asked for
+    when there is a kerb, and need not be all: any part of the drive may only not be left out.
+    """
+    classes = _ways(semantic_map.voxels.label_set)
+    if classes is None:
+        return None
+    ways = np.where(semantic_map.shown & np.isin(semantic_map.labels, classes), semantic_map.labels, -1)
+    meeting = _meeting(semantic_map, ways, classes)
+    if len(meeting) == 0:
+        return None
+    road, sidewalk = _levels(semantic_map, meeting, ways, classes, sweeps)
+    is_step = sidewalk - road >= settings.least_step_m  # no, where one of them is not known
+    kerbs = meeting[is_step]
+    if len(kerbs) == 0:
+        return None
+    rows = np.full(len(ways), -1, np.int32)
+    rows[kerbs] = np.arange(len(kerbs))
+    beside = _around(semantic_map, kerbs, (1, 1, 0)).T.reshape(-1, 3, 3)
+    known = (beside >= 0) & (ways[beside] >= 0)
+    sure = 2 * semantic_map.confidence[beside] - 1
+    leaning = np.where(known, np.where(ways[beside] == classes[0], sure, -sure), np.float32(0))
+    levels = np.stack([road[is_step], sidewalk[is_step]])
+    return Kerbs(settings, semantic_map.voxels.voxel_size_m, classes, rows, leaning, known, levels)
+
+
+def _ways(label_set: LabelSet) -> tuple[int, int] | None:
+    names = label_set.names
+    return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
+
+
+def _meeting(
+    semantic_map: SemanticMap, ways: NDArray[np.integer], classes: tuple[int, int]
+) -> NDArray[np.int64]:
+    """Voxels (e,) of one class beside one of the other, in their own layer."""
+    found = np.zeros(len(ways), np.bool_)
+    for own, other in (classes, classes[::-1]):
+        candidates = np.flatnonzero(ways == own)
+        for beside in _neighbours(semantic_map, candidates, (1, 1, 0)):
+            found[candidates] |= (beside >= 0) & (ways[beside] == other)
+    return np.flatnonzero(found)
+
+
+def _around(
+    semantic_map: SemanticMap, voxels: NDArray[np.int64], reach: tuple[int, int, int]
+) -> NDArray[np.int64]:
+    """Places (o, k) of what lies around k voxels; see `_neighbours`."""
+    return np.stack(list(_neighbours(semantic_map, voxels, reach)))
+
+
+def _neighbours(
+    semantic_map: SemanticMap, voxels: NDArray[np.int64], reach: tuple[int, int, int]
+) -> Iterator[NDArray[np.int64]]:
+    """Places (k,) of k voxels' neighbours within `reach` voxels in x, y and z, x outermost; -1 for nothing there."""
+    keys = semantic_map.voxels.keys[voxels]
+    for x, y, z in product(*(range(-r, r + 1) for r in reach)):
+        yield semantic_map.voxels.places(keys + ((x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z))
+
+
+def _levels(
+    semantic_map: SemanticMap,
+    meeting: NDArray[np.int64],
+    ways: NDArray[np.integer],
+    classes: tuple[int, int],
+    sweeps: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+) -> list[NDArray[np.float64]]:
+    """Per class the mean height (e,) m of the voxels near where they meet, NaN where there is none."""
+    around = _around(semantic_map, meeting, (REACH, REACH, 1))
+    is_mixed = np.isin(around, meeting)  # what holds both is no measure of either
+    around[(around >= 0) & ((ways[around] < 0) | is_mixed)] = -1
+    measured = np.unique(around[around >= 0])
+    slots = np.full(len(ways) + 1, -1, np.int64)  # the place -1 finds the last
+    slots[measured] = np.arange(len(measured))
+    sums, counts = np.zeros(len(measured)), np.zeros(len(measured))
+    for places, z in sweeps:
+        mine = slots[places]
+        hit = mine >= 0
+        sums += np.bincount(mine[hit], z[hit], len(measured))
+        counts += np.bincount(mine[hit], minlength=len(measured))
+    heights = np.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan), np.nan)[slots[around]]
+    return [_mean_where(np.isfinite(heights) & (ways[around] == one), heights) for one in classes]
+
+
+def _mean_where(these: NDArray[np.bool_], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over the first axis of the values that count, NaN where none does."""
+    count = np.count_nonzero(these, axis=0)
+    return np.where(count > 0, np.where(these, values, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)

@@ -123,7 +123,7 @@ def find_kerbs(
     rows[kerbs] = np.arange(len(kerbs))
     beside = _around(semantic_map, kerbs, (1, 1, 0)).T.reshape(-1, 3, 3)
     known = (beside >= 0) & (ways[beside] >= 0)
-    sure = 2 * semantic_map.confidence[beside] - 1
+    sure = np.maximum(2 * semantic_map.confidence[beside] - 1, 0)  # unsure of one is not sure of the other
     leaning = np.where(known, np.where(ways[beside] == classes[0], sure, -sure), np.float32(0))
     levels = np.stack([road[is_step], sidewalk[is_step]])
     return Kerbs(settings, semantic_map.voxels.voxel_size_m, classes, rows, leaning, known, levels)

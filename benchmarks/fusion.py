@@ -119,7 +119,9 @@ def mapped(excerpt: Excerpt, drive: Drive, settings: Settings, only: Labels) -> 
     both: tuple[Labels, Labels] = ({}, {})
     sure: tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]] = ({}, {})
     maps = (result.raw, result.refined)
-    for scan, found in label_points(drive.log, result.trajectory, maps, settings, result.moving):
+    for scan, found in label_points(
+        drive.log, result.trajectory, maps, settings, result.moving, result.kerbs
+    ):
         names.append(scan.name)
         for stage, of_map in enumerate(found):
             both[stage][scan.name], sure[stage][scan.name] = IDS[of_map.labels], of_map.confidence

@@ -37,6 +37,7 @@ EQUATION_6: dict[str, dict[str, Any]] = {
         "count_exponent": 1.0,
         "geometry": "off",
         "smoothing": "off",
+        "levels": "off",
         "kerbs": "off",
         "systematic_errors": 0.0,
         "confidence_temperature": 1.0,

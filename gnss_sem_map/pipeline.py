@@ -4,7 +4,7 @@
                         bind it in turn
     motion              which points belong to something that moved
     for every scan      deskew into the map, label from its image, fuse into the voxels
-    refine              height, columns, vehicles, neighbours
+    refine              height, columns, vehicles, neighbours; levels of road and sidewalk
 
 Files are the business of `io` and `export`.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -28,7 +29,8 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import build_maps
 from gnss_sem_map.motion import find_moving
-from gnss_sem_map.refinement import RefinementReport, refine
+from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
+from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.refinement.moving_objects import MovingObjects
 from gnss_sem_map.remembering import RememberedSegmenter
 from gnss_sem_map.scan_matching import match_scans
@@ -37,6 +39,7 @@ from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sharpness import Sharpness, of_drive
+from gnss_sem_map.surface_heights import surface_heights
 from gnss_sem_map.voxel_map import SemanticMap
 
 MATCHED_SHARE = 0.95
@@ -58,6 +61,8 @@ class Result:
     """Frame number -> places of the points of moving objects among the scan's usable ones; None: not sought."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
     """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
+    kerbs: Kerbs | None = None
+    """Where points of the refined map must be told apart into road and sidewalk."""
 
 
 def run(
@@ -101,9 +106,13 @@ def run(
         refined, refinement = refine(
             maps.static, settings.refinement, maps.removed, found.objects, calibration, witnesses
         )
+        refined, kerbs, levels = tell_ways(
+            refined, settings.refinement, partial(surface_heights, log, trajectory, settings)
+        )
+        refinement = replace(refinement, steps=(*refinement.steps, levels))
         progress("refinement", 1, 1)
     raw = SemanticMap.of(maps.static + maps.removed)
-    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness)
+    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs)
 
 
 def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:

@@ -175,7 +175,9 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
     known_ids = result.raw.voxels.label_set.semantic_kitti_ids
     ids = np.append(known_ids, 0).astype("<u4")  # the label -1 finds the last
     maps = (result.raw, result.refined)
-    for scan, (raw, refined) in label_points(log, result.trajectory, maps, settings, result.moving):
+    for scan, (raw, refined) in label_points(
+        log, result.trajectory, maps, settings, result.moving, result.kerbs
+    ):
         ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
         ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
         refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{scan.name}.bin")

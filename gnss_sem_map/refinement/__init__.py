@@ -5,7 +5,7 @@ Every step turns log scores (v, c) into better ones, can be switched off, and re
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,16 +21,26 @@ from gnss_sem_map.refinement.count_grid import CountGridSettings
 from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.geometry import GeometrySettings, against
 from gnss_sem_map.refinement.ground import height_over_ground
-from gnss_sem_map.refinement.kerbs import KerbSettings
+from gnss_sem_map.refinement.kerbs import Kerbs, find_kerbs
+from gnss_sem_map.refinement.levels import StepSettings, tell_levels
 from gnss_sem_map.refinement.recapture import doubted, systematic_errors
 from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
 from gnss_sem_map.refinement.testimony import Witnesses
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
 from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
+from gnss_sem_map.refinement.ways import on_ways
 from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, entropy_of, softmax
 
-__all__ = ["RefinementReport", "RefinementSettings", "Step", "VehicleObject", "refine", "with_removed"]
+__all__ = [
+    "RefinementReport",
+    "RefinementSettings",
+    "Step",
+    "VehicleObject",
+    "refine",
+    "tell_ways",
+    "with_removed",
+]
 
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""
@@ -39,6 +49,7 @@ NAT_PER_LOOK = 1.3
 """Between a look that says nothing (1) and one that is sure (1.6 for five classes and a floor of 5 %)."""
 SWITCHED_OFF, LACKING = "switched off", "the class set lacks one of them"
 NO_ROAD = "the map has no road to stand on"
+NO_WAYS = "the map has no road, or no sidewalk"
 NO_WITNESS = "no scans with poses held by scan matching"
 
 
@@ -89,6 +100,10 @@ class RefinementSettings(BaseModel):
         default="evidence",
         description="Voxels that scan after scan looks through are what moved, where scan matching holds the poses.",
     )
+    levels: Literal["evidence", "off"] = Field(
+        default="evidence",
+        description="Height tells road from sidewalk where the two lie on clearly two levels.",
+    )
     kerbs: Literal["evidence", "off"] = Field(
         default="evidence",
         description="Points where road meets sidewalk, which are finer than voxels, go by their own place and height.",
@@ -103,7 +118,7 @@ class RefinementSettings(BaseModel):
     )
     motion: MotionSettings = Field(default=MotionSettings(), description="Numbers of the evidence of motion.")
     emptiness: ClearingSettings = Field(default=ClearingSettings(), description="Numbers of the clearing.")
-    levels: KerbSettings = Field(default=KerbSettings(), description="Numbers of the kerbs.")
+    step: StepSettings = Field(default=StepSettings(), description="Numbers of the levels and the kerbs.")
 
 
 @dataclass(frozen=True)
@@ -160,6 +175,29 @@ def refine(
         refined, layered = _with_layer(refined, removed)
         steps.append(layered)
     return refined, RefinementReport(tuple(steps), weighed.objects, tracked, weighed.systematic_errors)
+
+
+def tell_ways(
+    refined: SemanticMap,
+    settings: RefinementSettings,
+    measure: Callable[[SemanticMap, NDArray[np.bool_]], NDArray[np.float64]],
+) -> tuple[SemanticMap, Kerbs | None, Step]:
+    """Road and sidewalk told apart once more, by how high they lie: the voxels, and where points must be told apart.
+
+    `measure` is asked for the heights (v,) m of the map's surface in some of its voxels (v,), NaN where unknown.
+    """
+    name = "levels"
+    wanted = on_ways(refined)
+    if "evidence" not in (settings.levels, settings.kerbs) or not wanted.any():
+        return refined, None, Step(name, {}, SWITCHED_OFF if settings.levels == "off" else NO_WAYS)
+    heights = measure(refined, wanted)
+    step = Step(name, {}, SWITCHED_OFF)
+    if settings.levels == "evidence":
+        told = tell_levels(refined, heights, settings.step)
+        step = Step(name, _changes(told.voxels.label_set, refined.labels, told.labels))
+        refined = told
+    kerbs = find_kerbs(refined, heights, settings.step) if settings.kerbs == "evidence" else None
+    return refined, kerbs, step
 
 
 @dataclass(frozen=True, eq=False)

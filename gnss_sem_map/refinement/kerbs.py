@@ -6,17 +6,15 @@ they stand on the right level all the same, and on the right side of where the m
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import expit
 
-from gnss_sem_map.labels import LabelSet
-from gnss_sem_map.voxel_kernels import AXIS_BITS
+from gnss_sem_map.labels import UNLABELLED
+from gnss_sem_map.refinement.levels import StepSettings
+from gnss_sem_map.refinement.ways import ROAD, around, meeting, on_ways, ways
 from gnss_sem_map.voxel_map import SemanticMap
 
 REACH = 3
@@ -25,32 +23,11 @@ SUREST = 0.98
 """No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
 
 
-class KerbSettings(BaseModel):
-    """How the points of a kerb are told apart."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    height_stddev_m: float = Field(
-        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
-    )
-    face_begins: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="Share of the step, from the road up, where a point is as likely the kerb's face, so sidewalk.",
-    )
-    least_step_m: float = Field(
-        default=0.06,
-        gt=0,
-        description="What is lower is no kerb: the voxel's class is all that is known there.",
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Kerbs:
     """The e voxels of a map where road and sidewalk meet at a step, in order."""
 
-    settings: KerbSettings
+    settings: StepSettings
     voxel_size_m: float
     classes: tuple[int, int]
     """Road and sidewalk."""
@@ -94,96 +71,58 @@ class Kerbs:
         road, sidewalk = self.levels[:, rows]
         step = sidewalk - road
         turning = road + self.settings.face_begins * step
-        return np.asarray(step * (turning - z) / self.settings.height_stddev_m**2)
+        return np.asarray(step * (turning - z) / self.settings.point_stddev_m**2)
 
 
 def find_kerbs(
-    semantic_map: SemanticMap,
-    sweeps: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
-    settings: KerbSettings,
+    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: StepSettings
 ) -> Kerbs | None:
     """Where road and sidewalk of a map meet at a step, and how high both lie; None where they never do.
 
-    `sweeps`: scans in the map, the voxel of every point (n,), -1 for none, and its height (n,) m. They are asked for
-    when there is a kerb, and need not be all: any part of the drive may only not be left out.
+    `heights` (v,) m: of every voxel's surface, NaN where unknown.
     """
-    classes = _ways(semantic_map.voxels.label_set)
+    classes = ways(semantic_map.voxels.label_set)
     if classes is None:
         return None
-    ways = np.where(semantic_map.shown & np.isin(semantic_map.labels, classes), semantic_map.labels, -1)
-    meeting = _meeting(semantic_map, ways, classes)
-    if len(meeting) == 0:
+    labels = np.where(on_ways(semantic_map), semantic_map.labels, UNLABELLED)
+    edge = np.flatnonzero(meeting(semantic_map, labels, classes))
+    if len(edge) == 0:
         return None
-    road, sidewalk = _levels(semantic_map, meeting, ways, classes, sweeps)
-    is_step = sidewalk - road >= settings.least_step_m  # no, where one of them is not known
-    kerbs = meeting[is_step]
+    road, sidewalk = _levels(semantic_map, edge, labels, classes, heights)
+    is_step = sidewalk - road >= settings.least_m  # no, where one of them is not known
+    kerbs = edge[is_step]
     if len(kerbs) == 0:
         return None
-    rows = np.full(len(ways), -1, np.int32)
+    rows = np.full(len(labels), -1, np.int32)
     rows[kerbs] = np.arange(len(kerbs))
     beside = _around(semantic_map, kerbs, (1, 1, 0)).T.reshape(-1, 3, 3)
-    known = (beside >= 0) & (ways[beside] >= 0)
+    known = (beside >= 0) & (labels[beside] >= 0)
     sure = np.maximum(2 * semantic_map.confidence[beside] - 1, 0)  # unsure of one is not sure of the other
-    leaning = np.where(known, np.where(ways[beside] == classes[0], sure, -sure), np.float32(0))
+    leaning = np.where(known, np.where(labels[beside] == classes[ROAD], sure, -sure), np.float32(0))
     levels = np.stack([road[is_step], sidewalk[is_step]])
     return Kerbs(settings, semantic_map.voxels.voxel_size_m, classes, rows, leaning, known, levels)
-
-
-def _ways(label_set: LabelSet) -> tuple[int, int] | None:
-    names = label_set.names
-    return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
-
-
-def _meeting(
-    semantic_map: SemanticMap, ways: NDArray[np.integer], classes: tuple[int, int]
-) -> NDArray[np.int64]:
-    """Voxels (e,) of one class beside one of the other, in their own layer."""
-    found = np.zeros(len(ways), np.bool_)
-    for own, other in (classes, classes[::-1]):
-        candidates = np.flatnonzero(ways == own)
-        for beside in _neighbours(semantic_map, candidates, (1, 1, 0)):
-            found[candidates] |= (beside >= 0) & (ways[beside] == other)
-    return np.flatnonzero(found)
 
 
 def _around(
     semantic_map: SemanticMap, voxels: NDArray[np.int64], reach: tuple[int, int, int]
 ) -> NDArray[np.int64]:
-    """Places (o, k) of what lies around k voxels; see `_neighbours`."""
-    return np.stack(list(_neighbours(semantic_map, voxels, reach)))
-
-
-def _neighbours(
-    semantic_map: SemanticMap, voxels: NDArray[np.int64], reach: tuple[int, int, int]
-) -> Iterator[NDArray[np.int64]]:
-    """Places (k,) of k voxels' neighbours within `reach` voxels in x, y and z, x outermost; -1 for nothing there."""
-    keys = semantic_map.voxels.keys[voxels]
-    for x, y, z in product(*(range(-r, r + 1) for r in reach)):
-        yield semantic_map.voxels.places(keys + ((x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z))
+    """Places (o, k) of what lies around k voxels; see `around`."""
+    keys = semantic_map.voxels.keys
+    return np.stack(list(around(keys, keys[voxels], reach)))
 
 
 def _levels(
     semantic_map: SemanticMap,
-    meeting: NDArray[np.int64],
-    ways: NDArray[np.integer],
+    edge: NDArray[np.int64],
+    labels: NDArray[np.integer],
     classes: tuple[int, int],
-    sweeps: Iterable[tuple[NDArray[np.int64], NDArray[np.float64]]],
+    heights: NDArray[np.float64],
 ) -> list[NDArray[np.float64]]:
-    """Per class the mean height (e,) m of the voxels near where they meet, NaN where there is none."""
-    around = _around(semantic_map, meeting, (REACH, REACH, 1))
-    is_mixed = np.isin(around, meeting)  # what holds both is no measure of either
-    around[(around >= 0) & ((ways[around] < 0) | is_mixed)] = -1
-    measured = np.unique(around[around >= 0])
-    slots = np.full(len(ways) + 1, -1, np.int64)  # the place -1 finds the last
-    slots[measured] = np.arange(len(measured))
-    sums, counts = np.zeros(len(measured)), np.zeros(len(measured))
-    for places, z in sweeps:
-        mine = slots[places]
-        hit = mine >= 0
-        sums += np.bincount(mine[hit], z[hit], len(measured))
-        counts += np.bincount(mine[hit], minlength=len(measured))
-    heights = np.append(np.where(counts > 0, sums / np.maximum(counts, 1), np.nan), np.nan)[slots[around]]
-    return [_mean_where(np.isfinite(heights) & (ways[around] == one), heights) for one in classes]
+    """Per class the mean height (e,) m of the voxels near the edge between them, NaN where there is none."""
+    nearby = _around(semantic_map, edge, (REACH, REACH, 1))
+    is_mixed = np.isin(nearby, edge)  # what holds both is no measure of either
+    known = (nearby >= 0) & ~is_mixed & np.isfinite(heights[nearby])
+    return [_mean_where(known & (labels[nearby] == one), heights[nearby]) for one in classes]
 
 
 def _mean_where(these: NDArray[np.bool_], values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +17,8 @@ from gnss_sem_map.evaluation import Tables, confusion
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.io.point_labels import read_labels
 from gnss_sem_map.point_labels import PointLabels, label_points
-from gnss_sem_map.refinement.kerbs import Kerbs, KerbSettings, find_kerbs
+from gnss_sem_map.refinement.kerbs import Kerbs, find_kerbs
+from gnss_sem_map.refinement.levels import StepSettings
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, keys_of
@@ -40,11 +40,12 @@ class Scene:
     def places(self) -> NDArray[np.int64]:
         return self.semantic_map.voxels.places(keys_of(self.p_map, SIZE_M))
 
-    def sweeps(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        yield self.places, self.p_map[:, 2]
+    @property
+    def heights(self) -> NDArray[np.float64]:
+        return np.bincount(self.places, self.p_map[:, 2]) / np.bincount(self.places)
 
-    def kerbs(self, settings: KerbSettings | None = None) -> Kerbs:
-        found = find_kerbs(self.semantic_map, self.sweeps(), settings or KerbSettings())
+    def kerbs(self, settings: StepSettings | None = None) -> Kerbs:
+        found = find_kerbs(self.semantic_map, self.heights, settings or StepSettings())
         assert found is not None
         return found
 
@@ -88,31 +89,25 @@ def test_points_of_a_kerb_are_told_apart_better_than_any_labels_of_voxels_could(
 
 def test_a_line_on_level_ground_is_no_kerb_and_the_voxels_stand() -> None:
     flat = scene(step_m=0.0)
-    assert find_kerbs(flat.semantic_map, flat.sweeps(), KerbSettings()) is None
+    assert find_kerbs(flat.semantic_map, flat.heights, StepSettings()) is None
     sunk = scene(step_m=-0.12)  # a sidewalk below the road is none that these heights know
-    assert find_kerbs(sunk.semantic_map, sunk.sweeps(), KerbSettings()) is None
+    assert find_kerbs(sunk.semantic_map, sunk.heights, StepSettings()) is None
 
 
-def test_where_no_two_meet_no_scan_is_asked_for() -> None:
+def test_where_no_two_meet_there_is_no_kerb() -> None:
     street = scene()
-
-    def never() -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        raise AssertionError("scans were read for nothing")
-        yield
-
     one = np.full_like(street.semantic_map.labels, ROAD)
-    assert find_kerbs(replace(street.semantic_map, labels=one), never(), KerbSettings()) is None
     removed = np.full_like(street.semantic_map.states, State.REMOVED)
-    assert find_kerbs(replace(street.semantic_map, states=removed), never(), KerbSettings()) is None
     beside_a_wall = np.where(street.semantic_map.labels == SIDEWALK, BUILDING, ROAD).astype(np.int8)
-    assert find_kerbs(replace(street.semantic_map, labels=beside_a_wall), never(), KerbSettings()) is None
+    for other in ({"labels": one}, {"states": removed}, {"labels": beside_a_wall}):
+        assert find_kerbs(replace(street.semantic_map, **other), street.heights, StepSettings()) is None
 
 
 def test_the_odds_are_those_of_scipy() -> None:
     """Place: a bilinear interpolation of probabilities between voxel centres; height: two normal distributions."""
     low, confidence, stddev = 0.04, 0.9, 0.08
     street = scene(low_m=low, confidence=confidence, heading=0.0)
-    settings = KerbSettings(height_stddev_m=stddev, face_begins=0.5)
+    settings = StepSettings(point_stddev_m=stddev, face_begins=0.5)
     inside, chosen, probability = street.kerbs(settings).decide(street.places, street.p_map)
     x, y = (np.arange(n) * SIZE_M for n in (50, 20))
     grid = np.where(street.semantic_map.labels.reshape(50, 20) == ROAD, confidence, 1 - confidence)
@@ -156,25 +151,18 @@ def told(street: Path) -> Told:
         f"labels:{street / 'truth' / 'train_ids'}", URBAN, expected_size=log.calibration.image_size
     )
     result = pipeline.run(log, segmenter, config.Settings())
-    settings = {
-        "on": config.Settings(),
-        "off": config.load(overrides=["refinement.kerbs=off"]),
-        "paper": config.load(overrides=["fusion=paper"]),
-    }
     maps = (result.raw, result.refined)
-    return {
-        name: {
-            scan.name: both for scan, both in label_points(log, result.trajectory, maps, one, result.moving)
-        }
-        for name, one in settings.items()
+    found = {
+        "on": label_points(log, result.trajectory, maps, config.Settings(), result.moving, result.kerbs),
+        "off": label_points(log, result.trajectory, maps, config.Settings(), result.moving),
     }
+    return {name: {scan.name: both for scan, both in scans} for name, scans in found.items()}
 
 
 def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(told: Told) -> None:
     for name, on in told["on"].items():
-        off, paper = told["off"][name], told["paper"][name]
+        off = told["off"][name]
         np.testing.assert_array_equal(on[0].labels, off[0].labels)
-        np.testing.assert_array_equal(off[1].labels, paper[1].labels)
         np.testing.assert_array_equal(on[1].removed, off[1].removed)
         differ = on[1].labels != off[1].labels
         assert np.isin(on[1].labels[differ], (ROAD, SIDEWALK)).all()

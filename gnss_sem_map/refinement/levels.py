@@ -1,0 +1,192 @@
+"""Levels: road and sidewalk lie on two planes a step apart, and the height of a voxel's surface says on which it lies.
+
+Where a network takes the gaps between cars on a sidewalk for road, it does so in every image, and neighbours only
+confirm each other. Height is a witness of its own. Around every place the ground is fitted by two parallel planes, with
+every voxel on each as far as its class is probable, and its class in turn by how near it lies to each: expectation
+maximisation (Dempster, Laird, Rubin 1977). Where there are not clearly two planes, height says nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import entr, expit, logit
+
+from gnss_sem_map.labels import UNLABELLED
+from gnss_sem_map.refinement.ways import ROAD, SIDEWALK, around, meeting, on_ways, ways
+from gnss_sem_map.voxel_map import SemanticMap, State, keys_of
+
+CELL_M = 2.0
+REACH = (3, 3, 1)
+"""Cells to each side that make the surroundings of a place: seven metres, which a street's crown does not bend much."""
+FEWEST = 20
+"""Voxels of each class that a plane needs."""
+ROUNDS = 6
+CLEARLY_TWO = 2.0
+"""Least distance of two normal distributions, in standard deviations, that are seen to be two (Ashman et al. 1994)."""
+SUREST = 0.98
+"""No image is surer of road against sidewalk: height must have its say."""
+X, Y, ON_SIDEWALK, Z = 1, 2, 3, 4
+"""Of the terms of a fit; the first is one."""
+
+
+class StepSettings(BaseModel):
+    """How high the step from road to sidewalk is, and how sharply it is measured."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    least_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="What is lower is no step: the images are all that is known there.",
+    )
+    face_begins: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="Share of the step, from the road up, where what lies there is as likely the kerb's face, so"
+        " sidewalk.",
+    )
+    voxel_stddev_m: float = Field(
+        default=0.03,
+        gt=0,
+        description="Surfaces of voxels lie at least so far over or under the plane that they belong to, m.",
+    )
+    point_stddev_m: float = Field(
+        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
+    )
+
+
+def tell_levels(
+    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: StepSettings
+) -> SemanticMap:
+    """The map with road and sidewalk told apart by height as well, where the two lie on clearly two levels.
+
+    `heights` (v,) m: of every voxel's surface, NaN where unknown. Nothing else changes.
+    """
+    classes = ways(semantic_map.voxels.label_set)
+    voxels = np.flatnonzero(on_ways(semantic_map) & np.isfinite(heights))
+    if classes is None or len(voxels) == 0:
+        return semantic_map
+    labels, confidence = semantic_map.labels[voxels], semantic_map.confidence[voxels]
+    sure = logit(np.clip(confidence, 0.5, SUREST).astype(np.float64))
+    images = np.where(labels == classes[SIDEWALK], sure, -sure)
+    ground = _Ground.of(semantic_map.voxels.centres[voxels], heights[voxels])
+    planes = _fit(ground, expit(images))
+    for _ in range(ROUNDS):
+        planes = _fit(ground, expit(images + _log_odds(planes, ground, settings)))
+    of_height = _log_odds(planes, ground, settings)
+    log_odds = images + of_height
+    told = np.where(log_odds > 0, classes[SIDEWALK], classes[ROAD])
+    clear = _are_two(planes, settings)[ground.cell] & (of_height != 0)
+    clear &= ~_hold_both(semantic_map, voxels, told, classes)
+    return _decided(semantic_map, voxels[clear], told[clear], log_odds[clear])
+
+
+def _hold_both(
+    semantic_map: SemanticMap, voxels: NDArray[np.int64], told: NDArray[np.int64], classes: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Which of the voxels (g,) stand where the two meet, by the images and by what is told as well.
+
+    A kerb goes through those, and they lie on neither level; their points are told apart, see `kerbs`.
+    """
+    before = np.where(semantic_map.shown, semantic_map.labels, UNLABELLED)
+    after = before.copy()
+    after[voxels] = told
+    still = meeting(semantic_map, before, classes) & meeting(semantic_map, after, classes)
+    return np.asarray(still[voxels])
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """Surfaces of g voxels, and the k cells that they lie in."""
+
+    p: NDArray[np.float64]
+    """(g, 3) m."""
+    cell: NDArray[np.int64]
+    """(g,) the cell of each."""
+    surroundings: list[NDArray[np.int64]]
+    """Per offset the cell (k,) that lies there, -1 for none."""
+
+    @classmethod
+    def of(cls, centres: NDArray[np.float64], heights: NDArray[np.float64]) -> _Ground:
+        p = np.column_stack([centres[:, :2], heights])
+        cells, cell = np.unique(keys_of(p, CELL_M), return_inverse=True)
+        return cls(p - p.mean(axis=0), cell, list(around(cells, cells, REACH)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Planes:
+    """z = z0 + a x + b y on the road, a step higher on the sidewalk, around each of k cells."""
+
+    z0: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    """(k, 3) along x and y, and the step, m."""
+    variance: NDArray[np.float64]
+    """(k,) m²; of what lies on either plane; infinite where there are too few voxels for two."""
+
+
+def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
+    """Least squares around every cell, each voxel (g,) on the sidewalk as far as it is probable."""
+    x, y, z = ground.p.T
+    terms = np.stack([np.ones_like(x), x, y, on_sidewalk, z])
+    rows, columns = np.triu_indices(len(terms))
+    products = terms[rows] * terms[columns]
+    products[(rows == ON_SIDEWALK) & (columns == ON_SIDEWALK)] = (
+        on_sidewalk  # a class is 0 or 1: E[s²] = E[s]
+    )
+    cells = len(ground.surroundings[0])
+    own = np.stack([np.bincount(ground.cell, one, cells + 1) for one in products], axis=1)  # -1 finds zeros
+    sums = np.empty((cells, len(terms), len(terms)))
+    sums[:, rows, columns] = sums[:, columns, rows] = sum(own[there] for there in ground.surroundings)
+    count = sums[:, 0, 0]
+    scatter = sums - sums[:, :, :1] * sums[:, :1, :] / count[:, None, None]
+    of_terms, with_z = scatter[:, 1:Z, 1:Z], scatter[:, 1:Z, Z]
+    slopes = np.linalg.solve(of_terms + 1e-6 * np.eye(Z - 1), with_z[..., None])[..., 0]
+    z0 = (sums[:, 0, Z] - (slopes * sums[:, 0, 1:Z]).sum(axis=1)) / count
+    left_over = scatter[:, Z, Z] - (slopes * with_z).sum(axis=1)
+    fewer = np.minimum(sums[:, 0, ON_SIDEWALK], count - sums[:, 0, ON_SIDEWALK])
+    variance = np.where(fewer >= FEWEST, left_over / np.maximum(count - len(terms) + 1, 1), np.inf)
+    return _Planes(z0, np.asarray(slopes), variance)
+
+
+def _are_two(planes: _Planes, settings: StepSettings) -> NDArray[np.bool_]:
+    """Around which cells (k,) the planes are clearly two."""
+    step, stddev = planes.slopes[:, 2], np.sqrt(_variance(planes, settings))
+    return (step >= settings.least_m) & (step >= CLEARLY_TWO * stddev)
+
+
+def _log_odds(planes: _Planes, ground: _Ground, settings: StepSettings) -> NDArray[np.float64]:
+    """What height says for the sidewalk (g,): the planes are two normal distributions; 0 where it is silent."""
+    of_road = planes.z0[ground.cell] + (planes.slopes[ground.cell, :2] * ground.p[:, :2]).sum(axis=1)
+    step = np.maximum(planes.slopes[ground.cell, 2], settings.least_m)  # no lower one is believed in
+    up = (ground.p[:, 2] - of_road) / step  # 0 on the road, 1 on the sidewalk
+    odds = step**2 * (up - settings.face_begins) / _variance(planes, settings)[ground.cell]
+    return np.where((up > -1) & (up < 2), odds, 0.0)  # what lies a whole step off both is neither
+
+
+def _variance(planes: _Planes, settings: StepSettings) -> NDArray[np.float64]:
+    return np.maximum(planes.variance, settings.voxel_stddev_m**2)
+
+
+def _decided(
+    semantic_map: SemanticMap,
+    voxels: NDArray[np.int64],
+    labels: NDArray[np.int64],
+    log_odds: NDArray[np.float64],
+) -> SemanticMap:
+    """The map with these labels in these voxels, as sure as they are."""
+    probability = expit(np.abs(log_odds)).astype(np.float32)
+    after, states = semantic_map.labels.copy(), semantic_map.states.copy()
+    differ = voxels[labels != after[voxels]]
+    states[differ] = np.where(states[differ] == State.OBSERVED, State.REFINED, states[differ])
+    confidence = semantic_map.confidence.copy()
+    after[voxels], confidence[voxels] = labels, probability
+    entropy = semantic_map.entropy
+    if entropy is not None:
+        entropy = entropy.copy()
+        entropy[voxels] = entr(probability) + entr(1 - probability)
+    return replace(semantic_map, labels=after, confidence=confidence, states=states, entropy=entropy)

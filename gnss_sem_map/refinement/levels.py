@@ -133,13 +133,16 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
     """Least squares around every cell, each voxel (g,) on the sidewalk as far as it is probable."""
     x, y, z = ground.p.T
     terms = np.stack([np.ones_like(x), x, y, on_sidewalk, z])
-    rows, columns = np.triu_indices(len(terms))
-    products = terms[rows] * terms[columns]
-    products[(rows == ON_SIDEWALK) & (columns == ON_SIDEWALK)] = (
-        on_sidewalk  # a class is 0 or 1: E[s²] = E[s]
-    )
     cells = len(ground.surroundings[0])
-    own = np.stack([np.bincount(ground.cell, one, cells + 1) for one in products], axis=1)  # -1 finds zeros
+
+    def moment(a: np.intp, b: np.intp) -> NDArray[np.float64]:
+        one = on_sidewalk if a == b == ON_SIDEWALK else terms[a] * terms[b]  # a class is 0 or 1: E[s²] = E[s]
+        return np.asarray(
+            np.bincount(ground.cell, one, cells + 1), np.float64
+        )  # -1 finds the last, which is zero
+
+    rows, columns = np.triu_indices(len(terms))
+    own = np.stack([moment(a, b) for a, b in zip(rows, columns, strict=True)], axis=1)
     sums = np.empty((cells, len(terms), len(terms)))
     sums[:, rows, columns] = sums[:, columns, rows] = sum(own[there] for there in ground.surroundings)
     count = sums[:, 0, 0]
@@ -181,8 +184,8 @@ def _decided(
     """The map with these labels in these voxels, as sure as they are."""
     probability = expit(np.abs(log_odds)).astype(np.float32)
     after, states = semantic_map.labels.copy(), semantic_map.states.copy()
-    differ = voxels[labels != after[voxels]]
-    states[differ] = np.where(states[differ] == State.OBSERVED, State.REFINED, states[differ])
+    refined = np.where(labels == semantic_map.voxels.labels[voxels], State.OBSERVED, State.REFINED)
+    states[voxels] = np.where(states[voxels] == State.INFERRED, State.INFERRED, refined)
     confidence = semantic_map.confidence.copy()
     after[voxels], confidence[voxels] = labels, probability
     entropy = semantic_map.entropy

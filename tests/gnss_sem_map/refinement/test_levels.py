@@ -41,6 +41,7 @@ def mapped(
     """The map of these points, the height of its surfaces, and the place of every point in it."""
     keys, first, place = np.unique(keys_of(p, SIZE_M), return_index=True, return_inverse=True)
     evidence = np.full((len(keys), len(URBAN.names)), -1000, np.int32)
+    evidence[np.arange(len(keys)), called[first]] = -100
     voxels = VoxelMap(SIZE_M, URBAN, keys, evidence, np.ones(len(keys), np.uint32))
     states = np.full(len(keys), State.OBSERVED, np.uint8)
     sure = np.full(len(keys), confidence, np.float32)
@@ -172,6 +173,22 @@ def test_what_lies_a_whole_step_off_both_levels_stays_what_it_was() -> None:
     after = tell_levels(before, heights, StepSettings())
     np.testing.assert_array_equal(after.labels[place[ramp]], before.labels[place[ramp]])
     np.testing.assert_array_equal(after.confidence[place[ramp]], before.confidence[place[ramp]])
+
+
+def test_states_say_where_a_label_comes_from() -> None:
+    p, truth = street()
+    of_images, heights, place = mapped(p, truth)
+    wrong = with_mistakes(p, truth)
+    called = of_images.labels.copy()
+    called[place] = wrong
+    states = np.where(called == of_images.labels, State.OBSERVED, State.REFINED).astype(np.uint8)
+    after = tell_levels(replace(of_images, labels=called, states=states), heights, StepSettings())
+    differ = after.labels != called
+    assert differ.sum() > 250
+    expected = np.where(after.labels == of_images.labels, State.OBSERVED, State.REFINED)
+    np.testing.assert_array_equal(after.states, expected)
+    inferred = replace(of_images, labels=called, states=np.full_like(states, State.INFERRED))
+    assert (tell_levels(inferred, heights, StepSettings()).states == State.INFERRED).all()
 
 
 @pytest.mark.parametrize(

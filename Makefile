@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 
-.PHONY: test test-slow check demo notebooks clean
+.PHONY: test test-slow test-faults check demo notebooks clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -20,7 +20,7 @@ $(TOOLS): $(PACKAGE)
 	touch $@
 
 test: $(TOOLS)
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow and not faults'
 
 notebooks: $(TOOLS)
 	$(BIN)/pytest --nbmake --nbmake-timeout=600 examples
@@ -30,6 +30,9 @@ demo: $(PACKAGE)
 
 test-slow: $(TOOLS)
 	$(BIN)/pytest -m slow
+
+test-faults: $(TOOLS)
+	$(BIN)/pytest tests/faults
 
 check: $(TOOLS)
 	$(BIN)/ruff format --check .

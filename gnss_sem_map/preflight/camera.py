@@ -1,0 +1,13 @@
+"""The camera: calibration, size, and depth edges against image edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gnss_sem_map.preflight.findings import Finding
+from gnss_sem_map.preflight.sample import Sample
+
+
+def check(sample: Sample) -> Iterator[Finding]:
+    """Nothing is checked yet."""
+    yield from ()

@@ -1,0 +1,93 @@
+"""What the pre-flight says: one finding per check, each green, amber or red, with the probable mistake and its remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+from gnss_sem_map.errors import DataError
+
+
+class Level(StrEnum):
+    """How bad a finding is: green fits, amber is in doubt, red makes a wrong map."""
+
+    GREEN = "green"
+    AMBER = "amber"
+    RED = "red"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check; `mistake` and `remedy` are empty where it is green."""
+
+    check: str
+    """What was looked at, in a few words: "IMU axes"."""
+    level: Level
+    evidence: str
+    """What was found and what was expected, with figures and units."""
+    mistake: str = ""
+    """The probable mistake: "z points down: FRD axes"."""
+    remedy: str = ""
+    """The line that mends it: "set imu_axes: frd"."""
+
+    def __str__(self) -> str:
+        parts = (f"{self.check}: {self.evidence}", self.mistake, self.remedy)
+        return "; ".join(part for part in parts if part)
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """All findings of a drive, in the order of the checks."""
+
+    findings: tuple[Finding, ...]
+    seconds: float
+
+    @property
+    def level(self) -> Level:
+        """The worst of the findings; green when there is none."""
+        found = {finding.level for finding in self.findings}
+        return next((level for level in (Level.RED, Level.AMBER) if level in found), Level.GREEN)
+
+    def of(self, level: Level) -> tuple[Finding, ...]:
+        """The findings of one level."""
+        return tuple(finding for finding in self.findings if finding.level is level)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The page as run.json holds it."""
+        return {
+            "level": str(self.level),
+            "seconds": round(self.seconds, 3),
+            "findings": [asdict(finding) for finding in self.findings],
+        }
+
+
+class PreflightError(DataError):
+    """The pre-flight found what makes a wrong map; `page` holds all findings."""
+
+    def __init__(self, name: str, page: Preflight) -> None:
+        red = page.of(Level.RED)
+        more = f" (and {len(red) - 1} more, see `gnss-sem-map check`)" if len(red) > 1 else ""
+        super().__init__(f"{name}: the pre-flight is red: {red[0]}{more}; mend it, or run with --force")
+        self.page = page
+
+
+def green(check: str, evidence: str) -> Finding:
+    """A check that fits."""
+    return Finding(check, Level.GREEN, evidence)
+
+
+def amber(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
+    """A check that leaves doubt."""
+    return Finding(check, Level.AMBER, evidence, mistake, remedy)
+
+
+def red(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
+    """A check that says that the map would be wrong."""
+    return Finding(check, Level.RED, evidence, mistake, remedy)
+
+
+def page_of(findings: Iterable[Finding], seconds: float) -> Preflight:
+    """The findings as one page."""
+    return Preflight(tuple(findings), seconds)

@@ -1,0 +1,13 @@
+"""LiDAR sweeps: stamps, deskewing, and the motion that they see against the trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gnss_sem_map.preflight.findings import Finding
+from gnss_sem_map.preflight.sample import Sample
+
+
+def check(sample: Sample) -> Iterator[Finding]:
+    """Nothing is checked yet."""
+    yield from ()

@@ -1,0 +1,27 @@
+"""The fault campaign counts its trials; the summary says how many there were of each kind, and what went wrong."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import pytest
+
+TRIALS: Counter[str] = Counter()
+
+
+@pytest.fixture
+def trial() -> Callable[..., None]:
+    """Count one trial of a kind, and fail with all its faults when it has some: `trial("rights", faults, outcome)`."""
+
+    def count(kind: str, faults: list[str] | None = None, about: object = "") -> None:
+        TRIALS[kind] += 1
+        assert not faults, f"{kind}: {'; '.join(faults or [])}\n{about}"
+
+    return count
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if TRIALS:
+        kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(TRIALS.items()))
+        terminalreporter.write_line(f"fault campaign: {sum(TRIALS.values())} trials ({kinds})")

@@ -1,0 +1,131 @@
+"""A command in a process of its own, watched: its exit code, its output, its time, its memory, and what it left behind.
+
+Processes are forked from a server that has imported the package already, so that a trial costs no start of Python.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+
+PRELOAD = [
+    "gnss_sem_map.cli",
+    "gnss_sem_map.pipeline",
+    "gnss_sem_map.export.run_folder",
+    "gnss_sem_map.io.kitti_raw",
+    "gnss_sem_map.io.semantic_kitti",
+    "gnss_sem_map.io.table_log",
+    "gnss_sem_map.segmentation.cached",
+]
+TIMEOUT_S = 120.0
+OUR_CODES = {0, 1, 2, 130, 143}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended."""
+
+    arguments: tuple[str, ...]
+    code: int | None
+    """None: it did not end in time, and was killed; negative: the signal that ended it."""
+    out: str
+    err: str
+    seconds: float
+    peak_mb: float
+    left: tuple[str, ...]
+    """What it left in its TMPDIR."""
+
+    @property
+    def faults(self) -> list[str]:
+        """What no command may ever do, whatever its input: empty for an honest end."""
+        found = []
+        if self.code is None:
+            found.append(f"hang: not done after {self.seconds:.0f} s")
+        elif self.code not in OUR_CODES:
+            found.append(f"exit code {self.code}")
+        if "Traceback" in self.err or "Traceback" in self.out:
+            found.append("traceback")
+        lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
+        if self.code in (1, 2) and len(lines) != 1:
+            found.append(f"{len(lines)} lines on stderr, expected 1")
+        if self.left:
+            found.append(f"left in TMPDIR: {self.left}")
+        return found
+
+    def __str__(self) -> str:
+        return (
+            f"{' '.join(self.arguments)}\n  code {self.code} after {self.seconds:.1f} s\n  {self.err[-1500:]}"
+        )
+
+
+def gnss_sem_map(
+    *arguments: str | Path,
+    folder: Path,
+    timeout_s: float = TIMEOUT_S,
+    memory_mb: int | None = None,
+    cwd: Path | None = None,
+) -> Outcome:
+    """Run a command; `folder` is where its output and its TMPDIR go, a new one for each trial.
+
+    `memory_mb` limits its address space.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / "tmp"
+    temporary.mkdir(exist_ok=True)
+    words = tuple(map(str, arguments))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOAD)
+    start = time.perf_counter()
+    process = context.Process(target=_child, args=(words, folder, temporary, memory_mb, cwd))
+    process.start()
+    process.join(timeout_s)
+    code = process.exitcode
+    if code is None:
+        os.killpg(process.pid or 0, signal.SIGKILL)
+        process.join()
+    peak = folder / "peak"
+    return Outcome(
+        words,
+        code,
+        (folder / "out").read_text(errors="replace"),
+        (folder / "err").read_text(errors="replace"),
+        time.perf_counter() - start,
+        float(peak.read_text()) if peak.exists() else 0.0,
+        tuple(sorted(path.name for path in temporary.iterdir())),
+    )
+
+
+def _child(
+    arguments: tuple[str, ...], folder: Path, temporary: Path, memory_mb: int | None, cwd: Path | None
+) -> None:
+    os.setsid()
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)
+    os.environ["TMPDIR"] = str(temporary)
+    if cwd is not None:
+        os.chdir(cwd)
+    if memory_mb is not None:
+        resource.setrlimit(resource.RLIMIT_AS, (memory_mb << 20, memory_mb << 20))
+    sys.argv = ["gnss-sem-map", *arguments]
+    code: int | str | None = 0
+    try:
+        from gnss_sem_map.cli import main
+
+        main()
+    except SystemExit as end:
+        code = end.code
+    except BaseException:  # noqa: BLE001 (whatever escapes is what is looked for)
+        traceback.print_exc()
+        code = 99
+    finally:
+        sys.stdout.flush()
+        (folder / "peak").write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+    os._exit(code if isinstance(code, int) else 1 if code else 0)

@@ -33,7 +33,7 @@ Z_BITS = 14
 Z_OFFSET = 1 << (Z_BITS - 1)
 FORMAT = 2
 HITS_REMOVED = "hits_removed"
-"""Column of maps in which something moved through voxels that stand: how many of their hits are of points that moved."""
+"""Column of maps in which something moved through voxels that stand."""
 Tile = tuple[int, int]
 NAME = re.compile(r"(-?\d+)_(-?\d+)\.parquet")
 

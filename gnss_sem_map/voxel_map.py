@@ -139,7 +139,9 @@ class VoxelMap:
         evidence[places] -= part.evidence
         hits[places] -= part.hits
         if evidence[hits == 0].any():
-            raise DataError("cannot take one map out of another that has other evidence; were both of one run?")
+            raise DataError(
+                "cannot take one map out of another that has other evidence; were both of one run?"
+            )
         return replace(self, evidence=evidence, hits=hits)[hits > 0]
 
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:

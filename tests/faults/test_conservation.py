@@ -341,7 +341,7 @@ def conserve(clean: dict[str, Clean], layout: str, seed: int, trial: Callable[..
 def test_nothing_is_lost_on_random_damage(
     layout: str, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:
-    for seed in range(5):
+    for seed in range(4):
         conserve(clean, layout, seed, trial, tmp_path)
 
 
@@ -350,7 +350,7 @@ def test_nothing_is_lost_on_random_damage(
 def test_nothing_is_lost_on_much_random_damage(
     layout: str, clean: dict[str, Clean], trial: Callable[..., None], tmp_path: Path
 ) -> None:
-    for seed in range(5, 47):
+    for seed in range(4, 47):
         conserve(clean, layout, seed, trial, tmp_path)
 
 

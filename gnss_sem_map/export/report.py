@@ -68,6 +68,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _facts(run),
         _picture(folder, "perspective.png"),
         _warnings(run.get("warnings", ())),
+        _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
         _section(
@@ -87,9 +88,27 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _section("Files", _files(folder)),
         _section("Versions", _pairs(run.get("versions", {}))),
     ]
+    write_page(folder / "report.html", title, sections)
+
+
+def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
+    """The findings of a pre-flight as a table, each row coloured by its level."""
+    rows = "".join(
+        f'<tr class="{escape(found["level"])}">{_cell(found["level"])}{_cell(found["check"])}{_cell(found["evidence"])}'
+        f"{_cell(found['mistake'])}{_cell(found['remedy'])}</tr>"
+        for found in findings
+    )
+    titles = "".join(
+        f"<th>{title}</th>" for title in ("", "check", "found", "probable mistake", "what to do")
+    )
+    return f'<div class="scroll"><table><tr>{titles}</tr>{rows}</table></div>' if rows else ""
+
+
+def write_page(path: Path, title: str, sections: Iterable[str]) -> None:
+    """Write one self-contained page of HTML sections; raises DataError when the file cannot be written."""
     template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
     page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    with replacing(folder / "report.html") as file:
+    with replacing(path) as file:
         file.write(page.encode("utf-8"))
 
 

@@ -28,6 +28,7 @@ from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.point_labels import label_points
+from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.refinement import RefinementReport
 from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
 from gnss_sem_map.sensor_log import SensorLog
@@ -87,6 +88,7 @@ def write_run(
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, result.account) | {
             "inputs": {"drive": str(drive.resolve()), "segmenter": _absolute(segmenter)},
+            "preflight": result.preflight.as_dict(),
             "trajectory": _about_solution(result.solution),
             "map": _about_map(result),
         }
@@ -127,12 +129,16 @@ def write_trajectory_run(
     solution: Solution | None,
     account: Account,
     settings: Settings,
+    page: Preflight,
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with new_folder(out) as folder:
         _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        about = about_run(drive, log, account) | {"trajectory": _about_solution(solution)}
+        about = about_run(drive, log, account) | {
+            "preflight": page.as_dict(),
+            "trajectory": _about_solution(solution),
+        }
         _write_json(folder / "run.json", about)
     return about
 

@@ -42,7 +42,7 @@ from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sharpness import Sharpness, of_drive
 from gnss_sem_map.surface_heights import surface_heights
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 MATCHED_SHARE = 0.95
 """With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
@@ -118,6 +118,8 @@ def run(
         )
         refinement = replace(refinement, steps=(*refinement.steps, levels))
         progress("refinement", 1, 1)
+    if (refined.states == State.REMOVED).all():
+        account.warnings.append("everything was taken for moving: what is drawn is what was removed")
     raw = SemanticMap.of(maps.static + maps.removed)
     return Result(
         trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs, page

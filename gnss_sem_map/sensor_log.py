@@ -137,6 +137,8 @@ class Skip:
     what: str
     where: str
     reason: str
+    frames: int = 1
+    """How many frames, rows or files it stands for."""
 
 
 @dataclass(frozen=True, eq=False)

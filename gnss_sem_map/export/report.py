@@ -53,6 +53,8 @@ WORDS = {
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260
+MANY_SKIPS = 200
+"""The page lists this many; run.json lists all."""
 
 
 def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
@@ -163,11 +165,11 @@ def _skips(skips: Mapping[str, Any]) -> str:
     listed = skips.get("listed", ())
     if not listed:
         return ""
-    table = _table(
-        ("what", "where", "why"), [(skip["what"], skip["where"], skip["reason"]) for skip in listed]
+    rows = [(skip["what"], skip["where"], skip["reason"]) for skip in listed[:MANY_SKIPS]]
+    more = skips.get("count", len(listed)) - len(rows)
+    return _table(("what", "where", "why"), rows) + (
+        f"<p>and {more:,} more, which run.json lists</p>" if more > 0 else ""
     )
-    more = skips.get("count", len(listed)) - len(listed)
-    return table + (f"<p>and {more:,} more</p>" if more > 0 else "")
 
 
 def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
@@ -192,7 +194,7 @@ def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
         strict = scores.get("strict", {}).get("mean_iou")
         remarks[f"evaluated points that the {stage} map labels"] = _percent(scores.get("coverage"))
         remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = _percent(strict)
-    known = {key: about_map[key] for key in ("voxels", "points") if key in about_map}
+    known = {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map}
     return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(remarks)
 
 

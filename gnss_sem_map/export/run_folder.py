@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -34,8 +35,6 @@ from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
 from gnss_sem_map.sensor_log import SensorLog
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
-MANY_SKIPS = 200
-"""run.json lists this many skips; it always says how many there were."""
 
 
 @contextmanager
@@ -192,7 +191,10 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
 
 def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
     """What went in, what was left out and why, and what it cost."""
-    skips = sorted({(s.what, s.where, s.reason) for s in account.skips})
+    skips = sorted(set(account.skips), key=astuple)
+    frames: Counter[str] = Counter()
+    for skip in skips:
+        frames[skip.what] += skip.frames
     return {
         "versions": {name: _version(name) for name in PACKAGES},
         "drive": drive.name,
@@ -203,9 +205,8 @@ def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
         "warnings": account.warnings,
         "skips": {
             "count": len(skips),
-            "listed": [
-                dict(zip(("what", "where", "reason"), skip, strict=True)) for skip in skips[:MANY_SKIPS]
-            ],
+            "frames": dict(sorted(frames.items())),
+            "listed": [asdict(skip) for skip in skips],
         },
         "seconds": {name: round(value, 3) for name, value in account.seconds.items()},
         "peak_memory_mb": {name: round(value) for name, value in account.peak_memory_mb.items()},
@@ -217,6 +218,7 @@ def _about_map(result: Result) -> dict[str, Any]:
     return {
         "voxels": len(result.raw),
         "points": int(result.raw.voxels.hits.sum()),
+        "points_removed": int(result.refined.removed_hits.sum()),
         "labelled": {
             stage: {name: int(np.count_nonzero(m.labels[m.shown] == i)) for i, name in enumerate(names)}
             for stage, m in (("raw", result.raw), ("refined", result.refined))

@@ -3,20 +3,45 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.sensor_log import Skip
 
 
 def numbered(folder: Path, suffix: str) -> dict[int, Path]:
     """The files of a folder by the frame number in their name, in order; empty when there is no such folder."""
     if not folder.is_dir():
         return {}
-    found = {int(path.stem): path for path in folder.glob(f"*{suffix}") if path.stem.isdecimal()}
+    found: dict[int, Path] = {}
+    for path in sorted(folder.glob(f"*{suffix}")):
+        if path.stem.isdecimal():
+            found.setdefault(int(path.stem), path)  # `repeated` names the others
     return dict(sorted(found.items()))
+
+
+def repeated(folder: Path, suffix: str, what: str, kept: dict[int, Path]) -> list[Skip]:
+    """Files whose frame has another file already: `5.bin` beside `0000000005.bin`."""
+    return [
+        Skip(what, str(path), f"frame {int(path.stem)} has another file, {kept[int(path.stem)].name}")
+        for path in sorted(folder.glob(f"*{suffix}"))
+        if path.stem.isdecimal() and kept.get(int(path.stem), path) != path
+    ]
+
+
+def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path]) -> list[Skip]:
+    """One skip for every run of known frames without a file."""
+    absent = sorted(set(known) - set(files))
+    breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
+    runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
+    return [
+        Skip(what, f"{folder}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing", len(run))
+        for run in runs
+    ]
 
 
 def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:

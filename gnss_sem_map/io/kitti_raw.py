@@ -123,10 +123,10 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 
 def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows of the navigation unit, sorted, without repeats; and what was left out."""
-    files = frames.numbered(drive / "oxts" / "data", ".txt")
-    stamps = _stamps_ns(drive / "oxts" / "timestamps.txt")
+    folder = drive / "oxts"
+    files, stamps = frames.numbered(folder / "data", ".txt"), _stamps_ns(folder / "timestamps.txt")
     rows: dict[int, Array] = {}
-    skips = []
+    skips = _left_out("oxts", folder, ".txt", stamps, files)
     for number, path in files.items():
         try:
             row = np.array(path.read_text("utf-8").split(), np.float64)
@@ -173,9 +173,9 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     folder = drive / "velodyne_points"
     files = frames.numbered(folder / "data", ".bin")
     if not files:
-        return (), []
+        return (), _all_missing("scan", folder)
     middle, start, end = (_stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end"))
-    scans, skips = [], _missing("scan", folder, middle, files)
+    scans, skips = [], _left_out("scan", folder, ".bin", middle, files)
     for number, path in files.items():
         if number not in middle or number not in start or number not in end:
             skips.append(Skip("scan", str(path), "no stamp for this frame"))
@@ -201,9 +201,9 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
     folder = drive / "image_02"
     files = frames.numbered(folder / "data", ".png")
     if not files:
-        return (), []
+        return (), _all_missing("image", folder)
     stamps = _stamps_ns(folder / "timestamps.txt")
-    images, skips = [], _missing("image", folder, stamps, files)
+    images, skips = [], _left_out("image", folder, ".png", stamps, files)
     for number, path in files.items():
         if number in stamps:
             stamp = (stamps[number] - epoch_ns) * 1e-9
@@ -213,14 +213,20 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
     return _in_order(images, skips)
 
 
-def _missing(what: str, folder: Path, stamps: dict[int, int], files: dict[int, Path]) -> list[Skip]:
-    """One skip for every run of stamped frames without a file."""
-    absent = sorted(set(stamps) - set(files))
-    breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
-    runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
+def _left_out(
+    what: str, folder: Path, suffix: str, stamps: dict[int, int], files: dict[int, Path]
+) -> list[Skip]:
+    """Frames with a stamp and no file, and files of a frame that has another one."""
     return [
-        Skip(what, f"{folder}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing") for run in runs
+        *frames.missing(what, folder, stamps, files),
+        *frames.repeated(folder / "data", suffix, what, files),
     ]
+
+
+def _all_missing(what: str, folder: Path) -> list[Skip]:
+    """The frames of a sensor that has no file at all, if it has stamps."""
+    stamps = folder / "timestamps.txt"
+    return frames.missing(what, folder, _stamps_ns(stamps), {}) if stamps.is_file() else []
 
 
 def _in_order(items: list[T], skips: list[Skip]) -> tuple[tuple[T, ...], list[Skip]]:

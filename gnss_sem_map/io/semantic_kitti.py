@@ -40,10 +40,8 @@ def read(sequence: Path) -> SensorLog:
         T_imu_lidar=np.eye(4), T_camera_lidar=T_camera_camera0 @ Tr, K=K, image_size=size
     )
     skips = [
-        Skip("scan" if path.suffix == ".bin" else "image", str(path), "no pose for this frame")
-        for files in (scan_files, image_files)
-        for number, path in files.items()
-        if number >= len(poses)
+        *_left_out("scan", sequence / "velodyne", ".bin", len(poses), scan_files),
+        *_left_out("image", sequence / "image_2", ".png", len(poses), image_files),
     ]
     return SensorLog(
         name=f"sequence {sequence.name}",
@@ -62,6 +60,16 @@ def read(sequence: Path) -> SensorLog:
         given=Trajectory(times, _lidar_poses(poses, Tr)),
         skips=tuple(skips),
     )
+
+
+def _left_out(what: str, folder: Path, suffix: str, poses: int, files: dict[int, Path]) -> list[Skip]:
+    """Frames with a pose and no file, files without a pose, and files of a frame that has another one."""
+    beyond = [path for number, path in files.items() if number >= poses]
+    return [
+        *(frames.missing(what, folder, range(poses), files) if folder.is_dir() else ()),
+        *(Skip(what, str(path), "no pose for this frame") for path in beyond),
+        *frames.repeated(folder, suffix, what, files),
+    ]
 
 
 def _lidar_poses(poses: Array, Tr: Array) -> Array:

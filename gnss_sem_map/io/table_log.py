@@ -156,28 +156,41 @@ def _origin(gnss_rows: Array, path: Path) -> LocalFrame:
     )
 
 
-def _stamped(folder: Path, suffix: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
+def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
+    """Stamp of every frame, the first where there are several; and the lines that were left out."""
+    stamps: dict[int, float] = {}
+    skips = []
+    for line, (number, stamp) in enumerate(_table(path, ("number", "stamp_s")), 2):
+        if not np.isfinite((number, stamp)).all():
+            skips.append(Skip(what, f"{path}: line {line}", "no number, or no stamp"))
+        elif int(number) in stamps:
+            skips.append(Skip(what, f"{path}: line {line}", f"frame {int(number)} has a stamp already"))
+        else:
+            stamps[int(number)] = float(stamp)
+    return stamps, skips
+
+
+def _stamped(folder: Path, suffix: str, what: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has both, sorted by stamp; and what was left out."""
     files = frames.numbered(folder, suffix)
-    if not files:
+    if not files and not (folder / "stamps.csv").is_file():
         return [], []
-    rows = _table(folder / "stamps.csv", ("number", "stamp_s"))
-    stamps = {int(number): float(stamp) for number, stamp in rows if np.isfinite((number, stamp)).all()}
-    skips = [
-        Skip(suffix, str(path), "no stamp for this frame") for n, path in files.items() if n not in stamps
+    stamps, skips = _stamps(folder / "stamps.csv", what)
+    skips += [
+        Skip(what, str(path), "no stamp for this frame") for n, path in files.items() if n not in stamps
     ]
-    skips += [Skip(suffix, f"{folder}: frame {n}", "file missing") for n in stamps if n not in files]
+    skips += frames.missing(what, folder, stamps, files) + frames.repeated(folder, suffix, what, files)
     found: list[tuple[int, float, Path]] = []
     for number in sorted(set(files) & set(stamps), key=lambda n: (stamps[n], n)):
         if found and stamps[number] == found[-1][1]:
-            skips.append(Skip(suffix, f"frame {number}", "repeated stamp"))
+            skips.append(Skip(what, f"frame {number}", "repeated stamp"))
         else:
             found.append((number, stamps[number], files[number]))
     return found, skips
 
 
 def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:
-    found, skips = _stamped(folder, ".bin")
+    found, skips = _stamped(folder, ".bin", "scan")
     return tuple(
         Scan(path.stem, n, t, partial(_read_scan, path, t, is_compensated)) for n, t, path in found
     ), skips
@@ -192,5 +205,5 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool) -> Points:
 
 
 def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
-    found, skips = _stamped(folder, ".png")
+    found, skips = _stamped(folder, ".png", "image")
     return tuple(Image(n, t, partial(frames.read_image, path, size)) for n, t, path in found), skips

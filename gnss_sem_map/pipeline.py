@@ -88,6 +88,7 @@ def run(
     pre-flight is red. Raises PreflightError, DataError when not one scan can be used, MeasurementError and
     EstimationError from the smoother.
     """
+    log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
     _refuse_early(log, segmenter, settings)
     page = check_drive(log, segmenter, settings, account, force)
@@ -187,6 +188,7 @@ def solve(
     """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given."""
     if log.given is not None:
         return ()
+    log = log.in_our_conventions(settings.sensors)
     imu, gnss, frame = log.imu, log.gnss, log.frame
     if imu is None or gnss is None or frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")

@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.ownership import amend
 
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
@@ -89,8 +89,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
     ]
     template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
     page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    with replacing(folder / "report.html") as file:
-        file.write(page.encode("utf-8"))
+    amend(folder, "report.html", page.encode("utf-8", "backslashreplace"))
 
 
 def _section(title: str, *parts: str) -> str:

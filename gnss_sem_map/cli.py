@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
@@ -11,9 +14,9 @@ import typer
 
 from gnss_sem_map.console import (
     print_cache,
-    print_camera_check,
     print_merged,
     print_metrics,
+    print_preflight,
     print_run,
     progress_bars,
     warn,
@@ -57,6 +60,7 @@ Segmenter = Annotated[
     ),
 ]
 Device = Annotated[str, typer.Option(help="Where a network runs: auto, cpu, cuda.")]
+Force = Annotated[bool, typer.Option("--force", help="Go on where the pre-flight (see `check`) is red.")]
 Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 
 
@@ -73,39 +77,39 @@ def run(
     workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
     resume: Annotated[bool, typer.Option(help="Go on with what an interrupted run of this mapped.")] = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
-    import shutil
-
     from gnss_sem_map import labels, pipeline
     from gnss_sem_map.export import run_folder
+    from gnss_sem_map.output import refuse_inputs
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
-    run_folder.check_replaceable(out)
     settings = _settings(config, set_)
-    log = _open(drive, drive_format, frames)
-    network = None
-    if segmenter is None and log.images:
-        typer.echo(no_segmenter_message(str(drive)), err=True)
-        raise typer.Exit(1)
-    if segmenter not in (None, "none"):
-        label_set = labels.label_set(settings.classes)
-        network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
-    work = out.with_name(f".{out.name}.work")
-    with progress_bars() as progress:
-        result = pipeline.run(
-            log,
-            network,
-            settings,
-            progress,
-            work=work,
-            resume=resume,
-            workers=workers,
-            labels_from=str(segmenter),
-        )
-        about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
-    shutil.rmtree(work, ignore_errors=True)
+    with run_folder.claimed_run(out, _inputs(drive, config, settings, segmenter), resume) as claim:
+        log = _open(drive, drive_format, frames)
+        refuse_inputs(claim.out, sorted(log.folders))
+        network = None
+        if segmenter is None and log.images:
+            typer.echo(no_segmenter_message(str(drive)), err=True)
+            raise typer.Exit(1)
+        if segmenter not in (None, "none"):
+            label_set = labels.label_set(settings.classes)
+            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
+        with progress_bars() as progress:
+            result = pipeline.run(
+                log,
+                network,
+                settings,
+                progress,
+                work=claim.work,
+                resume=resume,
+                workers=workers,
+                labels_from=str(segmenter),
+                force=force,
+            )
+            about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
     warn(result.account.warnings)
     print_run(about, out, as_json)
 
@@ -122,10 +126,8 @@ def merge(
     as_json: Json = False,
 ) -> None:
     """One map of two runs of the same place, refined again."""
-    from gnss_sem_map.export import run_folder
     from gnss_sem_map.export.merged_run import merge_run_folders
 
-    run_folder.check_replaceable(out)
     about = merge_run_folders(first, second, out, match)
     if as_json:
         typer.echo(json.dumps(about))
@@ -140,6 +142,7 @@ def trajectory(
     config: Config = None,
     set_: Set = None,
     drive_format: Format = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
@@ -147,13 +150,14 @@ def trajectory(
     from gnss_sem_map.account import Account
     from gnss_sem_map.export import run_folder
 
-    run_folder.check_replaceable(out)
     settings = _settings(config, set_)
-    log = _open(drive, drive_format, None)
-    account = Account(skips=list(log.skips))
-    with progress_bars() as progress, account.stage("trajectory"):
-        estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
-    about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings)
+    with run_folder.claimed_run(out, _inputs(drive, config, settings)):
+        log = _open(drive, drive_format, None)
+        account = Account(skips=list(log.skips))
+        page = pipeline.check_drive(log, None, settings, account, force)
+        with progress_bars() as progress, account.stage("trajectory"):
+            estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
+        about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings, page)
     warn(account.warnings)
     if as_json:
         typer.echo(json.dumps(about))
@@ -186,7 +190,11 @@ def segment(
     label_set = labels.label_set(classes)
     network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
     with progress_bars() as progress:
-        report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
+        try:
+            report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
+        except Stopped as stopped:
+            stopped.add_note("what is segmented is kept: the same command goes on")
+            raise
     warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
     print_cache(report, out)
 
@@ -224,19 +232,23 @@ def train(
     settings = config.parse(TrainingSettings, set_ or ())
     learnt, checked = ([LabelledFolder.parse(text) for text in texts] for texts in (data, validation))
     with progress_bars() as progress:
-        report = train_network(
-            learnt,
-            checked,
-            out,
-            labels.label_set(classes),
-            taxonomy,
-            ids,
-            settings,
-            initial,
-            device,
-            resume,
-            progress,
-        )
+        try:
+            report = train_network(
+                learnt,
+                checked,
+                out,
+                labels.label_set(classes),
+                taxonomy,
+                ids,
+                settings,
+                initial,
+                device,
+                resume,
+                progress,
+            )
+        except Stopped as stopped:
+            stopped.add_note("the same command with --resume goes on from the last validation")
+            raise
     typer.echo(
         f"{report.network}: validation mean IoU {report.best_mean_iou:.3f} at step {report.best_step} of {report.steps}"
     )
@@ -256,9 +268,11 @@ def evaluate(
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
+    from gnss_sem_map.output import locked, real_path
 
-    metrics = score_run(run_folder, truth, restrict_to=restrict_to)
-    write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
+    with locked(real_path(run_folder)):
+        metrics = score_run(run_folder, truth, restrict_to=restrict_to)
+        write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
@@ -282,9 +296,11 @@ def calibrate(
     """Measure what the network's answers are worth; use it with --set calibration=FILE."""
     from gnss_sem_map.export.atomic import replacing
     from gnss_sem_map.io.calibrating import calibrate as measure
+    from gnss_sem_map.label_calibration import check_replaceable
 
     if len(truth) != len(run_folders):
         raise typer.BadParameter(f"found {len(truth)} for {len(run_folders)} runs", param_hint="--truth")
+    check_replaceable(out)
     with progress_bars() as progress:
         found = measure(list(zip(run_folders, truth, strict=True)), drive, segmenter, progress)
     with replacing(out) as file:
@@ -299,29 +315,35 @@ def calibrate(
 @app.command()
 def check(
     drive: Drive,
-    images: Annotated[int, typer.Option(min=5, help="Images to look at, spread over the drive.")] = 40,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Page to write.")] = Path("check.html"),
+    segmenter: Segmenter = None,
     config: Config = None,
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
     as_json: Json = False,
 ) -> None:
-    """Is the camera where, and when, the calibration says? Depth edges against image edges."""
-    from dataclasses import asdict
+    """The pre-flight: a log against physics, and its sensors against each other; 1 when something is red."""
+    from gnss_sem_map import labels, preflight
+    from gnss_sem_map.export.check_page import check_writable, write_check_page
+    from gnss_sem_map.preflight.findings import Level
+    from gnss_sem_map.segmentation import open_segmenter
 
-    from gnss_sem_map import pipeline
-    from gnss_sem_map.account import Account
-    from gnss_sem_map.camera_check import check_camera, check_projection
-
-    settings, log = _settings(config, set_), _open(drive, drive_format, frames)
-    check_projection(log)
-    with progress_bars() as progress:
-        trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
-        found = check_camera(log, trajectory, settings, images, progress)
+    check_writable(out)
+    settings = _settings(config, set_)
+    log = _open(drive, drive_format, frames)
+    network = None
+    if segmenter not in (None, "none"):
+        label_set = labels.label_set(settings.classes)
+        network = open_segmenter(str(segmenter), label_set, expected_size=log.calibration.image_size)
+    page = preflight.check(log, settings, network)
+    write_check_page(out, log.name, page)
     if as_json:
-        typer.echo(json.dumps(asdict(found)))
+        typer.echo(json.dumps(page.as_dict()))
     else:
-        print_camera_check(log.name, found)
+        print_preflight(log.name, page, out)
+    if page.level is Level.RED:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -380,6 +402,15 @@ def _settings(file: Path | None, overrides: list[str] | None) -> Settings:
     return config.load(file, overrides or ())
 
 
+def _inputs(
+    drive: Path, config: Path | None, settings: Settings, segmenter: str | None = None
+) -> list[Path | str | None]:
+    """Every place that a run reads, as far as it is known before the drive is opened."""
+    place = (segmenter or "").partition(":")[2].partition("?")[0]
+    classes = settings.classes if Path(settings.classes).suffix else None
+    return [drive, config, place or None, settings.calibration, classes]
+
+
 def _open(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
     from dataclasses import replace
 
@@ -408,18 +439,57 @@ def _frame_range(frames: str) -> tuple[int, float]:
         ) from None
 
 
+class Stopped(BaseException):
+    """Somebody asked us to stop: Ctrl-C, `kill`, or a terminal that was closed."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.number = number
+
+
+def _stop(number: int, _: object) -> None:
+    raise Stopped(number)
+
+
 def main() -> None:
-    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours."""
+    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours.
+
+    A signal ends it as orderly, with 128 and its number.
+    """
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
     try:
-        sys.exit(app(prog_name="gnss-sem-map", standalone_mode=False))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` wants it
+                signal.signal(number, _stop)
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")  # names of files may be no text
+        code = app(prog_name="gnss-sem-map", standalone_mode=False)
+        sys.stdout.flush()
+    except Stopped as stopped:
+        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped.number)
     except typer.TyperException as error:
-        sys.exit(_wrong_usage(error))
+        code = _wrong_usage(error)
     except (SemMapError, FactorGraphError) as error:
-        typer.echo(f"gnss-sem-map: {' '.join(str(error).split())}", err=True)
-        sys.exit(1)
+        code = _say(str(error), 1)
+    except OSError as error:  # what the system refused, and nobody explained better
+        code = _say(f"{error.filename or 'output'}: {error.strerror or error}", 1)
+        _close_stdout()
+    sys.exit(code)
+
+
+def _say(message: str, code: int) -> int:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # we are ending already
+    typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _close_stdout() -> None:
+    """What could not be printed will not be tried again at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wrong_usage(error: typer.TyperException) -> int:

@@ -7,6 +7,7 @@ of several drives can be put together, and a reader can see what they rest on.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import LabelSet
 
 HEIGHT_EDGES_M = (-0.3, -0.15, -0.05, 0.05, 0.15, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 6.0)
@@ -140,6 +141,19 @@ def read(file: Path, label_set: LabelSet) -> LabelCalibration:
             f" {label_set.name!r} with {list(label_set.names)}; calibrate with the same class set"
         )
     return found
+
+
+def check_replaceable(file: Path) -> None:
+    """Raise DataError when a file is there that is no label calibration: it would be lost."""
+    try:
+        if not os.path.lexists(file) or file.read_text("utf-8").startswith(f"format: {FORMAT}\nclass_set: "):
+            return
+        reason = "is no label calibration"
+    except UnicodeDecodeError:
+        reason = "is no label calibration"
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror})"
+    raise DataError(f"{file}: is there already, and {reason}; choose another -o")
 
 
 def opened(file: Path | None, label_set: LabelSet) -> LabelCalibration | None:

@@ -1,5 +1,6 @@
 """The whole flow on one page: a drive in, a trajectory and a semantic map out (Fig. 1 of the paper).
 
+    preflight           the log against physics, and its sensors against each other: a probable mistake stops the run
     trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive); sweeps matched by it
                         bind it in turn
     motion              which points belong to something that moved
@@ -11,7 +12,8 @@ Files are the business of `io` and `export`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -22,17 +24,18 @@ from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import label_calibration, labels
+from gnss_sem_map import label_calibration, labels, preflight
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.camera_check import check_projection, check_stamps
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import build_maps
+from gnss_sem_map.mapping import answers_fingerprint, build_maps
 from gnss_sem_map.motion import find_moving
+from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.refinement.moving_objects import MovingObjects
-from gnss_sem_map.remembering import RememberedSegmenter
+from gnss_sem_map.remembering import RememberedSegmenter, answers_folder
 from gnss_sem_map.scan_matching import match_scans
 from gnss_sem_map.seen_scans import Drive
 from gnss_sem_map.segmentation import Segmenter
@@ -63,6 +66,8 @@ class Result:
     """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
     kerbs: Kerbs | None = None
     """Where points of the refined map must be told apart into road and sidewalk."""
+    preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
+    """What was found before any work."""
 
 
 def run(
@@ -75,15 +80,19 @@ def run(
     resume: bool = False,
     workers: int = 1,
     labels_from: str = "",
+    force: bool = False,
 ) -> Result:
     """Trajectory, raw map and refined map of one drive.
 
     Without a segmenter, or without images, the map has no labels. What is mapped is kept in the folder `work` until
-    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. Raises DataError when not
-    one scan can be used, MeasurementError and EstimationError from the smoother.
+    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. `force` goes on where the
+    pre-flight is red. Raises PreflightError, DataError when not one scan can be used, MeasurementError and
+    EstimationError from the smoother.
     """
+    log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
     _refuse_early(log, segmenter, settings)
+    page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
         solutions = solve(log, settings, account, progress)
@@ -92,9 +101,9 @@ def run(
     with account.stage("sharpness"):
         figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
-    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
-        drive, found = _without_moving(whole, Path(folder), account, progress)
+    whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
+    with _answers(whole, work, resume, labels_from) as folder:
+        drive, found = _without_moving(whole, folder, account, progress)
         with account.stage("mapping"):
             maps = build_maps(
                 drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -114,7 +123,21 @@ def run(
     if (refined.states == State.REMOVED).all():
         account.warnings.append("everything was taken for moving: what is drawn is what was removed")
     raw = SemanticMap.of(maps.static + maps.removed)
-    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs)
+    return Result(
+        trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs, page
+    )
+
+
+def check_drive(
+    log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account, force: bool = False
+) -> Preflight:
+    """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
+    with account.stage("preflight"):
+        page = preflight.check(log, settings, segmenter)
+    if page.level is Level.RED and not force:
+        raise PreflightError(log.name, page)
+    account.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
+    return page
 
 
 def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
@@ -123,6 +146,16 @@ def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Setting
     if segmenter is not None and log.images and log.calibration.has_camera:
         check_projection(log)
         check_stamps(log, settings.labelling.image_within_s)
+
+
+@contextmanager
+def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
+    """Where a network's answers are kept: with what is mapped, so that --resume asks for none twice."""
+    if work is not None:
+        yield answers_folder(work, answers_fingerprint(drive, labels_from), resume)
+        return
+    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        yield Path(folder)
 
 
 def _without_moving(
@@ -166,6 +199,7 @@ def solve(
     """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given."""
     if log.given is not None:
         return ()
+    log = log.in_our_conventions(settings.sensors)
     imu, gnss, frame = log.imu, log.gnss, log.frame
     if imu is None or gnss is None or frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import DataError
 
 
@@ -85,6 +87,12 @@ class Image:
     """s since the log's epoch, as the camera reports it (see `Calibration.camera_time_offset_s`)."""
     read: Callable[[], NDArray[np.uint8]] = field(repr=False)
     """The RGB pixels, (h, w, 3); raises DataError when the file is damaged."""
+
+
+def file_of(item: Scan | Image) -> Path | None:
+    """The file that a scan or an image is read from: the first argument of its `read`; None where there is none."""
+    first = item.read.args[:1] if isinstance(item.read, partial) else ()
+    return next((path for path in first if isinstance(path, Path)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +174,8 @@ class SensorLog:
     reference: Trajectory | None = None
     """What the drive's own navigation system says, to compare with; never used as input."""
     skips: tuple[Skip, ...] = ()
+    conventions: SensorConventions | None = field(default_factory=SensorConventions)
+    """In which axes, units and clocks the drive says that its sensors report; None: all are ours already."""
 
     def __post_init__(self) -> None:
         for what, items in (("scans", self.scans), ("images", self.images)):
@@ -176,6 +186,26 @@ class SensorLog:
                 )
         if self.given is None and (self.imu is None or self.gnss is None):
             raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
+
+    @property
+    def folders(self) -> set[Path]:
+        """Where the files of scans and images are."""
+        files = {*map(file_of, self.scans), *map(file_of, self.images)}
+        return {file.parent for file in files if file is not None}
+
+    def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
+        """The same log in our axes, units and clock, once: what is chosen wins over what the drive says of itself."""
+        if self.conventions is None:
+            return self
+        theirs = chosen.over(self.conventions)
+        offset = theirs.lidar_time_offset_s
+        return replace(
+            self,
+            imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
+            gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
+            scans=self.scans if offset == 0.0 else tuple(_later(scan, offset) for scan in self.scans),
+            conventions=None,
+        )
 
     @cached_property
     def _image_stamps(self) -> list[float]:
@@ -188,3 +218,12 @@ class SensorLog:
         near = [self.images[i] for i in (after - 1, after) if 0 <= i < len(stamps)]
         best = min(near, key=lambda image: abs(image.stamp - stamp), default=None)
         return best if best is not None and abs(best.stamp - stamp) <= within_s else None
+
+
+def _later(scan: Scan, offset_s: float) -> Scan:
+    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s))
+
+
+def _read_later(scan: Scan, offset_s: float) -> Points:
+    points = scan.read()
+    return points if points.stamps is None else replace(points, stamps=points.stamps + offset_s)

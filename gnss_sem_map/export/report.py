@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.ownership import amend
 
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
@@ -70,6 +70,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _facts(run),
         _picture(folder, "perspective.png"),
         _warnings(run.get("warnings", ())),
+        _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
         _section(
@@ -89,10 +90,27 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _section("Files", _files(folder)),
         _section("Versions", _pairs(run.get("versions", {}))),
     ]
+    amend(folder, "report.html", page_of(title, sections))
+
+
+def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
+    """The findings of a pre-flight as a table, each row coloured by its level."""
+    rows = "".join(
+        f'<tr class="{escape(found["level"])}">{_cell(found["level"])}{_cell(found["check"])}{_cell(found["evidence"])}'
+        f"{_cell(found['mistake'])}{_cell(found['remedy'])}</tr>"
+        for found in findings
+    )
+    titles = "".join(
+        f"<th>{title}</th>" for title in ("", "check", "found", "probable mistake", "what to do")
+    )
+    return f'<div class="scroll"><table><tr>{titles}</tr>{rows}</table></div>' if rows else ""
+
+
+def page_of(title: str, sections: Iterable[str]) -> bytes:
+    """One self-contained page of HTML sections."""
     template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
     page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    with replacing(folder / "report.html") as file:
-        file.write(page.encode("utf-8"))
+    return page.encode("utf-8", "backslashreplace")
 
 
 def _section(title: str, *parts: str) -> str:

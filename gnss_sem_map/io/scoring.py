@@ -16,6 +16,7 @@ from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io.point_labels import label_files, read_labels, truth_folder
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.ownership import amend
 
 ONE_SECOND = 10
 """Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
@@ -36,7 +37,7 @@ def score_run(
     path = truth / "trajectory_lidar.tum"
     if path.is_file():
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", "utf-8")
+    amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
 

@@ -1,6 +1,7 @@
 """Table logs: a user's own drive as plain tables, with scans and images beside them where there are any.
 
-    imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up
+    imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
+                                                       or as `imu_axes`, `force_unit`, `rate_unit` of log.yaml say
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
@@ -17,10 +18,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu
+from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import frames
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
@@ -38,8 +40,8 @@ IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
 
 
-class LogFile(BaseModel):
-    """What `log.yaml` may say about the drive."""
+class LogFile(SensorConventions):
+    """What `log.yaml` may say about the drive; its axes, units and clocks are those of `SensorConventions`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -88,6 +90,7 @@ def read(drive: Path) -> SensorLog:
         imu=imu,
         gnss=gnss,
         imu_noise=about.imu_noise,
+        conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*skips, *scan_skips, *image_skips),
     )
 

@@ -82,7 +82,7 @@ def build_maps(
                 drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from
             )
             maps = Maps(store.whole(STATIC), store.whole(REMOVED))
-    _check(drive, account)
+    _check(drive, account, maps)
     return maps
 
 
@@ -150,16 +150,27 @@ def _table(settings: Settings) -> VoxelTable:
 def _warn(drive: Drive, account: Account) -> None:
     if drive.segmenter is None:
         account.warnings.append("no segmenter: the map shows geometry only")
-    elif not drive.log.images or not drive.log.calibration.has_camera:
+    elif not _has_camera(drive):
         account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _check(drive: Drive, account: Account) -> None:
+def _check(drive: Drive, account: Account, maps: Maps) -> None:
     if not account.counts["scans"]:
-        why = f"; first reason: {account.skips[0].where}: {account.skips[0].reason}" if account.skips else ""
+        why = _first_reason(account, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
-    if not account.counts["points labelled"]:
-        account.warnings.append("no point got a label: the map shows geometry only")
+    is_labelled = maps.static.observed.any() or maps.removed.observed.any()
+    if drive.segmenter is not None and _has_camera(drive) and not is_labelled:
+        why = _first_reason(account, "labels")
+        account.warnings.append(f"no point got a label, and the map shows geometry only{why}")
+
+
+def _has_camera(drive: Drive) -> bool:
+    return bool(drive.log.images) and drive.log.calibration.has_camera
+
+
+def _first_reason(account: Account, what: str) -> str:
+    """Why the first one was left out, as the end of a sentence; nothing where none was."""
+    return next((f"; first reason: {s.where}: {s.reason}" for s in account.skips if s.what == what), "")
 
 
 @contextmanager

@@ -137,6 +137,23 @@ def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
         assert 0 < counts["points labelled"] < at_once[1].counts["points labelled"]
 
 
+def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive) -> None:
+    class Hopeless:
+        class_names = ("road", "other")
+
+        def __call__(self, image: Image) -> NDArray[np.uint8]:
+            raise DataError("this network is broken")
+
+    account = Account()
+    assert len(build_maps(replace(drive, segmenter=Hopeless()), account).static) > 1000
+    assert account.counts["points labelled"] == 0
+    first = drive.log.scans[0].number
+    assert account.warnings == [
+        "no point got a label, and the map shows geometry only; first reason:"
+        f" frame {first}: this network is broken"
+    ]
+
+
 def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_path: Path) -> None:
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size

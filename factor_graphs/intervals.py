@@ -134,8 +134,8 @@ def _fill(stamps: Array, max_interval_s: float) -> Array:
     exact = np.maximum(1, np.ceil(np.diff(stamps) / max_interval_s - 0.05))
     if exact.sum() > MOST_STEPS:
         raise MeasurementError(
-            f"the IMU spans {stamps[-1] - stamps[0]:.6g} s, {exact.sum():.3g} steps of {max_interval_s:g} s; expected at"
-            f" most {MOST_STEPS}: are its stamps in seconds?"
+            f"the IMU spans {stamps[-1] - stamps[0]:.6g} s, {exact.sum():.3g} steps of {max_interval_s:g} s;"
+            f" expected at most {MOST_STEPS}: are its stamps in seconds?"
         )
     parts = exact.astype(int)
     first = np.repeat(np.cumsum(parts) - parts, parts)

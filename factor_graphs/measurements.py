@@ -129,7 +129,8 @@ def clean_imu(
 
     `stamps` (n,) s; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s. Rows that are not finite
     or beyond any sensor are dropped (GTSAM would integrate them), so is every row after the first with the same
-    stamp, and every row whose stamp is `far_off`. Raises MeasurementError for another shape and when fewer than two rows are left.
+    stamp, and every row whose stamp is `far_off`. Raises MeasurementError for another shape and when fewer than
+    two rows are left.
     """
     values = [np.asarray(c, dtype=np.float64) for c in (specific_force, angular_rate)]
     sensible = [np.where(np.abs(c) <= LARGEST_OF_IMU, c, np.nan) for c in values]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
@@ -254,11 +256,19 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
+    from gnss_sem_map.errors import DataError
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
+    from gnss_sem_map.run_json import read_run
+    from gnss_sem_map.untrusted.files import shown
 
     metrics = score_run(run_folder, truth, restrict_to=restrict_to)
-    write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
+    try:
+        write_report(run_folder, read_run(run_folder), metrics)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise DataError(
+            f"{shown(run_folder / 'run.json')}: damaged ({type(error).__name__} {error}); make the run again"
+        ) from None
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
@@ -413,13 +423,29 @@ def main() -> None:
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # those of other packages; ours are printed as such
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
         sys.exit(app(prog_name="gnss-sem-map", standalone_mode=False))
     except typer.TyperException as error:
         sys.exit(_wrong_usage(error))
     except (SemMapError, FactorGraphError) as error:
-        typer.echo(f"gnss-sem-map: {' '.join(str(error).split())}", err=True)
-        sys.exit(1)
+        sys.exit(_say(str(error)))
+    except MemoryError as error:
+        sys.exit(
+            _say(f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive")
+        )
+    except (OSError, UnicodeError, RecursionError) as error:  # what is left: the world around us
+        sys.exit(_say(f"{type(error).__name__} {error}"))
+
+
+def _say(message: str) -> int:
+    """One line on stderr; returns the exit code."""
+    typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
+    return 1
 
 
 def _wrong_usage(error: typer.TyperException) -> int:

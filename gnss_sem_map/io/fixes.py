@@ -18,13 +18,17 @@ JUMP_M, FASTEST_M_S = 20_000.0, 150.0
 NEIGHBOURS = 21
 
 
-def usable_fixes(stamps: Array, geodetic: Array, stddevs: Array, where: str) -> tuple[NDArray[np.bool_], list[Skip]]:
+def usable_fixes(
+    stamps: Array, geodetic: Array, stddevs: Array, where: str
+) -> tuple[NDArray[np.bool_], list[Skip]]:
     """Which rows are fixes (n,), and one skip for each kind of those that are not.
 
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
     """
     lat, lon, alt = geodetic.T
-    is_place = np.isfinite(geodetic).all(axis=1) & ~((lat == 0) & (lon == 0))  # what receivers write without a fix
+    is_place = np.isfinite(geodetic).all(axis=1) & ~(
+        (lat == 0) & (lon == 0)
+    )  # what receivers write without a fix
     is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360) & (np.abs(alt) <= LARGEST_ALT_M)
     has_accuracy = ((stddevs >= LEAST_STDDEV_M) & (stddevs <= LARGEST_STDDEV_M)).all(axis=1)
     usable = is_place & has_accuracy

@@ -54,8 +54,11 @@ def numbered(folder: Path, *suffixes: str) -> Frames:
 
 
 def state_of(path: Path) -> State | None:
-    """How a file is now, to be compared when it is read; None where there is none."""
-    found = status(path)
+    """How a file is now, to be compared when it is read; None where that cannot be known."""
+    try:
+        found = status(path)
+    except DataError:
+        return None  # said when it is read
     return None if found is None else (found.st_size, found.st_mtime_ns)
 
 
@@ -68,9 +71,13 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
         found = os.fstat(file.fileno())
         size = found.st_size
         if state is not None and state != (size, found.st_mtime_ns):
-            raise DataError(f"{shown(path)}: changed while the drive was read; found {size} bytes, once {state[0]}")
+            raise DataError(
+                f"{shown(path)}: changed while the drive was read; found {size} bytes, once {state[0]}"
+            )
         if size > 4 * columns * MOST_POINTS:
-            raise DataError(f"{shown(path)}: found {size} bytes, expected at most {MOST_POINTS} points; is it a scan?")
+            raise DataError(
+                f"{shown(path)}: found {size} bytes, expected at most {MOST_POINTS} points; is it a scan?"
+            )
         try:
             rows = np.empty((size // (4 * columns), columns), "<f4")
             if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
@@ -79,7 +86,7 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
                     " than 0"
                 )
         except OSError as error:
-            raise DataError(f"{shown(path)}: cannot be read ({reason(error)})") from None
+            raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
     return rows
 
 
@@ -94,5 +101,6 @@ def missing(what: str, folder: Path, expected: set[int], files: dict[int, Path])
     breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
     runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
     return [
-        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing") for run in runs
+        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing")
+        for run in runs
     ]

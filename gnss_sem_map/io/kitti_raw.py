@@ -131,7 +131,9 @@ def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
         if STAMP.fullmatch(text) is None:
             raise _no_stamp(path, number, text)
         if not FIRST_YEAR <= int(text[:4]) <= LAST_YEAR:
-            skips.append(Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, no time of a drive"))
+            skips.append(
+                Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, no time of a drive")
+            )
             continue
         try:
             stamps[number] = int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
@@ -170,7 +172,11 @@ def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     off = far_off(np.array(order, np.float64) * 1e-9)
     for stamp, is_off in zip(order, off, strict=True):
         if is_off:
-            skips.append(Skip("oxts", shown(drive / "oxts"), f"stamp {np.datetime64(stamp, 'ns')} is far off all others"))
+            skips.append(
+                Skip(
+                    "oxts", shown(drive / "oxts"), f"stamp {np.datetime64(stamp, 'ns')} is far off all others"
+                )
+            )
     order = [stamp for stamp, is_off in zip(order, off, strict=True) if not is_off]
     if len(order) < 3:
         raise DataError(
@@ -233,12 +239,12 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
         if number not in middle or number not in start or number not in end:
             skips.append(Skip("scan", shown(path), "no stamp for this frame"))
             continue
-        stamp, *sweep = ((t[number] - epoch_ns) * 1e-9 for t in (middle, start, end))
-        fault = sweep_fault(stamp, *sweep)
+        stamp, begun, ended = ((t[number] - epoch_ns) * 1e-9 for t in (middle, start, end))
+        fault = sweep_fault(stamp, begun, ended)
         if fault is not None:
             skips.append(Skip("scan", shown(path), fault))
         else:
-            read = partial(_read_sweep, path, *sweep, frames.state_of(path))
+            read = partial(_read_sweep, path, begun, ended, frames.state_of(path))
             scans.append(Scan(path.stem, number, stamp, read))
     return in_order("scan", scans, skips), skips
 

@@ -67,7 +67,9 @@ def in_order(what: str, items: list[T], skips: list[Skip]) -> tuple[T, ...]:
     alone = far_off(np.array([item.stamp for item in items]))
     for item, is_off in zip(items, alone, strict=True):
         if is_off:
-            skips.append(Skip(what, f"frame {item.number}", f"stamp {item.stamp:.6g} s is far off all others"))
+            skips.append(
+                Skip(what, f"frame {item.number}", f"stamp {item.stamp:.6g} s is far off all others")
+            )
     kept: list[T] = []
     near = (item for item, is_off in zip(items, alone, strict=True) if not is_off)
     for item in sorted(near, key=lambda item: (item.stamp, item.number)):

@@ -126,7 +126,9 @@ def _fixes(path: Path) -> tuple[Array, list[Skip]]:
     stamped[stamped] = ~far_off(rows[stamped, 0])
     usable, skips = usable_fixes(rows[stamped, 0], rows[stamped, 1:4], rows[stamped, 4:7], shown(path))
     if not stamped.all():
-        skips.append(Skip("fix", shown(path), f"{(~stamped).sum()} rows: no stamp, or one far off all others"))
+        skips.append(
+            Skip("fix", shown(path), f"{(~stamped).sum()} rows: no stamp, or one far off all others")
+        )
     if not usable.any():
         raise DataError(
             f"{shown(path)}: no usable fix among {len(rows)} rows; expected degrees and metres of WGS 84, and standard"
@@ -209,9 +211,7 @@ def _whole(text: str) -> int | None:
     return int(whole) if whole.isdecimal() and len(whole) <= MOST_DIGITS else None
 
 
-def _stamped(
-    what: str, folder: Path, *suffixes: str
-) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
+def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has both; and what was left out."""
     of_folder = frames.numbered(folder, *suffixes)
     files, skips = of_folder.files, of_folder.skips
@@ -219,7 +219,9 @@ def _stamped(
         return [], skips
     stamps = _stamps_of(folder / "stamps.csv")
     check_unit(np.array(list(stamps.values())), LONGEST_FRAME_STEP_S, shown(folder / "stamps.csv"))
-    skips += [Skip(what, shown(path), "no stamp for this frame") for n, path in files.items() if n not in stamps]
+    skips += [
+        Skip(what, shown(path), "no stamp for this frame") for n, path in files.items() if n not in stamps
+    ]
     skips += [Skip(what, f"{shown(folder)}: frame {n}", "file missing") for n in stamps if n not in files]
     return [(n, stamps[n], path) for n, path in files.items() if n in stamps], skips
 
@@ -257,7 +259,9 @@ def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> 
     if count:
         rows[outside, :3], after[outside] = np.nan, 0.0
     if np.ptp(after) > LONGEST_SWEEP_S:
-        raise DataError(f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}")
+        raise DataError(
+            f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}"
+        )
 
 
 def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:

@@ -18,6 +18,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, LabelSet
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
+from gnss_sem_map.untrusted.structured import read_json
 
 ABOUT = "about.json"
 """Says who wrote a cache; frames of two segmenters are not mixed."""
@@ -140,11 +141,9 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
             if any(folder.glob("*.npz")):
                 raise ConfigError(f"cache {folder}: found .npz files but no {ABOUT}; choose an empty folder")
             file.write_text(json.dumps(about) + "\n")
-        found = json.loads(file.read_text())
     except OSError as error:
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
-    except json.JSONDecodeError:
-        raise DataError(f"{file}: damaged; remove the folder and write it again") from None
+    found = read_json(file)
     if found != about:
         raise ConfigError(
             f"cache {folder}: was begun with {found}, now asked for {about}; choose another folder"

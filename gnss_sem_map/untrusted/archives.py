@@ -24,7 +24,8 @@ MOST_HEADER_BYTES = 10_000
 CHUNK_BYTES = 1 << 18
 KINDS_OF_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 HEADER = re.compile(
-    r"\{'descr': '([<>|=]?[biufcU]\d{1,6})', 'fortran_order': (True|False), 'shape': \(((?:\d{1,18}, ?)*\d{0,18})\),? ?\}\s*"
+    r"\{'descr': '([<>|=]?[biufcU]\d{1,6})', 'fortran_order': (True|False),"
+    r" 'shape': \(((?:\d{1,18}, ?)*\d{0,18})\),? ?\}\s*"
 )
 """What numpy writes, and nothing that would have to be evaluated."""
 
@@ -67,7 +68,7 @@ class Archive:
     def unpack(self, member: Member) -> NDArray[Any]:
         """The values of an array."""
         values = np.empty(member.shape[::-1] if member.is_fortran else member.shape, member.dtype)
-        room = memoryview(values.reshape(-1).view(np.uint8)) if values.size else memoryview(bytearray())
+        room = values.reshape(-1).view(np.uint8)
         with self._damage(), self._members.open(member.entry) as file:
             file.read(member.start)
             done = 0
@@ -75,7 +76,7 @@ class Archive:
                 chunk = file.read(min(CHUNK_BYTES, len(room) - done))
                 if not chunk:
                     raise EOFError("it ends too early")
-                room[done : done + len(chunk)] = chunk
+                room[done : done + len(chunk)] = np.frombuffer(chunk, np.uint8)
                 done += len(chunk)
             file.read(1)  # the checksum is compared at the end
         return values.T if member.is_fortran else values

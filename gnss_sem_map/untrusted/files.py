@@ -15,6 +15,7 @@ MOST_LINES = 5_000_000
 LONGEST_LINE = 100_000
 
 KINDS = {
+    stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a pipe",
     stat.S_IFSOCK: "a socket",
@@ -33,21 +34,27 @@ def status(path: Path, error: type[SemMapError] = DataError) -> os.stat_result |
     try:
         return path.stat()
     except (FileNotFoundError, NotADirectoryError):
+        if os.path.islink(path):
+            raise error(f"{shown(path)}: a link to what is not there") from None
         return None
     except (OSError, ValueError) as problem:
-        raise error(f"{shown(path)}: cannot be read ({reason(problem)})") from None
+        raise error(f"{shown(path)}: cannot read it ({reason(problem)})") from None
 
 
 def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:
-    """Whether a path is an ordinary file; raises `error` where that cannot be known."""
+    """Whether there is a file; raises `error` where that cannot be known, or something else is there."""
     found = status(path, error)
-    return found is not None and stat.S_ISREG(found.st_mode)
+    if found is not None:
+        _check_ordinary(path, found, error)
+    return found is not None
 
 
 def is_folder(path: Path, error: type[SemMapError] = DataError) -> bool:
-    """Whether a path is a folder; raises `error` where that cannot be known."""
+    """Whether there is a folder; raises `error` where that cannot be known, or something else is there."""
     found = status(path, error)
-    return found is not None and stat.S_ISDIR(found.st_mode)
+    if found is not None and not stat.S_ISDIR(found.st_mode):
+        raise error(f"{shown(path)}: found {_kind(found)}, expected a folder")
+    return found is not None
 
 
 def inside(folder: Path, error: type[SemMapError] = DataError) -> list[Path]:
@@ -64,9 +71,9 @@ def open_file(path: Path, error: type[SemMapError] = DataError) -> int:
         _check_ordinary(path, os.stat(path), error)  # before opening: to open some devices is to use them
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        raise error(f"{shown(path)}: no such file") from None
+        raise error(f"{shown(path)}: cannot read it (No such file or directory)") from None
     except (OSError, ValueError) as problem:
-        raise error(f"{shown(path)}: cannot be read ({reason(problem)})") from None
+        raise error(f"{shown(path)}: cannot read it ({reason(problem)})") from None
     try:
         _check_ordinary(path, os.fstat(descriptor), error)
     except SemMapError:
@@ -81,10 +88,12 @@ def read_bytes(path: Path, most: int = MOST_BYTES, error: type[SemMapError] = Da
         try:
             size = os.fstat(file.fileno()).st_size
             if size > most:
-                raise error(f"{shown(path)}: found {size} bytes, expected at most {most}; is it the right file?")
+                raise error(
+                    f"{shown(path)}: found {size} bytes, expected at most {most}; is it the right file?"
+                )
             return file.readall()
         except OSError as problem:
-            raise error(f"{shown(path)}: cannot be read ({reason(problem)})") from None
+            raise error(f"{shown(path)}: cannot read it ({reason(problem)})") from None
 
 
 def read_text(path: Path, most: int = MOST_TEXT_BYTES, error: type[SemMapError] = DataError) -> str:
@@ -113,6 +122,9 @@ def reason(problem: OSError | ValueError) -> str:
 
 
 def _check_ordinary(path: Path, found: os.stat_result, error: type[SemMapError]) -> None:
-    kind = stat.S_IFMT(found.st_mode)
-    if kind != stat.S_IFREG:
-        raise error(f"{shown(path)}: found {KINDS.get(kind, 'something else')}, expected a file")
+    if not stat.S_ISREG(found.st_mode):
+        raise error(f"{shown(path)}: found {_kind(found)}, expected a file")
+
+
+def _kind(found: os.stat_result) -> str:
+    return KINDS.get(stat.S_IFMT(found.st_mode), "something else")

@@ -26,8 +26,16 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 KEPT_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
-GREY, PALETTE = 0, 3
-INTERLACED = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+GREY, COLOUR, PALETTE = 0, 2, 3
+INTERLACED = (
+    (0, 0, 8, 8),
+    (4, 0, 8, 8),
+    (0, 4, 4, 8),
+    (2, 0, 4, 4),
+    (0, 2, 2, 4),
+    (1, 0, 2, 2),
+    (0, 1, 1, 2),
+)
 """Of the seven passes of Adam7: first column and line, and steps between them."""
 
 
@@ -41,6 +49,11 @@ class PngHeader:
     colour: int
     is_interlaced: bool
 
+    def __str__(self) -> str:
+        """What it is, in words."""
+        palette = " by a palette" if self.colour == PALETTE else ""
+        return f"uint{self.depth} ({self.height}, {self.width}, {CHANNELS[self.colour]}){palette}"
+
     @property
     def passes(self) -> list[tuple[int, int]]:
         """Lines, and bytes of each, of every pass."""
@@ -50,15 +63,23 @@ class PngHeader:
         return [(lines, 1 + -(-columns * bits // 8)) for columns, lines in sizes if columns > 0 and lines > 0]
 
 
-def read_picture(path: Path, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """RGB pixels (h, w, 3) of a PNG or JPEG; raises DataError for a damaged one, and one of another (width, height)."""
+def read_picture(
+    path: Path, size: tuple[int, int] | None = None, needs_colour: bool = False
+) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3) of a PNG or JPEG.
+
+    Raises DataError for a damaged one, one of another (width, height), and where `needs_colour` one of other than three
+    channels of 8 bits.
+    """
     content = read_bytes(path, MOST_FILE_BYTES)
     if content.startswith(PNG):
         header, plain = _checked_png(path, content)
         _check_size(path, (header.width, header.height), size)
+        if needs_colour and (header.colour not in (COLOUR, PALETTE) or header.depth > 8):
+            raise DataError(f"{shown(path)}: found {header}, expected 8-bit colour")
         return np.ascontiguousarray(_decoded(path, plain, "IMREAD_COLOR")[:, :, ::-1])
     if content.startswith(JPEG):
-        return _read_jpeg(path, content, size)
+        return _read_jpeg(path, content, size, needs_colour)
     raise DataError(f"{shown(path)}: damaged image; expected PNG or JPEG")
 
 
@@ -70,8 +91,7 @@ def read_ids(path: Path) -> NDArray[np.uint8]:
     header, plain = _checked_png(path, content)
     if header.colour != GREY or header.depth != 8:
         raise DataError(
-            f"{shown(path)}: found {CHANNELS[header.colour]} channels of {header.depth} bits"
-            f"{', a palette' if header.colour == PALETTE else ''}; expected an 8-bit grey PNG of class ids, not colours"
+            f"{shown(path)}: found {header}, expected an 8-bit grey PNG of class ids, not colours"
         )
     _check_size(path, (header.width, header.height), None)
     return _decoded(path, plain, "IMREAD_GRAYSCALE")
@@ -145,17 +165,30 @@ def _check_pixels(header: PngHeader, compressed: bytes) -> None:
         place += lines * size
 
 
-def _read_jpeg(path: Path, content: bytes, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+def _read_jpeg(
+    path: Path, content: bytes, size: tuple[int, int] | None, needs_colour: bool
+) -> NDArray[np.uint8]:
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(content), formats=("JPEG",)) as picture:
             _check_count(*picture.size)
             _check_size(path, picture.size, size)
+            if needs_colour and picture.mode != "RGB":
+                raise DataError(f"{shown(path)}: found {picture.mode}, expected 8-bit colour")
             return np.array(picture.convert("RGB"))
     except DataError:
         raise
-    except (OSError, SyntaxError, ValueError, TypeError, IndexError, KeyError, struct.error, ZeroDivisionError) as error:
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        TypeError,
+        IndexError,
+        KeyError,
+        struct.error,
+        ZeroDivisionError,
+    ) as error:
         raise DataError(
             f"{shown(path)}: damaged image ({' '.join(str(error).split())[:100]}); expected PNG or JPEG"
         ) from None

@@ -115,7 +115,13 @@ def not_finite(content: Any, place: str = "") -> str | None:
     """Where in nested lists and mappings a number is infinite or none, as `a.b.0`; None where there is no such."""
     if isinstance(content, float) and not math.isfinite(content):
         return place
-    parts = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
+    parts = (
+        content.items()
+        if isinstance(content, dict)
+        else enumerate(content)
+        if isinstance(content, list)
+        else ()
+    )
     for name, part in parts:
         found = not_finite(part, f"{place}.{name}" if place else str(name))
         if found is not None:

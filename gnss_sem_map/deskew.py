@@ -112,7 +112,7 @@ def knots_of(
         first, last = used.min(initial=np.inf), used.max(initial=-np.inf)
         if last - first > LONGEST_SWEEP_S:
             raise MeasurementError(
-                f"the sweep takes {last - first:.6g} s, expected at most {LONGEST_SWEEP_S:g} s; are its times in seconds?"
+                f"the sweep takes {last - first:.6g} s, expected at most {LONGEST_SWEEP_S:g}; are its times in s?"
             )
     if not first <= last:  # no point is usable
         return points.stamps, Knots(0, np.zeros((1, 3, 8)))

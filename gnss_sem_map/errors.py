@@ -11,3 +11,7 @@ class ConfigError(SemMapError, ValueError):
 
 class DataError(SemMapError, ValueError):
     """A drive, a map or a label file that is not what it must be."""
+
+
+class WriteError(DataError):
+    """What is needed later cannot be written: no fault of the one scan or image that it was about."""

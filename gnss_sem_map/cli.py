@@ -13,9 +13,9 @@ import typer
 
 from gnss_sem_map.console import (
     print_cache,
-    print_camera_check,
     print_merged,
     print_metrics,
+    print_preflight,
     print_run,
     progress_bars,
     warn,
@@ -59,6 +59,7 @@ Segmenter = Annotated[
     ),
 ]
 Device = Annotated[str, typer.Option(help="Where a network runs: auto, cpu, cuda.")]
+Force = Annotated[bool, typer.Option("--force", help="Go on where the pre-flight (see `check`) is red.")]
 Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 
 
@@ -75,6 +76,7 @@ def run(
     workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
     resume: Annotated[bool, typer.Option(help="Go on with what an interrupted run of this mapped.")] = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
@@ -105,6 +107,7 @@ def run(
             resume=resume,
             workers=workers,
             labels_from=str(segmenter),
+            force=force,
         )
         about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
     shutil.rmtree(work, ignore_errors=True)
@@ -142,6 +145,7 @@ def trajectory(
     config: Config = None,
     set_: Set = None,
     drive_format: Format = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
@@ -153,9 +157,10 @@ def trajectory(
     settings = _settings(config, set_)
     log = _open(drive, drive_format, None)
     account = Account(skips=list(log.skips))
+    page = pipeline.check_drive(log, None, settings, account, force)
     with progress_bars() as progress, account.stage("trajectory"):
         estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
-    about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings)
+    about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings, page)
     warn(account.warnings)
     if as_json:
         typer.echo(json.dumps(about))
@@ -309,29 +314,35 @@ def calibrate(
 @app.command()
 def check(
     drive: Drive,
-    images: Annotated[int, typer.Option(min=5, help="Images to look at, spread over the drive.")] = 40,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Page to write.")] = Path("check.html"),
+    segmenter: Segmenter = None,
     config: Config = None,
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
     as_json: Json = False,
 ) -> None:
-    """Is the camera where, and when, the calibration says? Depth edges against image edges."""
-    from dataclasses import asdict
+    """The pre-flight: a log against physics, and its sensors against each other; 1 when something is red."""
+    from gnss_sem_map import labels, preflight
+    from gnss_sem_map.export.check_page import check_writable, write_check_page
+    from gnss_sem_map.preflight.findings import Level
+    from gnss_sem_map.segmentation import open_segmenter
 
-    from gnss_sem_map import pipeline
-    from gnss_sem_map.account import Account
-    from gnss_sem_map.camera_check import check_camera, check_projection
-
-    settings, log = _settings(config, set_), _open(drive, drive_format, frames)
-    check_projection(log)
-    with progress_bars() as progress:
-        trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
-        found = check_camera(log, trajectory, settings, images, progress)
+    check_writable(out)
+    settings = _settings(config, set_)
+    log = _open(drive, drive_format, frames)
+    network = None
+    if segmenter not in (None, "none"):
+        label_set = labels.label_set(settings.classes)
+        network = open_segmenter(str(segmenter), label_set, expected_size=log.calibration.image_size)
+    page = preflight.check(log, settings, network)
+    write_check_page(out, log.name, page)
     if as_json:
-        typer.echo(json.dumps(asdict(found)))
+        typer.echo(json.dumps(page.as_dict()))
     else:
-        print_camera_check(log.name, found)
+        print_preflight(log.name, page, out)
+    if page.level is Level.RED:
+        raise typer.Exit(1)
 
 
 @app.command()

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
 from gnss_sem_map.refinement import RefinementSettings
@@ -49,6 +50,10 @@ class Settings(BaseModel):
         "evidence",
         description="`paper` is eq. 6 to the letter: looks count in full, nothing but the images speaks."
         " It sets what is not set beside it.",
+    )
+    sensors: SensorConventions = Field(
+        SensorConventions(),
+        description="Axes, units and clocks of the sensors; wins over the drive's log.yaml.",
     )
     trajectory: TrajectorySettings = Field(
         default_factory=TrajectorySettings, description="GNSS and IMU smoothing, LiDAR odometry."

@@ -12,7 +12,7 @@ import typer
 
 if TYPE_CHECKING:
     from gnss_sem_map.account import Progress
-    from gnss_sem_map.camera_check import CameraCheck
+    from gnss_sem_map.preflight.findings import Preflight
     from gnss_sem_map.segmentation.cache import CacheReport
 
 
@@ -133,24 +133,23 @@ def print_cache(report: CacheReport, out: Path) -> None:
         typer.echo(f"now use --segmenter labels:{out}")
 
 
-def print_camera_check(name: str, found: CameraCheck) -> None:
-    """How well time and mounting of the camera fit the images; what does not on stderr."""
-    typer.echo(
-        f"{name}: {found.edges} depth edges in {found.images} images; image edges are there"
-        f" {found.agreement:.2f} times as strong as elsewhere, at best {found.best_agreement:.2f}"
+def print_preflight(name: str, page: Preflight, out: Path) -> None:
+    """One page: every check with its level and what was found; under it the probable mistake and what to do."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(soft_wrap=True)
+    styles = {"green": "green", "amber": "yellow", "red": "bold red"}
+    console.print(
+        f"{name}: the pre-flight is {page.level} ({page.seconds:.1f} s)", highlight=False, markup=False
     )
-    typer.echo(
-        f"exposure minus image stamp: {1e3 * found.time_offset_s:.1f} +- {1e3 * found.time_offset_stddev_s:.1f} ms"
-        f" (the file says {1e3 * found.given_time_offset_s:.1f})"
-    )
-    turns = zip("xyz", found.rotation_deg, found.rotation_stddev_deg, strict=True)
-    typer.echo(
-        "camera turned about "
-        + ", ".join(f"{axis} {turn:.2f} +- {stddev:.2f} deg" for axis, turn, stddev in turns)
-    )
-    warn(found.warnings)
-    if not found.warnings:
-        typer.echo("time and mounting fit the images")
+    for found in page.findings:
+        level = str(found.level)
+        line = Text.assemble((f"{level:>5}", styles[level]), f"  {found.check}: {found.evidence}")
+        console.print(line, highlight=False)
+        for more in filter(None, (found.mistake, found.remedy)):
+            console.print(f"       {more}", highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False, markup=False)
 
 
 def _percent(share: float | None) -> str:

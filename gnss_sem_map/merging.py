@@ -20,7 +20,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.map_matching import MapMatch, NoMatch, match_maps
 from gnss_sem_map.voxel_kernels import EVIDENCE_LIMIT, HITS_LIMIT
-from gnss_sem_map.voxel_map import State, VoxelMap, keys_of
+from gnss_sem_map.voxel_map import VoxelMap, keys_of
 
 PARKED = "vehicle"
 """Class of what stands elsewhere when the second drive comes: no map is laid onto it."""
@@ -74,16 +74,20 @@ def merge_runs(
     and maps that do not fit together.
     """
     frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
-    static, removed = [], []
-    for run in (first, second):
-        refined = tiles.read(run / "refined", label_set)  # map/ holds what moved as well
-        gone = refined.states == State.REMOVED
-        static.append(refined.voxels[~gone])
-        removed.append(refined.voxels[gone])
+    static, removed = zip(*(_parted(run, label_set) for run in (first, second)), strict=True)
     laid = lay_onto(static[0], static[1], frames[0], frames[1], match)
     T = laid.match.T_target_source if laid.match else None
     stands, gone_too = (merge(a, b, frames[0], frames[1], T) for a, b in (static, removed))
     return MergedRuns(stands, gone_too, frames[0], laid)
+
+
+def _parted(run: Path, label_set: LabelSet | None) -> tuple[VoxelMap, VoxelMap]:
+    """What stands in a run, and what moved: map/ holds all evidence, refined/ says what of it stands."""
+    everything, stands = tiles.read(run / "map", label_set), tiles.read(run / "refined", label_set).standing
+    try:
+        return stands, everything.voxels - stands
+    except DataError:
+        raise DataError(f"{run}: map/ and refined/ are not of one run; make the run again") from None
 
 
 def lay_onto(

@@ -1,5 +1,6 @@
 """The whole flow on one page: a drive in, a trajectory and a semantic map out (Fig. 1 of the paper).
 
+    preflight           the log against physics, and its sensors against each other: a probable mistake stops the run
     trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive); sweeps matched by it
                         bind it in turn
     motion              which points belong to something that moved
@@ -22,13 +23,14 @@ from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import label_calibration, labels
+from gnss_sem_map import label_calibration, labels, preflight
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.camera_check import check_projection, check_stamps
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import build_maps
 from gnss_sem_map.motion import find_moving
+from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.refinement.moving_objects import MovingObjects
@@ -40,7 +42,7 @@ from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sharpness import Sharpness, of_drive
 from gnss_sem_map.surface_heights import surface_heights
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 MATCHED_SHARE = 0.95
 """With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
@@ -63,6 +65,8 @@ class Result:
     """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
     kerbs: Kerbs | None = None
     """Where points of the refined map must be told apart into road and sidewalk."""
+    preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
+    """What was found before any work."""
 
 
 def run(
@@ -75,15 +79,19 @@ def run(
     resume: bool = False,
     workers: int = 1,
     labels_from: str = "",
+    force: bool = False,
 ) -> Result:
     """Trajectory, raw map and refined map of one drive.
 
     Without a segmenter, or without images, the map has no labels. What is mapped is kept in the folder `work` until
-    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. Raises DataError when not
-    one scan can be used, MeasurementError and EstimationError from the smoother.
+    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. `force` goes on where the
+    pre-flight is red. Raises PreflightError, DataError when not one scan can be used, MeasurementError and
+    EstimationError from the smoother.
     """
+    log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
     _refuse_early(log, segmenter, settings)
+    page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
         solutions = solve(log, settings, account, progress)
@@ -111,8 +119,24 @@ def run(
         )
         refinement = replace(refinement, steps=(*refinement.steps, levels))
         progress("refinement", 1, 1)
+    if (refined.states == State.REMOVED).all():
+        account.warnings.append("everything was taken for moving: what is drawn is what was removed")
     raw = SemanticMap.of(maps.static + maps.removed)
-    return Result(trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs)
+    return Result(
+        trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs, page
+    )
+
+
+def check_drive(
+    log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account, force: bool = False
+) -> Preflight:
+    """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
+    with account.stage("preflight"):
+        page = preflight.check(log, settings, segmenter)
+    if page.level is Level.RED and not force:
+        raise PreflightError(log.name, page)
+    account.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
+    return page
 
 
 def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
@@ -164,6 +188,7 @@ def solve(
     """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given."""
     if log.given is not None:
         return ()
+    log = log.in_our_conventions(settings.sensors)
     imu, gnss, frame = log.imu, log.gnss, log.frame
     if imu is None or gnss is None or frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")

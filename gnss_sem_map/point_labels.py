@@ -54,6 +54,8 @@ def label_points(
             p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
             return None  # counted when the map was built
+        if not valid.any():
+            return None  # likewise
         keys = keys_of(p_map, settings.mapping.voxel_size_m)
         places = [m.voxels.places(keys) for m in (maps[:1] if one_grid else maps)]
         places *= len(maps) // len(places)

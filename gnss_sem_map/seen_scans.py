@@ -30,7 +30,7 @@ from gnss_sem_map.labelling import (
     view_at,
     visible,
 )
-from gnss_sem_map.segmentation import MissingLabels, Segmenter
+from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.probabilities import KeepsLabels
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.voxel_map import MappingSettings, keys_of
@@ -148,6 +148,7 @@ def _see(
     account.counts["points"] += n
     account.counts["points left out"] += n - count
     account.counts["points labelled"] += len(classes)
+    account.counts["points unlabelled"] += count - len(classes)
     kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
     seen_scan = SeenScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
     if not seen_scan.keys.all():
@@ -216,6 +217,6 @@ class _Look:
             )
             names = self._segmenter.class_names
             return points, (image, class_image(seen, names, self._label_set, size, where))
-        except MissingLabels as error:
+        except DataError as error:  # of this one image; the others have theirs
             self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +19,7 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import DataError
 
 
@@ -137,6 +138,8 @@ class Skip:
     what: str
     where: str
     reason: str
+    frames: int = 1
+    """How many frames, rows or files it stands for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +167,8 @@ class SensorLog:
     reference: Trajectory | None = None
     """What the drive's own navigation system says, to compare with; never used as input."""
     skips: tuple[Skip, ...] = ()
+    conventions: SensorConventions | None = field(default_factory=SensorConventions)
+    """In which axes, units and clocks the drive says that its sensors report; None: all are ours already."""
 
     def __post_init__(self) -> None:
         for what, items in (("scans", self.scans), ("images", self.images)):
@@ -174,6 +179,20 @@ class SensorLog:
                 )
         if self.given is None and (self.imu is None or self.gnss is None):
             raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
+
+    def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
+        """The same log in our axes, units and clock, once: what is chosen wins over what the drive says of itself."""
+        if self.conventions is None:
+            return self
+        theirs = chosen.over(self.conventions)
+        offset = theirs.lidar_time_offset_s
+        return replace(
+            self,
+            imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
+            gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
+            scans=self.scans if offset == 0.0 else tuple(_later(scan, offset) for scan in self.scans),
+            conventions=None,
+        )
 
     @cached_property
     def _image_stamps(self) -> list[float]:
@@ -186,3 +205,12 @@ class SensorLog:
         near = [self.images[i] for i in (after - 1, after) if 0 <= i < len(stamps)]
         best = min(near, key=lambda image: abs(image.stamp - stamp), default=None)
         return best if best is not None and abs(best.stamp - stamp) <= within_s else None
+
+
+def _later(scan: Scan, offset_s: float) -> Scan:
+    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s))
+
+
+def _read_later(scan: Scan, offset_s: float) -> Points:
+    points = scan.read()
+    return points if points.stamps is None else replace(points, stamps=points.stamps + offset_s)

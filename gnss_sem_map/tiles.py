@@ -1,8 +1,9 @@
 """The map on disk: Parquet tiles of 512 x 512 columns, and `map.json` that says what they mean.
 
 A tile `x_y.parquet` holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key
-(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the decision for each voxel. Keys are sorted
-and delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is there, whole, or not
+(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the decision for each voxel. A refined map
+counts all hits, and in `hits_removed` those of points that moved; its sums are of what stands. Keys are sorted and
+delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is there, whole, or not
 there; `map.json` knows the checksum of every tile.
 """
 
@@ -33,6 +34,8 @@ TILE_BITS = 9
 Z_BITS = 14
 Z_OFFSET = 1 << (Z_BITS - 1)
 FORMAT = 2
+HITS_REMOVED = "hits_removed"
+"""Column of maps in which something moved through voxels that stand."""
 Tile = tuple[int, int]
 NAME = re.compile(r"(-?\d{1,6})_(-?\d{1,6})\.parquet", re.ASCII)
 
@@ -130,6 +133,7 @@ def _piece(semantic_map: SemanticMap, places: NDArray[np.int64]) -> SemanticMap:
         semantic_map.labels[places],
         semantic_map.confidence[places],
         semantic_map.states[places],
+        hits_removed=None if semantic_map.hits_removed is None else semantic_map.hits_removed[places],
     )
 
 
@@ -144,6 +148,8 @@ def _encode(piece: SemanticMap) -> bytes:
     columns |= {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
     columns |= {"hits": voxels.hits, "label": piece.labels.astype(np.int32)}
     columns |= {"state": piece.states.astype(np.int32), "confidence": piece.confidence}
+    if piece.hits_removed is not None:
+        columns[HITS_REMOVED] = piece.hits_removed
     whole = [name for name in columns if name != "confidence"]
     sink = pa.BufferOutputStream()
     pq.write_table(
@@ -166,6 +172,7 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
         file = pq.ParquetFile(pa.BufferReader(content))
         if file.metadata.num_rows != about["voxels"]:
             raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
+        names += [HITS_REMOVED] * (HITS_REMOVED in file.schema_arrow.names)
         table = file.read(columns=names)
         columns = {name: _column(table, name) for name in names}
         if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
@@ -202,11 +209,13 @@ def _join(
     for i, name in enumerate(label_set.names):
         evidence[:, i] = column(f"log_{name}", np.int32)[order]
     voxels = VoxelMap(voxel_size_m, label_set, keys[order], evidence, column("hits", np.uint32)[order])
+    are_told = bool(parts) and all(HITS_REMOVED in part for part in parts)
     return SemanticMap(
         voxels=voxels,
         labels=column("label", np.int8)[order],
         confidence=column("confidence", np.float32)[order],
         states=column("state", np.uint8)[order],
+        hits_removed=column(HITS_REMOVED, np.uint32)[order] if are_told else None,
     )
 
 

@@ -63,7 +63,7 @@ class State(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class VoxelMap:
-    """Voxels with their evidence; `a + b` merges, `a[mask]` selects."""
+    """Voxels with their evidence; `a + b` merges, `a - b` takes a part out again, `a[mask]` selects."""
 
     voxel_size_m: float
     label_set: LabelSet
@@ -129,6 +129,21 @@ class VoxelMap:
             raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
         return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
 
+    def __sub__(self, part: VoxelMap) -> VoxelMap:
+        """What is left of this map without a part that was added to it; raises DataError for what is no part of it."""
+        places = self.places(part.keys)
+        is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
+        if not is_part or (places < 0).any() or (self.hits[places] < part.hits).any():
+            raise DataError("cannot take one map out of another that does not hold it; were both of one run?")
+        evidence, hits = self.evidence.copy(), self.hits.copy()
+        evidence[places] -= part.evidence
+        hits[places] -= part.hits
+        if evidence[hits == 0].any():
+            raise DataError(
+                "cannot take one map out of another that has other evidence; were both of one run?"
+            )
+        return replace(self, evidence=evidence, hits=hits)[hits > 0]
+
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
         """The voxels where a boolean mask holds, or those at increasing places."""
         return replace(
@@ -180,6 +195,8 @@ class SemanticMap:
     """(v,) of `State`."""
     entropy: NDArray[np.float32] | None = None
     """(v,) nat, of the class distribution behind `confidence`; None where a map was read from disk."""
+    hits_removed: NDArray[np.uint32] | None = None
+    """(v,) how many of the hits are of points that moved; None: those of the removed voxels, and no others."""
 
     def __post_init__(self) -> None:
         for name, values in (
@@ -187,6 +204,7 @@ class SemanticMap:
             ("confidence", self.confidence),
             ("states", self.states),
             ("entropy", self.entropy),
+            ("hits_removed", self.hits_removed),
         ):
             if values is not None and values.shape != (len(self.voxels),):
                 raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
@@ -210,6 +228,20 @@ class SemanticMap:
     def shown(self) -> NDArray[np.bool_]:
         """(v,) voxels with a label that belong to the map: all but the removed ones."""
         return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
+
+    @property
+    def removed_hits(self) -> NDArray[np.uint32]:
+        """(v,) how many of the hits are of points that moved."""
+        if self.hits_removed is not None:
+            return self.hits_removed
+        return np.where(self.states == State.REMOVED, self.voxels.hits, np.uint32(0))
+
+    @property
+    def standing(self) -> VoxelMap:
+        """What stands: without the removed voxels, and without the hits of what moved through the others."""
+        stands = self.states != State.REMOVED
+        voxels = self.voxels[stands]
+        return replace(voxels, hits=voxels.hits - self.removed_hits[stands])
 
 
 class VoxelTable:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.atomic import replacing
-from gnss_sem_map.export.point_cloud import visible
+from gnss_sem_map.export.point_cloud import drawable, visible
 from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
 from gnss_sem_map.export.render import FACE_LIGHT, Camera, draw_cubes, hollows
 from gnss_sem_map.labels import UNLABELLED, LabelSet
-from gnss_sem_map.voxel_map import SemanticMap, State
+from gnss_sem_map.voxel_map import SemanticMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -190,7 +190,7 @@ def write_perspective(
     trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
     map or when the file cannot be written, and MeasurementError when `at_s` lies outside the trajectory.
     """
-    kept = semantic_map.states != State.REMOVED
+    kept = drawable(semantic_map)
     if not kept.any():
         raise DataError(NO_VOXELS)
     centres, labels = semantic_map.voxels.centres[kept], semantic_map.labels[kept]

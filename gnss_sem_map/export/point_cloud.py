@@ -44,11 +44,15 @@ def colours(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
     return palette[labels]  # -1 is the last row
 
 
+def drawable(semantic_map: SemanticMap) -> NDArray[np.bool_]:
+    """Voxels that a picture may show: all but the removed ones, or these where nothing else is there."""
+    stands = semantic_map.states != State.REMOVED
+    return np.asarray(stands if stands.any() else ~stands)
+
+
 def visible(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Voxels that a picture shows: `shown`, or all but the removed ones in a map that no camera labelled."""
-    if (semantic_map.labels >= 0).any():
-        return semantic_map.shown
-    return np.asarray(semantic_map.states != State.REMOVED)
+    """Voxels that a picture is about: `shown`, or in a map that shows no label all that are `drawable`."""
+    return semantic_map.shown if semantic_map.shown.any() else drawable(semantic_map)
 
 
 def write_ply(semantic_map: SemanticMap, path: Path | str, frame: LocalFrame | None = None) -> None:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.atomic import replacing
-from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, visible
+from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, drawable, visible
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.labels import UNLABELLED
-from gnss_sem_map.voxel_map import SemanticMap, State
+from gnss_sem_map.voxel_map import SemanticMap
 
 NOTHING = -2
 """Label of a cell without any voxel."""
@@ -43,10 +43,10 @@ class TopView:
 def top_view(semantic_map: SemanticMap, longest_side: int) -> TopView:
     """Look at the map from above: of every cell, the highest labelled voxel, else the highest unlabelled one.
 
-    The view ends where the labelled voxels end; removed ones are not seen. A cell is one voxel, or as many as keep
-    the longer side within `longest_side` cells. Raises DataError for a map without voxels to see.
+    The view ends where the labelled voxels end; removed ones are not seen, unless all are. A cell is one voxel, or as
+    many as keep the longer side within `longest_side` cells. Raises DataError for a map without voxels.
     """
-    kept = semantic_map.states != State.REMOVED
+    kept = drawable(semantic_map)
     framed = visible(semantic_map)[kept]
     if not framed.any():
         raise DataError(NO_VOXELS)

@@ -53,6 +53,8 @@ WORDS = {
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260
+MANY_SKIPS = 200
+"""The page lists this many; run.json lists all."""
 
 
 def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
@@ -68,6 +70,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _facts(run),
         _picture(folder, "perspective.png"),
         _warnings(run.get("warnings", ())),
+        _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
         _section(
@@ -87,9 +90,27 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _section("Files", _files(folder)),
         _section("Versions", _pairs(run.get("versions", {}))),
     ]
+    write_page(folder / "report.html", title, sections)
+
+
+def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
+    """The findings of a pre-flight as a table, each row coloured by its level."""
+    rows = "".join(
+        f'<tr class="{escape(found["level"])}">{_cell(found["level"])}{_cell(found["check"])}{_cell(found["evidence"])}'
+        f"{_cell(found['mistake'])}{_cell(found['remedy'])}</tr>"
+        for found in findings
+    )
+    titles = "".join(
+        f"<th>{title}</th>" for title in ("", "check", "found", "probable mistake", "what to do")
+    )
+    return f'<div class="scroll"><table><tr>{titles}</tr>{rows}</table></div>' if rows else ""
+
+
+def write_page(path: Path, title: str, sections: Iterable[str]) -> None:
+    """Write one self-contained page of HTML sections; raises DataError when the file cannot be written."""
     template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
     page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    with replacing(folder / "report.html") as file:
+    with replacing(path) as file:
         file.write(page.encode("utf-8"))
 
 
@@ -144,11 +165,11 @@ def _skips(skips: Mapping[str, Any]) -> str:
     listed = skips.get("listed", ())
     if not listed:
         return ""
-    table = _table(
-        ("what", "where", "why"), [(skip["what"], skip["where"], skip["reason"]) for skip in listed]
+    rows = [(skip["what"], skip["where"], skip["reason"]) for skip in listed[:MANY_SKIPS]]
+    more = skips.get("count", len(listed)) - len(rows)
+    return _table(("what", "where", "why"), rows) + (
+        f"<p>and {more:,} more, which run.json lists</p>" if more > 0 else ""
     )
-    more = skips.get("count", len(listed)) - len(listed)
-    return table + (f"<p>and {more:,} more</p>" if more > 0 else "")
 
 
 def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
@@ -173,7 +194,7 @@ def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
         strict = scores.get("strict", {}).get("mean_iou")
         remarks[f"evaluated points that the {stage} map labels"] = _percent(scores.get("coverage"))
         remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = _percent(strict)
-    known = {key: about_map[key] for key in ("voxels", "points") if key in about_map}
+    known = {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map}
     return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(remarks)
 
 

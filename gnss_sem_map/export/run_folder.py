@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -28,13 +29,12 @@ from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.point_labels import label_points
+from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.refinement import RefinementReport
 from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
 from gnss_sem_map.sensor_log import SensorLog
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
-MANY_SKIPS = 200
-"""run.json lists this many skips; it always says how many there were."""
 
 
 @contextmanager
@@ -87,6 +87,7 @@ def write_run(
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, result.account) | {
             "inputs": {"drive": str(drive.resolve()), "segmenter": _absolute(segmenter)},
+            "preflight": result.preflight.as_dict(),
             "trajectory": _about_solution(result.solution),
             "map": _about_map(result),
         }
@@ -127,12 +128,16 @@ def write_trajectory_run(
     solution: Solution | None,
     account: Account,
     settings: Settings,
+    page: Preflight,
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with new_folder(out) as folder:
         _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        about = about_run(drive, log, account) | {"trajectory": _about_solution(solution)}
+        about = about_run(drive, log, account) | {
+            "preflight": page.as_dict(),
+            "trajectory": _about_solution(solution),
+        }
         _write_json(folder / "run.json", about)
     return about
 
@@ -186,7 +191,10 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
 
 def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
     """What went in, what was left out and why, and what it cost."""
-    skips = sorted({(s.what, s.where, s.reason) for s in account.skips})
+    skips = sorted(set(account.skips), key=astuple)
+    frames: Counter[str] = Counter()
+    for skip in skips:
+        frames[skip.what] += skip.frames
     return {
         "versions": {name: _version(name) for name in PACKAGES},
         "drive": drive.name,
@@ -197,9 +205,8 @@ def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
         "warnings": account.warnings,
         "skips": {
             "count": len(skips),
-            "listed": [
-                dict(zip(("what", "where", "reason"), skip, strict=True)) for skip in skips[:MANY_SKIPS]
-            ],
+            "frames": dict(sorted(frames.items())),
+            "listed": [asdict(skip) for skip in skips],
         },
         "seconds": {name: round(value, 3) for name, value in account.seconds.items()},
         "peak_memory_mb": {name: round(value) for name, value in account.peak_memory_mb.items()},
@@ -211,6 +218,7 @@ def _about_map(result: Result) -> dict[str, Any]:
     return {
         "voxels": len(result.raw),
         "points": int(result.raw.voxels.hits.sum()),
+        "points_removed": int(result.refined.removed_hits.sum()),
         "labelled": {
             stage: {name: int(np.count_nonzero(m.labels[m.shown] == i)) for i, name in enumerate(names)}
             for stage, m in (("raw", result.raw), ("refined", result.refined))

@@ -79,7 +79,7 @@ def _within(most_voxels: int, semantic_map: SemanticMap) -> tuple[_Voxels, str]:
     unlabelled = semantic_map.labels < 0
     remark = ""
     rows = np.arange(len(semantic_map))
-    if len(rows) > most_voxels and not unlabelled.all():
+    if len(rows) > most_voxels and semantic_map.shown.any():
         rows = np.flatnonzero(~unlabelled)
         remark = ", without the unlabelled ones"
     if not len(rows):
@@ -127,7 +127,7 @@ def _meta(voxels: _Voxels, label_set: LabelSet, trajectory: Trajectory | None) -
     counts = np.bincount(voxels.labels[shown], minlength=len(label_set.names) + 1).tolist()
     low, high = np.percentile(voxels.indices[:, 2] - origin[2], [2, 98])
     framed = shown & (voxels.labels < len(label_set.names))
-    framed = framed if framed.any() else np.ones_like(shown)
+    framed = framed if framed.any() else shown if shown.any() else ~shown
     low_corner, high_corner = np.percentile(voxels.indices[framed] - origin, [2, 98], axis=0)
     return {
         "voxel_m": voxels.size_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +32,7 @@ class Frames:
     skips: list[Skip]
 
 
-def numbered(folder: Path, *suffixes: str) -> Frames:
+def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
     """The files whose name is a number, of any of these endings; none when there is no such folder.
 
     Of several files of one frame the one of the first ending stays, then the first by name. Raises DataError for a
@@ -45,9 +46,9 @@ def numbered(folder: Path, *suffixes: str) -> Frames:
     for path in sorted(of_kind, key=lambda path: suffixes.index(path.suffix.lower())):
         number = int(path.stem)
         if number > LARGEST_NUMBER:
-            skips.append(Skip("file", shown(path), f"frame number above {LARGEST_NUMBER}"))
+            skips.append(Skip(what, shown(path), f"frame number above {LARGEST_NUMBER}"))
         elif number in files:
-            skips.append(Skip("file", shown(path), f"same frame as {files[number].name}"))
+            skips.append(Skip(what, shown(path), f"frame {number} has another file, {files[number].name}"))
         else:
             files[number] = path
     return Frames(dict(sorted(files.items())), skips)
@@ -95,12 +96,12 @@ def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     return read_picture(path, size)
 
 
-def missing(what: str, folder: Path, expected: set[int], files: dict[int, Path]) -> list[Skip]:
-    """One skip for every run of frames that should have a file and have none."""
-    absent = sorted(expected - set(files))
+def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path]) -> list[Skip]:
+    """One skip for every run of known frames without a file."""
+    absent = sorted(set(known) - set(files))
     breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
     runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
     return [
-        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing")
+        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing", len(run))
         for run in runs
     ]

@@ -154,9 +154,9 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 
 def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows of the navigation unit, sorted, without repeats; and what was left out."""
-    found = frames.numbered(drive / "oxts" / "data", ".txt")
+    found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
     stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
-    skips += found.skips + frames.missing("oxts", drive / "oxts", set(stamps), found.files)
+    skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
     rows: dict[int, Array] = {}
     for number, path in found.files.items():
         fault, row = _oxts_row(path)
@@ -227,13 +227,13 @@ def _attitudes(oxts: Array) -> Array:
 
 def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     folder = drive / "velodyne_points"
-    found = frames.numbered(folder / "data", ".bin")
+    found = frames.numbered("scan", folder / "data", ".bin")
     if not found.files:
-        return (), found.skips
+        return (), found.skips + _all_missing("scan", folder)
     (middle, skips), (start, in_start), (end, in_end) = (
         _stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
     )
-    skips += in_start + in_end + found.skips + frames.missing("scan", folder, set(middle), found.files)
+    skips += in_start + in_end + found.skips + frames.missing("scan", folder, middle, found.files)
     scans = []
     for number, path in found.files.items():
         if number not in middle or number not in start or number not in end:
@@ -260,11 +260,11 @@ def _read_sweep(path: Path, start: float, end: float, state: frames.State | None
 
 def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
     folder = drive / "image_02"
-    found = frames.numbered(folder / "data", *frames.IMAGE_SUFFIXES)
+    found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
     if not found.files:
-        return (), found.skips
+        return (), found.skips + _all_missing("image", folder)
     stamps, skips = _stamps_ns(folder / "timestamps.txt")
-    skips += found.skips + frames.missing("image", folder, set(stamps), found.files)
+    skips += found.skips + frames.missing("image", folder, stamps, found.files)
     images = []
     for number, path in found.files.items():
         if number in stamps:
@@ -273,3 +273,9 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
         else:
             skips.append(Skip("image", shown(path), "no stamp for this frame"))
     return in_order("image", images, skips), skips
+
+
+def _all_missing(what: str, folder: Path) -> list[Skip]:
+    """The frames of a sensor that has no file at all, if it has stamps."""
+    path = folder / "timestamps.txt"
+    return frames.missing(what, folder, _stamps_ns(path)[0], {}) if is_file(path) else []

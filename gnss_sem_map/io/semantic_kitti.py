@@ -19,14 +19,13 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import frames, kitti_calibration
 from gnss_sem_map.io.stamps import LONGEST_FRAME_STEP_S, check_unit
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
-from gnss_sem_map.untrusted.files import is_file, read_lines, shown
+from gnss_sem_map.untrusted.files import is_file, is_folder, read_lines, shown
 
 Array = NDArray[np.float64]
 
 SIX_DIGITS = 2e-4
 """How far rows of six digits, multiplied many times over, are off a rotation."""
 FARTHEST_M = 1e6
-MOST_FRAMES = 1_000_000
 
 
 def read(sequence: Path) -> SensorLog:
@@ -42,25 +41,28 @@ def read(sequence: Path) -> SensorLog:
             f"{shown(sequence)}: found {len(poses)} poses and {len(times)} times, expected as many;"
             " are poses.txt and times.txt of the same sequence?"
         )
-    scan_files = frames.numbered(sequence / "velodyne", ".bin")
-    image_files = frames.numbered(sequence / "image_2", *frames.IMAGE_SUFFIXES)
+    scan_files = frames.numbered("scan", sequence / "velodyne", ".bin")
+    image_files = frames.numbered("image", sequence / "image_2", *frames.IMAGE_SUFFIXES)
     size = _image_size(image_files.files)
     K, T_camera_camera0 = kitti_calibration.split_projection(rows["P2"], f"{shown(file)}: P2")
     calibration = Calibration(
         T_imu_lidar=np.eye(4), T_camera_lidar=T_camera_camera0 @ Tr, K=K, image_size=size
     )
     skips = [
-        Skip(what, shown(path), "no pose for this frame")
-        for what, found in (("scan", scan_files), ("image", image_files))
-        for number, path in found.files.items()
-        if number >= len(poses)
+        *_left_out("scan", sequence / "velodyne", len(poses), scan_files),
+        *_left_out("image", sequence / "image_2", len(poses), image_files),
     ]
     return SensorLog(
         name=f"sequence {shown(sequence.name)}",
         epoch_ns=0,
         calibration=calibration,
         scans=tuple(
-            Scan(path.stem, number, float(times[number]), partial(_read_compensated, path, frames.state_of(path)))
+            Scan(
+                path.stem,
+                number,
+                float(times[number]),
+                partial(_read_compensated, path, frames.state_of(path)),
+            )
             for number, path in scan_files.files.items()
             if number < len(poses)
         ),
@@ -70,17 +72,18 @@ def read(sequence: Path) -> SensorLog:
             if number < len(poses)
         ),
         given=Trajectory(times, _lidar_poses(poses, Tr)),
-        skips=(*skips, *scan_files.skips, *image_files.skips, *_gaps("scan", scan_files.files, sequence / "velodyne"),
-               *_gaps("image", image_files.files, sequence / "image_2")),
-    )  # fmt: skip
+        skips=tuple(skips),
+    )
 
 
-def _gaps(what: str, files: dict[int, Path], folder: Path) -> list[Skip]:
-    """Frames that are missing between the first and the last: poses usually cover more than those."""
-    if not files:
-        return []
-    last = min(max(files), min(files) + MOST_FRAMES)
-    return frames.missing(what, folder, set(range(min(files), last)), files)
+def _left_out(what: str, folder: Path, poses: int, found: frames.Frames) -> list[Skip]:
+    """Frames with a pose and no file, files without a pose, and files of a frame that has another one."""
+    beyond = [path for number, path in found.files.items() if number >= poses]
+    return [
+        *(frames.missing(what, folder, range(poses), found.files) if is_folder(folder) else ()),
+        *(Skip(what, shown(path), "no pose for this frame") for path in beyond),
+        *found.skips,
+    ]
 
 
 def _times(path: Path) -> Array:

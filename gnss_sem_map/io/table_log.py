@@ -1,6 +1,7 @@
 """Table logs: a user's own drive as plain tables, with scans and images beside them where there are any.
 
-    imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up
+    imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
+                                                       or as `imu_axes`, `force_unit`, `rate_unit` of log.yaml say
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
@@ -17,10 +18,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu, far_off
+from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import frames
 from gnss_sem_map.io.fixes import usable_fixes
@@ -53,8 +55,8 @@ IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
 
 
-class LogFile(BaseModel):
-    """What `log.yaml` may say about the drive."""
+class LogFile(SensorConventions):
+    """What `log.yaml` may say about the drive; its axes, units and clocks are those of `SensorConventions`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -102,6 +104,7 @@ def read(drive: Path) -> SensorLog:
         imu=imu,
         gnss=gnss,
         imu_noise=about.imu_noise,
+        conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*skips, *fix_skips, *scan_skips, *image_skips),
     )
 
@@ -187,19 +190,27 @@ def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any
     return table
 
 
-def _stamps_of(path: Path) -> dict[int, float]:
-    """Stamp, s, by frame number, which may have 19 digits: it is never a floating number."""
-    columns = ("number", "stamp_s")
-    table = _columns(path, columns, {"number": "string", "stamp_s": "float64"})
-    numbers, stamps = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
-    found = {}
-    for text, stamp in zip(numbers, stamps.tolist(), strict=True):
+def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
+    """Stamp of every frame, the first where there are several; and the lines that were left out.
+
+    A number may have 19 digits: it is never a floating number.
+    """
+    table = _columns(path, ("number", "stamp_s"), {"number": "string", "stamp_s": "float64"})
+    texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
+    check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
+    stamps: dict[int, float] = {}
+    skips = []
+    for line, (text, stamp) in enumerate(zip(texts, seconds.tolist(), strict=True), 2):
         number = _whole(text or "")
-        if number is not None and np.isfinite(stamp):
-            found[number] = stamp
-    if not found:
-        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(numbers)} rows")
-    return found
+        if number is None or not np.isfinite(stamp):
+            skips.append(Skip(what, f"{shown(path)}: line {line}", "no number, or no stamp"))
+        elif number in stamps:
+            skips.append(Skip(what, f"{shown(path)}: line {line}", f"frame {number} has a stamp already"))
+        else:
+            stamps[number] = stamp
+    if not stamps:
+        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(texts)} rows")
+    return stamps, skips
 
 
 def _whole(text: str) -> int | None:
@@ -213,17 +224,17 @@ def _whole(text: str) -> int | None:
 
 def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has both; and what was left out."""
-    of_folder = frames.numbered(folder, *suffixes)
-    files, skips = of_folder.files, of_folder.skips
-    if not files:
-        return [], skips
-    stamps = _stamps_of(folder / "stamps.csv")
-    check_unit(np.array(list(stamps.values())), LONGEST_FRAME_STEP_S, shown(folder / "stamps.csv"))
+    found = frames.numbered(what, folder, *suffixes)
+    if not found.files and not is_file(folder / "stamps.csv"):
+        return [], found.skips
+    stamps, skips = _stamps(folder / "stamps.csv", what)
     skips += [
-        Skip(what, shown(path), "no stamp for this frame") for n, path in files.items() if n not in stamps
+        Skip(what, shown(path), "no stamp for this frame")
+        for number, path in found.files.items()
+        if number not in stamps
     ]
-    skips += [Skip(what, f"{shown(folder)}: frame {n}", "file missing") for n in stamps if n not in files]
-    return [(n, stamps[n], path) for n, path in files.items() if n in stamps], skips
+    skips += frames.missing(what, folder, stamps, found.files) + found.skips
+    return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
 
 
 def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:

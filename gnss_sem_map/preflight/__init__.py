@@ -20,7 +20,7 @@ from gnss_sem_map.sensor_log import SensorLog
 def check(log: SensorLog, settings: Settings, segmenter: Segmenter | None = None) -> Preflight:
     """Every check that the sensors of a drive allow; raises nothing for what it finds wrong."""
     start = time.perf_counter()
-    findings = tuple(_findings(Sample(log, settings, segmenter)))
+    findings = tuple(_findings(Sample(log.in_our_conventions(settings.sensors), settings, segmenter)))
     return page_of(findings, time.perf_counter() - start)
 
 

@@ -1,4 +1,4 @@
-"""What the pre-flight says: one finding per check, each green, amber or red, with the probable mistake and its remedy."""
+"""What the pre-flight says: one finding per check; amber and red ones name the probable mistake and its remedy."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ Every step turns log scores (v, c) into better ones, can be switched off, and re
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -407,7 +407,8 @@ def _decide(
 def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     """The map with a layer of REMOVED voxels, of class vehicle, wherever nothing of the static map stands.
 
-    Raises DataError for another voxel size or class set.
+    Where something stands, its evidence and its decision stay, and the hits of what moved through are counted beside
+    its own, in `hits_removed`: no point is lost. Raises DataError for another voxel size or class set.
     """
     alone = removed[static.voxels.places(removed.keys) < 0]
     voxels = static.voxels + alone
@@ -422,7 +423,18 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     if static.entropy is not None:
         entropy = np.empty(len(voxels), np.float32)
         entropy[kept], entropy[added] = static.entropy, entropy_of(alone.probabilities)
-    return SemanticMap(voxels, labels, confidence, states, entropy)
+    refined = SemanticMap(voxels, labels, confidence, states, entropy)
+    return refined if len(alone) == len(removed) else _with_hits(refined, static, removed)
+
+
+def _with_hits(refined: SemanticMap, static: SemanticMap, removed: VoxelMap) -> SemanticMap:
+    """The same voxels; those of `static` that things moved through have their hits as well."""
+    hits, gone = refined.voxels.hits.copy(), refined.removed_hits.copy()
+    through = removed[static.voxels.places(removed.keys) >= 0]
+    places = refined.voxels.places(through.keys)
+    hits[places] += through.hits
+    gone[places] += through.hits
+    return replace(refined, voxels=replace(refined.voxels, hits=hits), hits_removed=gone)
 
 
 def _classes(label_set: LabelSet, *names: str) -> tuple[int, ...]:

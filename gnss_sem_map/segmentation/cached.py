@@ -18,6 +18,8 @@ from gnss_sem_map.untrusted.pictures import read_ids
 
 HARD_LABEL_PROBABILITY = 0.9
 """What a label image's class gets; the rest is spread evenly over the other classes, for no network is always right."""
+MOST_TRIED = 20
+"""Files, from all over the folder, that are tried before it is given up."""
 
 MOST_NAME_BYTES = 1 << 20
 
@@ -28,7 +30,8 @@ class CachedLabels:
     An `.npz` holds `probabilities` (h, w, c), uint8 as round(255 p) or floating in 0..1, and `class_names` (c,). A
     PNG holds one 8-bit id per pixel, named by `ids` of `taxonomy`: the class gets HARD_LABEL_PROBABILITY, every other
     class an equal share of the rest, and a void pixel no evidence at all. Frame numbers may be padded with zeros to
-    any width. Raises ConfigError or DataError when the folder, or the first file in it, is not like that.
+    any width. The first good file says what the others must be like. Raises ConfigError or DataError when the folder is
+    not like that, or none of some files from all over it.
     """
 
     def __init__(
@@ -41,7 +44,6 @@ class CachedLabels:
     ) -> None:
         self._folder, self._size = folder, expected_size
         self._files, suffix = _label_files(folder)
-        first = next(iter(self._files.values()))
         self._evidence: NDArray[np.uint8] | None = None
         if suffix == ".png":
             self._ids = ids or _default_ids(taxonomy)
@@ -52,11 +54,8 @@ class CachedLabels:
                 f"labels {folder}: found .npz probabilities, where ids={ids} means nothing; leave it out"
             )
         else:
-            self.class_names = read_probabilities(first, expected_size)[1]
-            label_set.table_from(
-                self.class_names
-            )  # a name that nobody knows is refused here, not an hour later
-        self._read(first)
+            self.class_names = ()
+        self._try(label_set)
 
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
         """The probabilities of this frame; raises MissingLabels where the folder has none, DataError for a bad file."""
@@ -71,6 +70,25 @@ class CachedLabels:
                 f"{self._folder}: no labels of frame {image.number}; {len(self._files)} frames have some"
             )
         return self._read(path)
+
+    def _try(self, label_set: LabelSet) -> None:
+        """Find a good file, and what classes it has; raises DataError when there is none among those tried."""
+        files = list(self._files.values())
+        tried = files[:: -(-len(files) // MOST_TRIED)]
+        refused: list[DataError] = []
+        for path in tried:
+            try:
+                if self._evidence is not None:
+                    self._read_ids(path)
+                else:
+                    self.class_names = read_probabilities(path, self._size)[1]
+                    label_set.table_from(self.class_names)  # a name that nobody knows is refused here
+                return
+            except DataError as error:
+                refused.append(error)
+        if len(files) > 1:
+            raise DataError(f"{refused[0]}; nor can any of {len(tried)} label files be used that were tried")
+        raise refused[0]
 
     def _read(self, path: Path) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
         if self._evidence is not None:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import pipeline
 from gnss_sem_map.camera_check import check_camera, check_projection
-from gnss_sem_map.cli import app
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io import open_drive
@@ -127,15 +124,3 @@ def test_the_exposure_of_a_real_camera_is_where_it_was_measured(real_data: Path)
     assert abs(found.time_offset_s + 0.0085) < 0.003
     assert np.abs(found.rotation_deg).max() < 0.2
     assert found.warnings == ()
-
-
-@pytest.mark.slow
-def test_the_command_says_what_it_found_and_warns_of_a_wrong_setting(drive: Path) -> None:
-    wrong = ["--set", "labelling.camera_time_offset_s=0.03"]
-    said = CliRunner().invoke(app, ["check", str(drive)])
-    assert said.exit_code == 0, said.output
-    assert "time and mounting fit the images" in said.output
-    found = json.loads(CliRunner().invoke(app, ["check", str(drive), "--json", *wrong]).stdout)
-    assert found["given_time_offset_s"] == pytest.approx(0.03)
-    assert abs(found["time_offset_s"] + 0.0085) < 0.005
-    assert "camera_time_offset_s" in found["warnings"][0]

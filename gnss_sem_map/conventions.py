@@ -1,0 +1,99 @@
+"""In which axes, units and clocks the sensors of a log report, and how their data become ours.
+
+Ours: x forward, y left, z up; specific force in m/s² (at rest it points up), angular rate in rad/s; one clock.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.measurements import GnssFixes, ImuSamples
+
+Array = NDArray[np.float64]
+
+NAMED_AXES = {"flu": "x y z", "frd": "x -y -z", "rfu": "y -x z"}
+"""Forward left up, forward right down, right forward up: each says where our x, y, z are among the sensor's axes."""
+STANDARD_GRAVITY = 9.80665
+FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
+RATE_UNITS = {"rad/s": 1.0, "deg/s": float(np.pi / 180)}
+
+
+def matrix_of(axes: str) -> Array:
+    """The (3, 3) matrix that takes a vector in the sensor's axes to ours; raises ValueError for what names no axes."""
+    words = NAMED_AXES.get(axes, axes).replace(",", " ").split()
+    if sorted(word.lstrip("+-") for word in words) != ["x", "y", "z"] or any(len(w) > 2 for w in words):
+        raise ValueError(
+            f"found {axes!r}, expected one of {', '.join(NAMED_AXES)}, or x, y, z once each in any order with signs:"
+            ' "x -y -z" where our y and z point against the sensor\'s'
+        )
+    matrix = np.zeros((3, 3))
+    for row, word in enumerate(words):
+        matrix[row, "xyz".index(word[-1])] = -1.0 if word[0] == "-" else 1.0
+    return matrix
+
+
+def _known(axes: str) -> str:
+    matrix_of(axes)
+    return axes
+
+
+Axes = Annotated[str, AfterValidator(_known)]
+
+
+class SensorConventions(BaseModel):
+    """How the sensors of a drive report. What is set here wins over what the drive's own `log.yaml` says."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    imu_axes: Axes = Field(
+        "flu",
+        description='Axes of the IMU: flu, frd, rfu, or our x, y, z in its own axes, for example "y -x z".',
+    )
+    force_axes: Axes | None = Field(
+        None,
+        description='Those of the accelerometer, where they differ: "-x -y -z" when it points down at rest.',
+    )
+    rate_axes: Axes | None = Field(None, description="Those of the gyroscope, where they differ.")
+    imu_rotation_deg: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0),
+        description="Roll, pitch, yaw of a unit that is mounted askew, after `imu_axes`: its attitude in ours.",
+    )
+    force_unit: Literal["m/s2", "g", "mg"] = Field("m/s2", description="Unit of the specific force.")
+    rate_unit: Literal["rad/s", "deg/s"] = Field("rad/s", description="Unit of the angular rate.")
+    gnss_time_offset_s: float = Field(
+        0.0, ge=-3600, le=3600, description="Moment of a fix minus its stamp: -1 when stamps are 1 s late."
+    )
+    lidar_time_offset_s: float = Field(
+        0.0, ge=-3600, le=3600, description="Moment of a point minus its stamp."
+    )
+
+    def over(self, drive: SensorConventions) -> SensorConventions:
+        """These, and where nothing is set here those of the drive."""
+        return drive.model_copy(update={name: getattr(self, name) for name in self.model_fields_set})
+
+    def imu_in_ours(self, imu: ImuSamples) -> ImuSamples:
+        """The same samples in our axes and units; the very same object where nothing is to be done."""
+        force, rate = (self._to_ours(axes) for axes in (self.force_axes, self.rate_axes))
+        force, rate = force * FORCE_UNITS[self.force_unit], rate * RATE_UNITS[self.rate_unit]
+        if np.array_equal(force, np.eye(3)) and np.array_equal(rate, np.eye(3)):
+            return imu
+        return ImuSamples(imu.stamps, imu.specific_force @ force.T, imu.angular_rate @ rate.T)
+
+    def fixes_in_ours(self, fixes: GnssFixes) -> GnssFixes:
+        """The same fixes on our clock."""
+        if self.gnss_time_offset_s == 0.0:
+            return fixes
+        return GnssFixes(fixes.stamps + self.gnss_time_offset_s, fixes.positions, fixes.stddevs)
+
+    def _to_ours(self, axes: str | None) -> Array:
+        roll, pitch, yaw = self.imu_rotation_deg
+        matrix = matrix_of(axes if axes is not None else self.imu_axes)
+        if not any(self.imu_rotation_deg):
+            return matrix
+        turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+        return np.asarray(turn @ matrix)

@@ -1,0 +1,34 @@
+"""check.html: what the pre-flight found, on one page."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.report import findings_table, write_page
+from gnss_sem_map.preflight.findings import Level, Preflight
+
+VERDICTS = {
+    Level.GREEN: "Nothing speaks against this drive.",
+    Level.AMBER: "Something is in doubt: read what is amber before you trust the map.",
+    Level.RED: "A run stops here: what is red makes a wrong map. Mend it, or run with --force.",
+}
+GENERATOR = b'<meta name="generator" content="gnss-sem-map">'
+
+
+def check_writable(path: Path) -> None:
+    """Raise DataError when something lies at `path` that is no page of ours."""
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder, expected a file to write; choose another -o")
+    if path.exists() and GENERATOR not in path.read_bytes()[:2000]:
+        raise DataError(f"{path}: exists and is no page of gnss-sem-map; choose another -o or move it away")
+
+
+def write_check_page(path: Path, name: str, page: Preflight) -> None:
+    """Write the findings of a drive as one self-contained page, over an earlier one; raises DataError."""
+    check_writable(path)
+    facts = f'<p class="facts">{escape(VERDICTS[page.level])} Checked in {page.seconds:.1f} s.</p>'
+    title = f"Pre-flight of {name}"
+    body = (f"<h1>{escape(title)}</h1>", facts, findings_table(page.as_dict()["findings"]))
+    write_page(path, title, body)

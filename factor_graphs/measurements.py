@@ -14,8 +14,8 @@ from factor_graphs.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
-# No accelerometer or gyroscope of a vehicle says more, m/s² or rad/s.
-LARGEST_OF_IMU = 1e4
+# No accelerometer or gyroscope says more, in whatever unit.
+LARGEST_OF_IMU = 1e6
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
 BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
 

@@ -180,7 +180,7 @@ class Trajectory:
             raise MeasurementError(f"{path}: no column {', '.join(missing)}; expected {', '.join(pose)}")
         stamps, *position_and_quat = (columns[name] for name in pose)
         quat_xyzw = np.column_stack(position_and_quat[3:])
-        if not (np.abs(np.linalg.norm(quat_xyzw, axis=1) - 1) < 1e-3).all():
+        if not ((np.abs(quat_xyzw) <= 1.001).all() and np.allclose((quat_xyzw**2).sum(axis=1), 1, atol=2e-3)):
             raise MeasurementError(
                 f"{path}: found quaternions that are no rotation; expected qx qy qz qw of length one"
             )

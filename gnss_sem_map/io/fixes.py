@@ -40,7 +40,8 @@ def usable_fixes(
         (is_place & ~has_accuracy, "a standard deviation that is not above 0, or beyond all sense"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]
-    return near, [Skip("fix", where, f"{rows.sum()} rows: {why}") for rows, why in kinds if rows.any()]
+    counted = [(int(rows.sum()), why) for rows, why in kinds if rows.any()]
+    return near, [Skip("fix", where, f"{count} rows: {why}", count) for count, why in counted]
 
 
 def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:

@@ -229,7 +229,7 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     folder = drive / "velodyne_points"
     found = frames.numbered("scan", folder / "data", ".bin")
     if not found.files:
-        return (), [*found.skips, *_all_missing("scan", folder)]
+        return (), found.skips + _all_missing("scan", folder)
     (middle, skips), (start, in_start), (end, in_end) = (
         _stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
     )
@@ -262,7 +262,7 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
     folder = drive / "image_02"
     found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
     if not found.files:
-        return (), [*found.skips, *_all_missing("image", folder)]
+        return (), found.skips + _all_missing("image", folder)
     stamps, skips = _stamps_ns(folder / "timestamps.txt")
     skips += found.skips + frames.missing("image", folder, stamps, found.files)
     images = []
@@ -278,7 +278,4 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
 def _all_missing(what: str, folder: Path) -> list[Skip]:
     """The frames of a sensor that has no file at all, if it has stamps."""
     path = folder / "timestamps.txt"
-    if not is_file(path):
-        return []
-    stamps, skips = _stamps_ns(path)
-    return skips + frames.missing(what, folder, stamps, {})
+    return frames.missing(what, folder, _stamps_ns(path)[0], {}) if is_file(path) else []

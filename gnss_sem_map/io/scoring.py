@@ -164,7 +164,7 @@ def read_tum(path: Path) -> Trajectory:
         raise DataError(f"{shown(path)}: {str(error)[:100]}; expected eight numbers per line") from None
     if rows.ndim != 2 or rows.shape[1] != 8 or not (np.abs(rows) <= LARGEST).all():
         raise DataError(f"{shown(path)}: found {rows.shape} numbers, expected eight finite ones per line")
-    if not (np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 1e-2).all():
+    if not np.allclose((rows[:, 4:] ** 2).sum(axis=1), 1, atol=2e-2):
         raise DataError(
             f"{shown(path)}: found quaternions that are no rotation, expected qx qy qz qw of length one"
         )

@@ -190,24 +190,27 @@ def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any
     return table
 
 
-def _stamps_of(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
-    """Stamp, s, by frame number, which may have 19 digits: it is never a floating number; and the lines left out."""
-    columns = ("number", "stamp_s")
-    table = _columns(path, columns, {"number": "string", "stamp_s": "float64"})
-    numbers, stamps = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
-    found: dict[int, float] = {}
+def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
+    """Stamp of every frame, the first where there are several; and the lines that were left out.
+
+    A number may have 19 digits: it is never a floating number.
+    """
+    table = _columns(path, ("number", "stamp_s"), {"number": "string", "stamp_s": "float64"})
+    texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
+    check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
+    stamps: dict[int, float] = {}
     skips = []
-    for line, (text, stamp) in enumerate(zip(numbers, stamps.tolist(), strict=True), 2):
+    for line, (text, stamp) in enumerate(zip(texts, seconds.tolist(), strict=True), 2):
         number = _whole(text or "")
         if number is None or not np.isfinite(stamp):
-            skips.append(Skip(what, f"{shown(path)}: line {line}", "no whole number, or no stamp"))
-        elif number in found:
+            skips.append(Skip(what, f"{shown(path)}: line {line}", "no number, or no stamp"))
+        elif number in stamps:
             skips.append(Skip(what, f"{shown(path)}: line {line}", f"frame {number} has a stamp already"))
         else:
-            found[number] = stamp
-    if not found:
-        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(numbers)} rows")
-    return found, skips
+            stamps[number] = stamp
+    if not stamps:
+        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(texts)} rows")
+    return stamps, skips
 
 
 def _whole(text: str) -> int | None:
@@ -221,17 +224,17 @@ def _whole(text: str) -> int | None:
 
 def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has both; and what was left out."""
-    of_folder = frames.numbered(what, folder, *suffixes)
-    files, skips = of_folder.files, of_folder.skips
-    if not files and not is_file(folder / "stamps.csv"):
-        return [], skips
-    stamps, unusable = _stamps_of(folder / "stamps.csv", what)
-    check_unit(np.array(list(stamps.values())), LONGEST_FRAME_STEP_S, shown(folder / "stamps.csv"))
-    skips += unusable + [
-        Skip(what, shown(path), "no stamp for this frame") for n, path in files.items() if n not in stamps
+    found = frames.numbered(what, folder, *suffixes)
+    if not found.files and not is_file(folder / "stamps.csv"):
+        return [], found.skips
+    stamps, skips = _stamps(folder / "stamps.csv", what)
+    skips += [
+        Skip(what, shown(path), "no stamp for this frame")
+        for number, path in found.files.items()
+        if number not in stamps
     ]
-    skips += frames.missing(what, folder, stamps, files)
-    return [(n, stamps[n], path) for n, path in files.items() if n in stamps], skips
+    skips += frames.missing(what, folder, stamps, found.files) + found.skips
+    return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
 
 
 def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:

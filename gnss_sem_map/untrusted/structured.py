@@ -17,7 +17,7 @@ import yaml
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.untrusted.files import read_text, shown
 
-MOST_YAML_BYTES = 4 << 20
+MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 50_000
 MOST_JSON_BYTES = 64 << 20
 MOST_NODES = 500_000
 DEEPEST = 30
@@ -77,6 +77,8 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 def parse_yaml(text: str) -> Any:
     """What YAML text says; raises ValueError, in one line, for text that is none or that we do not take."""
+    if max(map(len, text.split("\n"))) > LONGEST_YAML_LINE:
+        raise ValueError(f"a line of more than {LONGEST_YAML_LINE} characters")
     try:
         loader = _Loader(text)
         try:

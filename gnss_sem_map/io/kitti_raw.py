@@ -45,6 +45,8 @@ SPECIFIC_FORCE = slice(11, 14)
 """ax ay az: in the body; af al au are levelled with the unit's own attitude and would leak it."""
 ANGULAR_RATE = slice(17, 20)
 POSITION_ACCURACY = 23
+LEAST_ACCURACY_M = 1e-4
+"""Zero is no standard deviation; what is too small to be true is for the pre-flight to say."""
 
 
 def read(drive: Path) -> SensorLog:
@@ -54,7 +56,7 @@ def read(drive: Path) -> SensorLog:
     epoch_ns = int(oxts_ns[0])
     frame = LocalFrame(*(float(v) for v in oxts[0, [LAT, LON, ALT]]))
     stamps = _seconds(oxts_ns, epoch_ns)
-    accuracy = np.maximum(oxts[:, POSITION_ACCURACY], 0.01)
+    accuracy = np.maximum(oxts[:, POSITION_ACCURACY], LEAST_ACCURACY_M)
     gnss = GnssFixes(
         stamps, frame.to_map(*oxts[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
     )

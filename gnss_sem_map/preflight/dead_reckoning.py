@@ -62,7 +62,7 @@ def windows_of(fixes: GnssFixes, start: float, end: float) -> Windows | None:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How well the two ways agree: sums of squares, m², before (`total`) and after (`rest`) the IMU's way is taken off."""
+    """How well the two ways agree: sums of squares, m², before and after the IMU's way is taken off."""
 
     total: float
     rest: float

@@ -166,7 +166,7 @@ def _axes(seen: Seen, gain: TurnGain | None) -> tuple[list[Finding], AxesMistake
             amber(
                 "IMU axes",
                 evidence,
-                "the IMU answers to the track in no way that we know: other axes, or fixes that are not of this vehicle",
+                "the IMU answers to the track in no way that we know: odd axes, or fixes of another vehicle",
                 "check imu_axes, and that both tables are of the same drive and clock",
             )
         ], axes.RIGHT

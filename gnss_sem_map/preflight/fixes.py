@@ -1,4 +1,4 @@
-"""Which fixes can be used to judge the IMU by: no outliers, none that stand still while the vehicle drives, in degrees."""
+"""By which fixes an IMU can be judged: no outliers, and none that stand still while the vehicle drives."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ SPAN_S = 0.5
 
 
 def rate_response(imu: ImuSamples, attitude: Trajectory) -> Array:
-    """What the gyroscope says per rad/s about the attitude's own x, y, z: columns of (3, 3), NaN where it is not sure."""
+    """What the gyroscope says per rad/s about the attitude's x, y, z: columns of (3, 3), NaN where not sure."""
     unseen = np.full((3, 3), np.nan)
     inside = (attitude.stamps >= imu.stamps[0]) & (attitude.stamps <= imu.stamps[-1])
     stamps, R = attitude.stamps[inside], attitude.T_map_imu[inside, :3, :3]

@@ -28,7 +28,7 @@ STEEPEST, HEIGHT_ALLOWANCE_M = 0.5, 60.0
 NOTABLE_SHARE = 0.05
 # The data sheet of every RTK receiver says 8 mm + 1 ppm; none measures a moving vehicle better.
 BEST_RECEIVER_M = 0.008
-# Heights of a road change slowly: when the fixes' scatter is so many claimed deviations, and this much, m, it is theirs.
+# Heights of a road change slowly: a scatter of so many claimed deviations, and this much, m, is the fixes' own.
 SCATTER_RATIO, SCATTER_M = 5.0, 0.1
 THIRD_DIFFERENCE, MAD = np.sqrt(20.0), 1.4826
 # A lag is told of from the first, s, and makes a wrong map when it moves the vehicle by the second, m.
@@ -110,7 +110,7 @@ def _frozen(fixes: GnssFixes, found: Fixes) -> Finding:
     total = float(np.ptp(found.frozen, axis=1).sum())
     return red(
         "GNSS frozen",
-        f"one position for {last - first:.1f} s from stamp {first:.1f} s while the vehicle drives, {total:.1f} s in all",
+        f"one position from {first:.1f} to {last:.1f} s while the vehicle drives, {total:.1f} s in all",
         "the GNSS is frozen: the receiver repeats its last position",
         "drop these fixes: an outage is bridged, a repeated position is believed",
     )

@@ -41,7 +41,7 @@ class TurnGain:
 
 @dataclass(frozen=True, eq=False)
 class ForceResponse:
-    """What the accelerometer says, (3,) each: at no acceleration, per m/s² of speeding up, per m/s² of a bend to the left.
+    """What the accelerometer says, (3,) each: unaccelerated, per m/s² of speeding up, and of a bend to the left.
 
     `stddevs` (3,) of each of them, per axis.
     """
@@ -55,7 +55,7 @@ class ForceResponse:
 def turn_gain(
     turned: SmoothedIntegral, track: Track, lag_s: float = 0.0, gain: float | None = None
 ) -> TurnGain | None:
-    """The gain that fits best (or the misfit of a given one), with fixes `lag_s` later than stamped; None: no course."""
+    """The gain that fits best (or a given one), with fixes `lag_s` later than stamped; None: no course."""
     courses, stamps, moving = track.courses, track.stamps, track.is_moving
     if moving.sum() < LEAST_INTERVALS:
         return None
@@ -91,9 +91,9 @@ def turn_gain(
 def force_response(
     imu: ImuSamples, up_rate: Array, track: Track, gain: float = 1.0, lag_s: float = 0.0
 ) -> ForceResponse | None:
-    """The accelerometer against the track; `up_rate` (n,) rad/s is the rate about the vertical, `gain` its sign and unit.
+    """The accelerometer against the track; None: too few intervals.
 
-    None: too few intervals.
+    `up_rate` (n,) rad/s is the rate about the vertical, `gain` its sign and unit.
     """
     t, stamps, speeds = imu.stamps, track.stamps, track.speeds
     if len(stamps) < LEAST_INTERVALS:

@@ -32,6 +32,7 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Array:
     return Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix().T
 
 
+Y_MIRRORED = np.diag([1.0, -1.0, 1.0])
 # what the sensors report: (force matrix, rate matrix), words
 IMU: dict[str, tuple[Array, Array, tuple[str, ...]]] = {
     "FRD": (FRD, FRD, ("frd",)),
@@ -39,7 +40,7 @@ IMU: dict[str, tuple[Array, Array, tuple[str, ...]]] = {
     "x backwards, turned by 180": (BACKWARDS, BACKWARDS, ("x points backwards", "180")),
     "x of force and rate reversed alone": (np.diag([-1.0, 1, 1]), np.diag([-1.0, 1, 1]), ("x points backwards",)),
     "x of force reversed alone": (np.diag([-1.0, 1, 1]), np.eye(3), ("x points backwards",)),
-    "y of force and rate reversed alone": (np.diag([1.0, -1, 1]), np.diag([1.0, -1, 1]), ("y points", "y of the force")),
+    "y of force and rate reversed alone": (Y_MIRRORED, Y_MIRRORED, ("y points", "y of the force")),
     "gyroscope reversed": (np.eye(3), -np.eye(3), ("gyroscope turns the wrong way",)),
     "turned by +90": (_rotation(0, 0, 90), _rotation(0, 0, 90), ("90°",)),
     "turned by -90": (_rotation(0, 0, -90), _rotation(0, 0, -90), ("90°",)),

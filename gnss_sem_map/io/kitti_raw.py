@@ -182,9 +182,9 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
         elif not start[number] < end[number]:
             skips.append(Skip("scan", str(path), "the sweep ends before it starts"))
         else:
-            sweep = tuple((t[number] - epoch_ns) * 1e-9 for t in (start, end))
+            sweep = (start[number] - epoch_ns) * 1e-9, (end[number] - epoch_ns) * 1e-9
             stamp = (middle[number] - epoch_ns) * 1e-9
-            scans.append(Scan(path.stem, number, stamp, partial(_read_sweep, path, *sweep)))
+            scans.append(Scan(path.stem, number, stamp, partial(_read_sweep, path, *sweep), sweep))
     return _in_order(scans, skips)
 
 

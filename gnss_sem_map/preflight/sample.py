@@ -3,10 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.errors import FactorGraphError
+from factor_graphs.measurements import ImuSamples
+from factor_graphs.smoothing import smooth
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
+from gnss_sem_map.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.preflight.lidar_motion import STEPS, Stretch, Surfaces, stretch
+from gnss_sem_map.registration import inverse
 from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import Points, SensorLog
+
+Array = NDArray[np.float64]
+LONGEST_S = 60.0
+"""Of a longer drive so much is smoothed, and looked at closely."""
+SCANS_PER_STRETCH, MOST_STRETCHES = 40, 6
+"""One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
+LONGEST_STRETCH_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,3 +35,118 @@ class Sample:
     log: SensorLog
     settings: Settings
     segmenter: Segmenter | None
+
+    @cached_property
+    def trajectory(self) -> Trajectory | None:
+        """The poses that came with the drive, or IMU and fixes of one stretch smoothed; None where that fails."""
+        log = self.log
+        if log.given is not None or log.imu is None or log.gnss is None or log.frame is None:
+            return log.given
+        start = self._start
+        inside = (log.imu.stamps >= start) & (log.imu.stamps <= start + LONGEST_S)
+        fixes = (log.gnss.stamps >= start) & (log.gnss.stamps <= start + LONGEST_S)
+        imu = ImuSamples(*(a[inside] for a in (log.imu.stamps, log.imu.specific_force, log.imu.angular_rate)))
+        smoother = self.settings.trajectory
+        if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
+            smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
+        attitude = log.initial_attitude if inside[0] else None
+        lever = log.calibration.p_imu_antenna
+        try:
+            return smooth(imu, log.gnss[fixes], log.frame, smoother, lever, attitude).trajectory
+        except FactorGraphError:
+            return None
+
+    @property
+    def _start(self) -> float:
+        """Where the smoothed stretch begins: at the start, or where most way lies ahead."""
+        assert self.log.imu is not None
+        assert self.log.gnss is not None
+        imu, gnss = self.log.imu.stamps, self.log.gnss
+        if imu[-1] - imu[0] <= LONGEST_S:
+            return float(imu[0])
+        starts = np.arange(imu[0], imu[-1] - LONGEST_S, LONGEST_S / 2)
+        at = np.column_stack([np.interp(starts, gnss.stamps, p) for p in gnss.positions.T])
+        later = np.column_stack([np.interp(starts + LONGEST_S, gnss.stamps, p) for p in gnss.positions.T])
+        return float(starts[np.argmax(np.linalg.norm(later - at, axis=1))])
+
+    @cached_property
+    def stretches(self) -> tuple[Stretch, ...]:
+        """A few seconds of the drive, as the LiDAR saw its own motion, where the vehicle moves most."""
+        scans = self.log.scans
+        last = len(scans) - 1 - STEPS[-1]
+        if last < 0:
+            return ()
+        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 2, MOST_STRETCHES))
+        firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
+        motion = np.array([self._motion(first) for first in firsts])
+        found: list[Stretch] = []
+        taken: list[int] = []
+        for place in np.argsort(-motion, kind="stable"):
+            first = int(firsts[place])
+            if len(found) == wanted or motion[place] < 0:
+                break
+            if any(abs(first - other) < STEPS[-1] for other in taken):
+                continue
+            taken.append(first)
+            try:
+                seen = stretch(scans, first, self._starts(first))
+            except DataError:
+                continue  # counted when the map is built
+            if seen is not None:
+                found.append(seen)
+        return tuple(sorted(found, key=lambda s: s.sweeps[0].stamp))
+
+    @cached_property
+    def first_points(self) -> tuple[Points, float] | None:
+        """The first scan that can be read, and its stamp."""
+        for scan in self.log.scans[:10]:
+            try:
+                return scan.read(), scan.stamp
+            except DataError:
+                continue
+        return None
+
+    def deskewed(self, seen: Stretch) -> tuple[Array, Surfaces]:
+        """A stretch with the times that its points were given, see `Stretch.deskewed`: computed once."""
+        if id(seen) not in self._deskewed:
+            self._deskewed[id(seen)] = seen.deskewed(
+                tuple(
+                    (s.after_s, s.dense_after_s)
+                    if s.after_s is not None and s.dense_after_s is not None and np.ptp(s.after_s) < LONGEST_SWEEP_S
+                    else None
+                    for s in seen.sweeps
+                )
+            )
+        return self._deskewed[id(seen)]
+
+    @cached_property
+    def _deskewed(self) -> dict[int, tuple[Array, Surfaces]]:
+        return {}
+
+    def _starts(self, first: int) -> tuple[Array, ...]:
+        """Where the second sweep may be by the trajectory, T_first_second: straight ahead, and as the extrinsics say."""
+        track, stamps = self.trajectory, [scan.stamp for scan in self.log.scans[first : first + 2]]
+        if track is None:
+            return ()
+        a, b = track.at(stamps, EXTRAPOLATE_S)
+        way = inverse(a) @ b
+        T_imu_lidar = self.log.calibration.T_imu_lidar.copy()
+        T_imu_lidar[:3, 3] = 0.0
+        along = np.linalg.norm(way[:3, 3])
+        ahead = np.eye(4)
+        ahead[0, 3] = along
+        return inverse(T_imu_lidar) @ way @ T_imu_lidar, ahead
+
+    def _motion(self, first: int) -> float:
+        """How far a stretch moves, m, a turn counted as at 10 m; -1 where it has a gap or leaves the trajectory."""
+        stamps = np.array([self.log.scans[first + step].stamp for step in (0, STEPS[-1])])
+        if stamps[1] - stamps[0] > LONGEST_STRETCH_S:
+            return -1.0
+        track = self.trajectory
+        if track is None:
+            return 0.0
+        if stamps[0] < track.start - EXTRAPOLATE_S or stamps[1] > track.end + EXTRAPOLATE_S:
+            return -1.0
+        a, b = track.at(stamps, EXTRAPOLATE_S)
+        turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
+        return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)

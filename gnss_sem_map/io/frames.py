@@ -44,8 +44,15 @@ def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path
     ]
 
 
+FARTHEST_M, NEAREST_M = 1000.0, 1e-6
+"""No LiDAR on a road sees farther; and a coordinate nearer to zero, but not zero, is no measurement."""
+NO_POINTS, EVERY = 0.1, 8
+"""With so many of its points out of these bounds a file is no scan: of random bytes nine in ten coordinates are. Every
+eighth point tells it at no cost."""
+
+
 def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:
-    """Rows of little-endian float32 (n, columns); raises DataError for a file that is cut short or empty."""
+    """Rows of little-endian float32 (n, columns); raises DataError for a file that is cut short, empty, or no scan."""
     try:
         with path.open("rb", buffering=0) as file:
             size = os.fstat(file.fileno()).st_size
@@ -54,9 +61,22 @@ def read_points(path: Path, columns: int = 4) -> NDArray[np.float32]:
                 raise DataError(
                     f"{path}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more than 0"
                 )
+        _refuse_other_bytes(rows, path)
         return rows
     except OSError as error:
         raise DataError(f"{path}: cannot read the scan ({error.strerror})") from None
+
+
+def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
+    """Points that were not measured, zero or not finite, are no reason to refuse a scan."""
+    sizes = np.abs(rows[::EVERY, :3])
+    out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
+    share = float(out.any(axis=1).mean())
+    if share > NO_POINTS:
+        raise DataError(
+            f"{path}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within {NEAREST_M:g} m of zero,"
+            " expected metres; are these other bytes, another count of columns, or mm?"
+        )
 
 
 def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:

@@ -28,9 +28,10 @@ FULL_CIRCLE = 0.75
 AT_ONCE_S = 1e-4
 LEAST_MOTION_M = 0.1
 """What a sweep must be bent by before surfaces tell anything."""
-SURE, LIKELY = 3.0, 1.5
-"""Standard errors by which one measure, and the other, must find surfaces thinner with other times."""
-VERY_SURE = 4.0
+LEAST, RAW_SURE, COMPENSATED_SURE, CLEAR = 1.0, 3.0, 4.0, 3.0
+"""Standard errors: that both measures must find for other times, that their sum must be for scans with times and for
+compensated ones, and by which one of two other times is clearly the better. Right times of raw scans are never worse
+than none (ten drives: -1 at most); what compensation leaves may look like times by chance, 2 in a stretch."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,11 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
         f"surfaces of {len(stretches)} stretches of a second: {best.name} against {as_given.name} make them"
         f" thinner by {thicknesses:.1f} standard errors (spread {extents:.1f})"
     )
-    sure = _is_raw_sure(extents, thicknesses) if has_times else _is_sure(extents, thicknesses, len(stretches))
+    sure = min(extents, thicknesses) > LEAST and (
+        extents + thicknesses > RAW_SURE
+        if has_times
+        else len(stretches) > 1 and extents + thicknesses > COMPENSATED_SURE
+    )
     if not sure:
         return green(THICKNESS, found)
     if not has_times:
@@ -143,27 +148,16 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
             "raw scans are called compensated (lidar_is_compensated), or their times are lost",
             "set lidar_is_compensated: false and give point times in a fifth column",
         )
-    if best is REVERSED:
-        return amber(
-            THICKNESS, found, "point times are reversed: the scanner turns the other way",
-            "change the sign of the point times",
-        )  # fmt: skip
-    return amber(
-        THICKNESS,
-        found,
+    reverse = "point times are reversed: the scanner turns the other way", "change the sign of the point times"
+    twice = (
         "compensated scans are called raw: they are deskewed twice",
         "set lidar_is_compensated: true, with scans of four columns",
     )
-
-
-def _is_raw_sure(extents: float, thicknesses: float) -> bool:
-    """Right times are never worse than none or reversed, so that little is needed to doubt them."""
-    return min(extents, thicknesses) > LIKELY and max(extents, thicknesses) > SURE
-
-
-def _is_sure(extents: float, thicknesses: float, stretches: int) -> bool:
-    """Compensation leaves something, which one stretch of a drive may share with a turn: two must say so, surely."""
-    return stretches > 1 and min(extents, thicknesses) > SURE and max(extents, thicknesses) > VERY_SURE
+    first, second = (reverse, twice) if best is REVERSED else (twice, reverse)
+    others_gain = min(sum(gain) for gain in gains.values())
+    if extents + thicknesses - others_gain > CLEAR:
+        return amber(THICKNESS, found, *first)
+    return amber(THICKNESS, found, f"{first[0]}; or {second[0]}", f"{first[1]}; or {second[1]}")
 
 
 def _surfaces(stretch: Stretch, times: _Times, interval: float, sample: Sample) -> Surfaces:

@@ -26,6 +26,7 @@ LONGEST_S = 60.0
 SCANS_PER_STRETCH, MOST_STRETCHES = 40, 6
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
+UNMATCHED = "its sweeps cannot be laid onto each other"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +70,22 @@ class Sample:
         later = np.column_stack([np.interp(starts + LONGEST_S, gnss.stamps, p) for p in gnss.positions.T])
         return float(starts[np.argmax(np.linalg.norm(later - at, axis=1))])
 
-    @cached_property
+    @property
     def stretches(self) -> tuple[Stretch, ...]:
         """A few seconds of the drive, as the LiDAR saw its own motion, where the vehicle moves most."""
+        return tuple(seen for seen in self.tried.values() if isinstance(seen, Stretch))
+
+    @cached_property
+    def tried(self) -> dict[float, Stretch | str]:
+        """The stretches looked at by the stamp of their first scan, in order, or why they tell nothing."""
         scans = self.log.scans
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
-            return ()
+            return {}
         wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 2, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
-        found: list[Stretch] = []
+        found: dict[float, Stretch | str] = {}
         taken: list[int] = []
         for place in np.argsort(-motion, kind="stable"):
             first = int(firsts[place])
@@ -90,11 +96,10 @@ class Sample:
             taken.append(first)
             try:
                 seen = stretch(scans, first, self._starts(first))
-            except DataError:
-                continue  # counted when the map is built
-            if seen is not None:
-                found.append(seen)
-        return tuple(sorted(found, key=lambda s: s.sweeps[0].stamp))
+                found[scans[first].stamp] = UNMATCHED if seen is None else seen
+            except DataError as error:
+                found[scans[first].stamp] = str(error)
+        return dict(sorted(found.items()))
 
     @cached_property
     def first_points(self) -> tuple[Points, float] | None:

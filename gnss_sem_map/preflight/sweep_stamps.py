@@ -23,6 +23,15 @@ FEW, MANY = 0.02, 0.2
 def check(sample: Sample) -> Iterator[Finding]:
     """Stamps of all sweeps: no file of points is read."""
     scans = sample.log.scans
+    backwards = sum("ends before it starts" in skip.reason for skip in sample.log.skips)
+    if backwards > FEW * (len(scans) + backwards):
+        yield red(
+            NAME,
+            f"{backwards} of {len(scans) + backwards} sweeps end before they start, and are left out",
+            "a lost line in timestamps_start.txt (or one too many in timestamps_end.txt): a sweep has the start of another",
+            "restore timestamps_start.txt of velodyne_points: line k belongs to frame k",
+        )
+        return
     if len(scans) < 2:
         return
     stamps = np.array([scan.stamp for scan in scans])

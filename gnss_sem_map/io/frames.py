@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, ImageSizeError
 from gnss_sem_map.sensor_log import Skip
 
 
@@ -91,8 +91,9 @@ def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     if pixels is None:
         raise DataError(f"{path}: damaged image; expected PNG or JPEG")
     if size is not None and (pixels.shape[1], pixels.shape[0]) != size:
-        raise DataError(
+        raise ImageSizeError(
             f"{path}: found {pixels.shape[1]} x {pixels.shape[0]} pixels, expected {size[0]} x {size[1]} as in the"
-            " calibration; is this the right camera, and the rectified image?"
+            " calibration; is this the right camera, and the rectified image?",
+            (pixels.shape[1], pixels.shape[0]),
         )
     return np.ascontiguousarray(pixels[:, :, ::-1])

@@ -15,10 +15,12 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.labelling import exposure_stamp
+from gnss_sem_map.preflight.depth_edges import Edges, View, depth_edges, edge_strength
 from gnss_sem_map.preflight.lidar_motion import STEPS, Stretch, Surfaces, stretch
 from gnss_sem_map.registration import inverse
 from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.sensor_log import Points, SensorLog
+from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
@@ -26,6 +28,9 @@ LONGEST_S = 60.0
 SCANS_PER_STRETCH, MOST_STRETCHES = 40, 6
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
+SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 6, 10
+LEAST_WAY_M = 5.0
+"""Images of places so far apart are different."""
 UNMATCHED = "its sweeps cannot be laid onto each other"
 
 
@@ -128,6 +133,76 @@ class Sample:
     def _deskewed(self) -> dict[int, tuple[Array, Surfaces]]:
         return {}
 
+    def pixels(self, image: Image) -> NDArray[np.uint8]:
+        """An image, read once; raises DataError."""
+        if image.number not in self._pixels:
+            self._pixels[image.number] = image.read()
+        return self._pixels[image.number]
+
+    @cached_property
+    def _pixels(self) -> dict[int, NDArray[np.uint8]]:
+        return {}
+
+    @property
+    def edges(self) -> Edges | None:
+        """Depth edges of a few scans, and their images; None without a camera."""
+        return self._edges[0] if self._edges is not None else None
+
+    @property
+    def edge_images(self) -> tuple[Image, ...]:
+        """The image of each view of `edges`."""
+        return self._edges[1] if self._edges is not None else ()
+
+    @cached_property
+    def _edges(self) -> tuple[Edges, tuple[Image, ...]] | None:
+        log = self.log
+        if not log.images or not log.calibration.has_camera or not log.scans:
+            return None
+        views, images = [], []
+        for scan in self._moving_scans:
+            image = log.image_at(scan.stamp, self.settings.labelling.image_within_s)
+            if image is None:
+                continue
+            stamp = exposure_stamp(image, log.calibration, self.settings.labelling)
+            try:
+                points = scan.read()
+                p_map, weights = depth_edges(points, scan.stamp, self.trajectory, log.calibration.T_imu_lidar)
+                coarse, fine = edge_strength(self.pixels(image))
+            except (DataError, FactorGraphError):
+                continue  # counted when the map is built
+            views.append(View(p_map, weights, stamp, coarse, fine))
+            images.append(image)
+        if not views:
+            return None
+        return Edges(tuple(views), self.trajectory, log.calibration), tuple(images)
+
+    @property
+    def _moving_scans(self) -> list[Scan]:
+        """Scans spread over the drive, where the vehicle moves: only there a moment differs from another."""
+        scans = self.log.scans
+        wanted = int(np.clip(len(scans) // SCANS_PER_IMAGE + 1, LEAST_IMAGES, MOST_IMAGES))
+        places = np.unique(np.linspace(0, len(scans) - 1, 3 * wanted).astype(int))
+        motion = np.array([self._speed(scans[place].stamp) for place in places])
+        chosen = np.sort(np.argsort(-motion, kind="stable")[:wanted])
+        return [scans[places[k]] for k in chosen if motion[k] >= 0]
+
+    def _speed(self, stamp: float) -> float:
+        """Way in a tenth of a second, a turn counted as at 10 m; -1 beyond the trajectory."""
+        track = self.trajectory
+        if track is None:
+            return 0.0
+        if stamp < track.start - EXTRAPOLATE_S / 2 or stamp > track.end + EXTRAPOLATE_S / 2:
+            return -1.0
+        return _way(*track.at([stamp - 0.05, stamp + 0.05], EXTRAPOLATE_S))
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the vehicle is elsewhere at the first and the last scan that is looked at, by more than a few metres."""
+        scans = self._moving_scans
+        if self.trajectory is None or len(scans) < 2:
+            return False
+        return _way(*self.trajectory.at([scans[0].stamp, scans[-1].stamp], EXTRAPOLATE_S)) > LEAST_WAY_M
+
     def _starts(self, first: int) -> tuple[Array, ...]:
         """Where the second sweep may be by the trajectory, T_first_second: straight ahead, and as the extrinsics say."""
         track, stamps = self.trajectory, [scan.stamp for scan in self.log.scans[first : first + 2]]
@@ -152,6 +227,10 @@ class Sample:
             return 0.0
         if stamps[0] < track.start - EXTRAPOLATE_S or stamps[1] > track.end + EXTRAPOLATE_S:
             return -1.0
-        a, b = track.at(stamps, EXTRAPOLATE_S)
-        turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
-        return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)
+        return _way(*track.at(stamps, EXTRAPOLATE_S))
+
+
+def _way(a: Array, b: Array) -> float:
+    """Between two poses, m, a turn counted as at 10 m."""
+    turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
+    return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)

@@ -247,7 +247,7 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
             skips.append(Skip("scan", shown(path), fault))
         else:
             read = partial(_read_sweep, path, begun, ended, frames.state_of(path))
-            scans.append(Scan(path.stem, number, stamp, read))
+            scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
     return in_order("scan", scans, skips), skips
 
 

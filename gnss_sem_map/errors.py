@@ -15,3 +15,11 @@ class DataError(SemMapError, ValueError):
 
 class WriteError(DataError):
     """What is needed later cannot be written: no fault of the one scan or image that it was about."""
+
+
+class ImageSizeError(DataError):
+    """An image is not of the size that the calibration says; `found` is its own (width, height)."""
+
+    def __init__(self, message: str, found: tuple[int, int]) -> None:
+        super().__init__(message)
+        self.found = found

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import GnssFixes
-from gnss_sem_map.preflight.dead_reckoning import beside_parabola, complex_at, windows_of
+from gnss_sem_map.preflight.dead_reckoning import Windows, beside_parabola, complex_at, windows_of
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.inertial_sums import integral, way_of
@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 
 # No vehicle is longer.
 LONGEST_M = 20.0
-# An antenna is told to be elsewhere from here, m, and from so many standard deviations.
-NOTABLE_M, SURE = 1.0, 5.0
-# What one is found with at best, m, to say that it is where it is said to be.
-OBSERVED_M = 0.5
+# An antenna is told to be elsewhere from here, m, and from so many standard deviations: amber, so 1 % may be chance.
+NOTABLE_M, SURE = 1.4, 2.5
+# What is less sure than this, m, says nothing about an antenna on a car.
+OBSERVED_M = 0.9
 # Slopes and biases make the ways differ for so long, s.
 CORRELATED_S = 5.0
 
@@ -78,6 +78,11 @@ def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, floa
             return None
         lever = complex(np.sum(np.conj(seen) * rest) / np.sum(np.conj(seen) * e))
         errors = rest - lever * e
-        independent = max(windows.seconds / 2 / CORRELATED_S, 1.0)  # windows overlap by a half
+        independent = max(_seconds(windows) / 2 / CORRELATED_S, 1.0)  # windows overlap by a half
         variance = float(np.sum(np.abs(errors) ** 2)) / (2.0 * information * independent)
     return np.array([lever.real, lever.imag]), float(np.sqrt(variance))
+
+
+def _seconds(windows: Windows) -> float:
+    """How much time the windows cover together, at no more than one fix a second."""
+    return float(np.minimum(np.ptp(windows.stamps, axis=1), windows.counts.sum(axis=1)).sum())

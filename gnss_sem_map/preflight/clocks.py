@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 # Lags that are tried, s: coarsely as far as a receiver's message may be late, then finely around the best.
 FARTHEST_S, COARSE_S, FINE_S = 3.0, 0.1, 0.02
-# Half of this is what the logarithm of the likelihood must gain: five standard deviations of one unknown.
-FIVE_SIGMA = 25.0
+# Twice the logarithm of the likelihood must gain so much: four standard deviations of one unknown.
+FOUR_SIGMA = 16.0
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Lag:
     @property
     def is_certain(self) -> bool:
         """Whether chance alone would not find it."""
-        return self.gain > FIVE_SIGMA
+        return self.gain > FOUR_SIGMA
 
 
 NO_LAG = Lag(0.0, 0.0, False)
@@ -42,7 +42,8 @@ NO_LAG = Lag(0.0, 0.0, False)
 def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j) -> Lag:
     """The lag that fits best, whatever the axes in the plane: z of the IMU is up, its rate in rad/s.
 
-    `lever` is where the antenna is said to be, m, ahead + i left. Both measures are free in what a mistake in the axes would change: the sign of the turns, the heading, the hand.
+    `lever` is where the antenna is said to be, m, ahead + i left. What a mistake in the axes would change is free:
+    the sign of the turns, the heading, the hand.
     """
     start, end = float(imu.stamps[0]), float(imu.stamps[-1])
     farthest = min(FARTHEST_S, (end - start) / 4)
@@ -73,9 +74,9 @@ def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j)
     coarse = np.arange(-round(farthest / COARSE_S), round(farthest / COARSE_S) + 1) * COARSE_S
     scores = likelihoods(coarse)
     best = float(coarse[int(np.argmax(scores))])
-    fine = np.concatenate([best + np.arange(-4, 5) * FINE_S, [0.0]])
+    fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)
     around = likelihoods(fine)
     found = float(fine[int(np.argmax(around))])
     beside = scores[np.abs(np.abs(coarse - found) - 0.5) < COARSE_S]
-    observable = len(beside) > 0 and 2 * (scores.max() - beside.max()) > FIVE_SIGMA
+    observable = len(beside) > 0 and 2 * (scores.max() - beside.max()) > FOUR_SIGMA
     return Lag(found, float(2 * (around.max() - around[-1])), bool(observable))

@@ -66,7 +66,7 @@ class Agreement:
     weights: Array
     """(w,) m², how much way each had to compare."""
     independent: float
-    """Number of independent fixes in the windows, by how alike neighbouring errors are; windows overlap by a half."""
+    """How many independent errors the windows hold."""
 
     @property
     def explained(self) -> float:
@@ -84,11 +84,17 @@ def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0)
     scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, 1e-12)
     errors = y - scales[:, None] * x
     rest = float(np.sum(np.abs(errors) ** 2))
+    return Agreement(float(np.sum(np.abs(y) ** 2)), rest, scales, power, independent_errors(windows, errors))
+
+
+def independent_errors(windows: Windows, errors: Complex) -> float:
+    """How many independent errors (w, k) are, by how alike neighbours are; windows overlap by a half."""
+    rest = float(np.sum(np.abs(errors) ** 2))
     alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, 1e-12)
     alike = min(max(alike, 0.0), 0.99)
     # a parabola, a scale and a heading were taken off each window
-    free = max(float(windows.counts.sum()) - 4.0 * len(x), 1.0) * (1.0 - alike) / (1.0 + alike)
-    return Agreement(float(np.sum(np.abs(y) ** 2)), rest, scales, power, free / (2.0 if len(x) > 1 else 1.0))
+    free = max(float(windows.counts.sum()) - 4.0 * len(errors), 1.0) * (1.0 - alike) / (1.0 + alike)
+    return free / (2.0 if len(errors) > 1 else 1.0)
 
 
 def complex_at(windows: Windows, stamps: Array, way: Complex, lag_s: float) -> Complex:

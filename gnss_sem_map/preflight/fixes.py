@@ -60,7 +60,7 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
 
 
 def _spikes(fixes: GnssFixes) -> Mask:
-    """Fixes that stand out from the line between their neighbours by more than driving and the usual noise can, (m,)."""
+    """Fixes farther from the line between their neighbours than driving and usual noise can be, (m,)."""
     out = np.zeros(len(fixes), dtype=bool)
     if len(fixes) < 5:
         return out

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import GnssFixes
-from gnss_sem_map.preflight.dead_reckoning import Windows, beside_parabola, complex_at, windows_of
+from gnss_sem_map.preflight.dead_reckoning import beside_parabola, complex_at, independent_errors, windows_of
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.inertial_sums import integral, way_of
@@ -17,12 +17,10 @@ Array = NDArray[np.float64]
 
 # No vehicle is longer.
 LONGEST_M = 20.0
-# An antenna is told to be elsewhere from here, m, and from so many standard deviations: amber, so 1 % may be chance.
-NOTABLE_M, SURE = 1.4, 2.5
+# An antenna is told to be elsewhere from here, m, and from so many standard deviations: one in a hundred by chance.
+NOTABLE_M, SURE = 1.4, 3.0
 # What is less sure than this, m, says nothing about an antenna on a car.
 OBSERVED_M = 0.9
-# Slopes and biases make the ways differ for so long, s.
-CORRELATED_S = 5.0
 
 
 def check_lever_arm(given: Array, diagnosis: Diagnosis | None, fixes: GnssFixes) -> Iterator[Finding]:
@@ -32,11 +30,11 @@ def check_lever_arm(given: Array, diagnosis: Diagnosis | None, fixes: GnssFixes)
         yield red("GNSS antenna", evidence, "the lever arm is in mm or cm", "give p_imu_antenna in metres")
         return
     found = None if diagnosis is None else found_lever_arm(diagnosis, fixes)
-    if found is None or found[1] > OBSERVED_M:
+    off = np.zeros(2) if found is None else found[0] - given[:2]
+    if found is None or (found[1] > OBSERVED_M and float(np.linalg.norm(off)) < SURE * found[1]):
         yield green("GNSS antenna", f"{evidence}; not observable: too few turns for the noise")
         return
     lever, stddev = found
-    off = lever - given[:2]
     evidence += f", the turns say ({lever[0]:.1f} {lever[1]:.1f}) ± {stddev:.1f} m horizontally"
     if float(np.linalg.norm(off)) > max(NOTABLE_M, SURE * stddev):
         yield amber(
@@ -78,11 +76,6 @@ def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, floa
             return None
         lever = complex(np.sum(np.conj(seen) * rest) / np.sum(np.conj(seen) * e))
         errors = rest - lever * e
-        independent = max(_seconds(windows) / 2 / CORRELATED_S, 1.0)  # windows overlap by a half
+        independent = independent_errors(windows, errors)
         variance = float(np.sum(np.abs(errors) ** 2)) / (2.0 * information * independent)
     return np.array([lever.real, lever.imag]), float(np.sqrt(variance))
-
-
-def _seconds(windows: Windows) -> float:
-    """How much time the windows cover together, at no more than one fix a second."""
-    return float(np.minimum(np.ptp(windows.stamps, axis=1), windows.counts.sum(axis=1)).sum())

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
@@ -266,13 +267,21 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
+    from gnss_sem_map.errors import DataError
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
     from gnss_sem_map.output import locked, real_path
+    from gnss_sem_map.run_json import read_run
+    from gnss_sem_map.untrusted.files import shown
 
     with locked(real_path(run_folder)):
         metrics = score_run(run_folder, truth, restrict_to=restrict_to)
-        write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
+        try:
+            write_report(run_folder, read_run(run_folder), metrics)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"{shown(run_folder / 'run.json')}: damaged ({type(error).__name__} {error}); make the run again"
+            ) from None
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
@@ -459,13 +468,15 @@ def main() -> None:
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # those of other packages; ours are printed as such
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` wants it
                 signal.signal(number, _stop)
-        for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")  # names of files may be no text
         code = app(prog_name="gnss-sem-map", standalone_mode=False)
         sys.stdout.flush()
     except Stopped as stopped:
@@ -474,13 +485,20 @@ def main() -> None:
         code = _wrong_usage(error)
     except (SemMapError, FactorGraphError) as error:
         code = _say(str(error), 1)
+    except MemoryError as error:
+        code = _say(
+            f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive", 1
+        )
     except OSError as error:  # what the system refused, and nobody explained better
         code = _say(f"{error.filename or 'output'}: {error.strerror or error}", 1)
         _close_stdout()
+    except (UnicodeError, RecursionError) as error:
+        code = _say(f"{type(error).__name__} {error}", 1)
     sys.exit(code)
 
 
 def _say(message: str, code: int) -> int:
+    """One line on stderr; returns the exit code."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # we are ending already
     typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map import work_folder
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labelling import class_image
 from gnss_sem_map.labels import OTHER, LabelSet
 from gnss_sem_map.ownership import write_whole
@@ -53,7 +53,7 @@ class RememberedSegmenter:
         try:
             write_whole(file, content.getvalue())
         except OSError as error:
-            raise DataError(
+            raise WriteError(
                 f"{self.folder}: cannot keep what the network said ({error.strerror}); free the disk, then --resume"
             ) from None
         return seen.probabilities

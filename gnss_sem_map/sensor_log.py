@@ -75,6 +75,8 @@ class Scan:
     """s since the log's epoch; mid sweep."""
     read: Callable[[], Points] = field(repr=False)
     """Raises DataError when the file is damaged."""
+    sweep: tuple[float, float] | None = None
+    """First and last moment, s, where the log says them; None: its points have times of their own, or one stamp."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.merging import Laid, merge_runs
 from gnss_sem_map.output import new_folder
 from gnss_sem_map.refinement import refine
+from gnss_sem_map.run_json import read_run
 from gnss_sem_map.voxel_map import SemanticMap
 
 
@@ -28,8 +29,7 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
     folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
-        if not (run / "run.json").is_file():
-            raise DataError(f"{run}: no run folder here; expected the -o of an earlier `gnss-sem-map run`")
+        read_run(run)
     if first.resolve() == second.resolve():
         raise DataError(
             f"{second}: is the first run as well; merged with itself, all it saw would count twice; give another run"

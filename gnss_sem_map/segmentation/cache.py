@@ -23,6 +23,7 @@ from gnss_sem_map.output import locked, real_path
 from gnss_sem_map.ownership import write_whole
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
+from gnss_sem_map.untrusted.structured import read_json
 
 ABOUT = "about.json"
 """Says who wrote a cache; frames of two segmenters are not mixed."""
@@ -178,11 +179,9 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
         for path in folder.iterdir():
             if PARTIAL.fullmatch(path.name):
                 path.unlink()  # of a call that was killed
-        found = json.loads(file.read_text("utf-8"))
     except OSError as error:
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise DataError(f"{file}: damaged; remove the folder and write it again") from None
+    found = read_json(file)
     if found != about:
         raise ConfigError(
             f"cache {folder}: was begun with {found}, now asked for {about}; choose another folder"

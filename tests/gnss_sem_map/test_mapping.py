@@ -16,19 +16,21 @@ import numpy as np
 import numpy_chain
 import pytest
 import street
+from numpy.typing import NDArray
 from street import Street
 
 from gnss_sem_map import labels, tiles
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.labelling import class_image
 from gnss_sem_map.mapping import STATIC, Drive, Maps, build_maps, fingerprint, map_chunks
 from gnss_sem_map.ownership import MARKER
+from gnss_sem_map.remembering import RememberedSegmenter
 from gnss_sem_map.seen_scans import seen_scans
-from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.sensor_log import file_of
+from gnss_sem_map.segmentation import Segmenter, open_segmenter
+from gnss_sem_map.sensor_log import Image, Skip, file_of
 from gnss_sem_map.voxel_map import SemanticMap, VoxelMap
 
 URBAN = labels.label_set()
@@ -101,6 +103,47 @@ def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_sca
     assert not found.observed.any()
     assert [skip.what for skip in account.skips] == ["labels"] * len(drive.log.scans)
     assert all("trajectory" in skip.reason for skip in account.skips)
+
+
+class Refusing:
+    """A segmenter that cannot do one image."""
+
+    def __init__(self, segmenter: Segmenter, refused: int) -> None:
+        self._segmenter, self._refused = segmenter, refused
+        self.class_names = segmenter.class_names
+
+    def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
+        if image.number == self._refused:
+            raise DataError("this image is damaged")
+        return self._segmenter(image)
+
+
+def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
+    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+) -> None:
+    """A live network's answers are remembered between the two passes; so is nothing that it refused."""
+    assert drive.segmenter is not None
+    size = drive.log.calibration.image_size
+    assert size is not None
+    refusing = RememberedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
+    for _ in range(2):
+        account = Account()
+        found = build_maps(replace(drive, segmenter=refusing), account)
+        assert account.skips == [Skip("labels", "frame 5", "this image is damaged")]
+        np.testing.assert_array_equal(found.static.hits, at_once[0].static.hits)
+        counts = account.counts
+        parts = ("points left out", "points unlabelled", "points labelled")
+        assert counts["points"] == sum(counts[part] for part in parts)
+        assert 0 < counts["points labelled"] < at_once[1].counts["points labelled"]
+
+
+def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_path: Path) -> None:
+    assert drive.segmenter is not None
+    size = drive.log.calibration.image_size
+    assert size is not None
+    nowhere = RememberedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
+    with pytest.raises(WriteError, match="cannot keep what the network said"):
+        build_maps(replace(drive, segmenter=nowhere), Account())
 
 
 @pytest.mark.parametrize(("chunk", "workers"), [(1, 1), (5, 1), (100, 1), (5, 2)])

@@ -287,7 +287,7 @@ def broken(folder: Path, what: str) -> LabelledFolder:
         ("size", r"found \(48, 95\) pixels"),
         ("ids", r"000000\.png: found unknown ids \[77\]"),
         ("image", r"000000\.png: damaged image"),
-        ("grey", r"000000\.png: found uint8 \(48, 96\)"),
+        ("grey", r"000000\.png: found uint8 \(48, 96, 1\)"),
         ("deep", "found uint16"),
         ("void", "found no pixel of any class"),
         ("empty", "found 0 images"),

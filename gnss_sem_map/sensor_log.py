@@ -200,7 +200,7 @@ class SensorLog:
         if self.conventions is None:
             return self
         theirs = chosen.over(self.conventions)
-        offset = theirs.lidar_time_offset_s
+        offset = theirs.lidar_time_offset_s or 0.0
         return replace(
             self,
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 # Lags that are tried, s: coarsely as far as a receiver's message may be late, then finely around the best.
 FARTHEST_S, COARSE_S, FINE_S = 3.0, 0.1, 0.02
-# Half of this is what the logarithm of the likelihood must gain: five standard deviations of one unknown.
-FIVE_SIGMA = 25.0
+# Twice the logarithm of the likelihood must gain so much: four standard deviations of one unknown.
+FOUR_SIGMA = 16.0
 
 
 @dataclass(frozen=True)
@@ -33,41 +33,50 @@ class Lag:
     @property
     def is_certain(self) -> bool:
         """Whether chance alone would not find it."""
-        return self.gain > FIVE_SIGMA
+        return self.gain > FOUR_SIGMA
 
 
 NO_LAG = Lag(0.0, 0.0, False)
 
 
-def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track) -> Lag:
+def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j) -> Lag:
     """The lag that fits best, whatever the axes in the plane: z of the IMU is up, its rate in rad/s.
 
-    Both measures are free in what a mistake in the axes would change: the sign of the turns, the heading, the hand.
+    `lever` is where the antenna is said to be, m, ahead + i left. What a mistake in the axes would change is free:
+    the sign of the turns, the heading, the hand.
     """
     start, end = float(imu.stamps[0]), float(imu.stamps[-1])
     farthest = min(FARTHEST_S, (end - start) / 4)
     windows = windows_of(fixes, start + farthest, end - farthest)
     turned = SmoothedIntegral.of(imu.stamps, imu.angular_rate[:, 2])
     backwards = ImuSamples(imu.stamps, imu.specific_force, -imu.angular_rate)
-    ways = [way_of(unit, mirrored=hand) for unit in (imu, backwards) for hand in (False, True)]
+    ways = [way_of(unit, lever, mirrored=hand) for unit in (imu, backwards) for hand in (False, True)]
 
-    def likelihood(lag: float) -> float:
-        score = 0.0
-        if windows is not None:
-            rests = [agreement(windows, imu.stamps, way, lag).rest for way in ways]
-            score -= windows.seconds * np.log(max(min(rests), 1e-9))
+    def misfits(lag: float) -> tuple[float, float, float, int]:
+        """Of the ways, and how many independent errors that is; of the courses, likewise."""
+        found = [agreement(windows, imu.stamps, way, lag) for way in ways] if windows is not None else []
+        best = min(found, key=lambda one: one.rest, default=None)
         gain = turn_gain(turned, track, lag)
-        if gain is not None:
-            score -= gain.intervals * np.log(max(gain.misfit, 1e-6))
-        return float(score)
+        return (
+            max(best.rest, 1e-9) if best is not None else 1.0,
+            best.independent if best is not None else 0.0,
+            max(gain.misfit, 1e-6) if gain is not None else 1.0,
+            gain.intervals if gain is not None else 0,
+        )
 
-    coarse = np.arange(-round(farthest / COARSE_S), round(farthest / COARSE_S) + 1) * COARSE_S
-    scores = np.array([likelihood(lag) for lag in coarse])
+    def likelihoods(lags: Array) -> Array:
+        """Logarithms, up to a constant: normal errors of the ways, and Laplace's of the turns."""
+        rests, free, turns, intervals = np.array([misfits(lag) for lag in lags]).T
+        # as many independent errors as where the fit is best, for all: elsewhere the lag itself makes them alike
+        at_best = int(np.argmin(rests * turns))
+        return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
+
+    coarse: Array = np.arange(-round(farthest / COARSE_S), round(farthest / COARSE_S) + 1) * COARSE_S
+    scores = likelihoods(coarse)
     best = float(coarse[int(np.argmax(scores))])
-    fine = best + np.arange(-4, 5) * FINE_S
-    around = np.array([likelihood(lag) for lag in fine])
-    found, top = float(fine[int(np.argmax(around))]), float(max(around.max(), scores.max()))
-    at_zero = float(scores[len(scores) // 2])
+    fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)
+    around = likelihoods(fine)
+    found = float(fine[int(np.argmax(around))])
     beside = scores[np.abs(np.abs(coarse - found) - 0.5) < COARSE_S]
-    observable = len(beside) > 0 and 2 * (top - float(beside.max())) > FIVE_SIGMA
-    return Lag(found, 2 * (top - at_zero), bool(observable))
+    observable = len(beside) > 0 and 2 * (scores.max() - beside.max()) > FOUR_SIGMA
+    return Lag(found, float(2 * (around.max() - around[-1])), bool(observable))

@@ -19,7 +19,7 @@ Complex = NDArray[np.complex128]
 # Long enough that a turn or a stop stands out from metres of noise, short enough that a consumer gyroscope holds.
 WINDOW_S = 20.0
 LEAST_FIXES = 7
-MOST_WINDOWS, MOST_FIXES = 40, 60
+MOST_WINDOWS, MOST_FIXES = 30, 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,6 @@ class Windows:
     counts: Array
     """(w, k) 1 for a fix, 0 for none."""
     basis: Array
-
-    @property
-    def seconds(self) -> float:
-        """How much time the windows cover, at no more than one independent fix per second."""
-        return float(np.minimum(np.ptp(self.stamps, axis=1), self.counts.sum(axis=1)).sum())
 
 
 def windows_of(fixes: GnssFixes, start: float, end: float) -> Windows | None:
@@ -70,6 +65,8 @@ class Agreement:
     """(w,) by how much, and by which heading, each window's way was turned."""
     weights: Array
     """(w,) m², how much way each had to compare."""
+    independent: float
+    """How many independent errors the windows hold."""
 
     @property
     def explained(self) -> float:
@@ -85,8 +82,19 @@ def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0)
     )
     power = np.sum(np.abs(x) ** 2, axis=1)
     scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, 1e-12)
-    rest = np.sum(np.abs(y - scales[:, None] * x) ** 2)
-    return Agreement(float(np.sum(np.abs(y) ** 2)), float(rest), scales, power)
+    errors = y - scales[:, None] * x
+    rest = float(np.sum(np.abs(errors) ** 2))
+    return Agreement(float(np.sum(np.abs(y) ** 2)), rest, scales, power, independent_errors(windows, errors))
+
+
+def independent_errors(windows: Windows, errors: Complex) -> float:
+    """How many independent errors (w, k) are, by how alike neighbours are; windows overlap by a half."""
+    rest = float(np.sum(np.abs(errors) ** 2))
+    alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, 1e-12)
+    alike = min(max(alike, 0.0), 0.99)
+    # a parabola, a scale and a heading were taken off each window
+    free = max(float(windows.counts.sum()) - 4.0 * len(errors), 1.0) * (1.0 - alike) / (1.0 + alike)
+    return free / (2.0 if len(errors) > 1 else 1.0)
 
 
 def complex_at(windows: Windows, stamps: Array, way: Complex, lag_s: float) -> Complex:

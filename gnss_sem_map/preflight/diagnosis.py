@@ -47,8 +47,13 @@ class Diagnosis:
     """The track is."""
 
 
-def diagnose(imu: ImuSamples, fixes: GnssFixes, frame: LocalFrame, attitude: Trajectory | None) -> Diagnosis:
-    """Test an IMU against usable fixes; `attitude` is what the drive's own navigation unit says, where it does."""
+def diagnose(
+    imu: ImuSamples, fixes: GnssFixes, frame: LocalFrame, attitude: Trajectory | None, lever: complex = 0j
+) -> Diagnosis:
+    """Test an IMU against usable fixes; `attitude` is what the drive's own navigation unit says, where it does.
+
+    `lever` is where the antenna is said to be, m, ahead + i left of the IMU.
+    """
     findings = [_sampling(imu)]
     unit, finding = units.force_unit(imu.specific_force, frame.gravity)
     findings.append(finding)
@@ -60,7 +65,7 @@ def diagnose(imu: ImuSamples, fixes: GnssFixes, frame: LocalFrame, attitude: Tra
     findings += rate_findings
     rate = rate * scale
     upright = ImuSamples(imu.stamps, *_upright(force, rate, up))
-    lag = lag_of(upright, fixes, track) if track is not None else NO_LAG
+    lag = lag_of(upright, fixes, track, lever) if track is not None else NO_LAG
     late = lag.seconds if lag.is_certain else 0.0
     scaled = ImuSamples(imu.stamps, force, rate)
     gain, answer = _answers(scaled, up, track, late)

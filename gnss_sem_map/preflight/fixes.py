@@ -21,9 +21,10 @@ SAME_PLACE_M = 1e-3
 FROZEN_S, FROZEN_FIXES = 2.0, 3
 # What a car brakes or speeds up with at most, m/s², and what its speed may differ by besides, m/s.
 HARD_BRAKING, SPEED_MARGIN = 6.0, 1.0
+# Noise seldom exceeds so many times its median.
+SPIKE = 6.0
 # Who stands gains no speed by the accelerometer, m/s (rms about a slope, which is tilt and bias).
 STANDING_MPS = 0.4
-# A track that drives 57 times slower than the IMU is in radians: halfway between, as factors.
 RADIANS = float(np.degrees(1.0))
 
 
@@ -46,6 +47,7 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     """Look at all fixes, before anything is known of the IMU."""
     credible = plausible(fixes, max_speed_mps)
     kept = fixes[credible]
+    kept = kept[~_spikes(kept)]
     frozen = frozen_runs(kept, imu, frame.gravity)
     thawed = np.ones(len(kept), dtype=bool)
     for first, last in frozen:
@@ -55,6 +57,21 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     if are_radians:
         kept = GnssFixes(kept.stamps, kept.positions * RADIANS, kept.stddevs)
     return Fixes(kept, int(np.sum(~credible)), frozen, are_radians, _moves_from(fixes))
+
+
+def _spikes(fixes: GnssFixes) -> Mask:
+    """Fixes farther from the line between their neighbours than driving and usual noise can be, (m,)."""
+    out = np.zeros(len(fixes), dtype=bool)
+    if len(fixes) < 5:
+        return out
+    p, t = fixes.positions[:, :2], fixes.stamps
+    share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
+    off = np.linalg.norm(p[1:-1] - (1 - share) * p[:-2] - share * p[2:], axis=1)
+    pause = (t[2:] - t[:-2]) / 2
+    limit = HARD_BRAKING * pause**2 + SPIKE * float(np.median(off))
+    padded = np.pad(off, 1)
+    out[1:-1] = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
+    return out
 
 
 def _look_like_radians(fixes: GnssFixes, frame: LocalFrame) -> bool:

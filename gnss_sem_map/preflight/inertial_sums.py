@@ -53,12 +53,15 @@ def _interpolated(wanted: Array, stamps: Array, values: Array) -> Array:
     return np.column_stack([np.interp(wanted, stamps, column) for column in values.T])
 
 
-def way_of(imu: ImuSamples, *, mirrored: bool = False) -> NDArray[np.complex128]:
-    """The way of an IMU with z up, (n,) m, east + i north up to a first heading, a line and a parabola.
+def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> NDArray[np.complex128]:
+    """The way of a point at `lever` m (ahead + i left) of an IMU with z up: (n,) m, up to a line and a parabola.
 
-    The accelerometer integrated twice along the gyroscope's heading; `mirrored`: its left taken as right.
+    East + i north up to a first heading: the accelerometer integrated twice along the gyroscope's heading.
+    `mirrored`: left is taken as right.
     """
     x, y = imu.specific_force[:, 0], imu.specific_force[:, 1] * (-1.0 if mirrored else 1.0)
-    ahead = (x + 1j * y) * np.exp(1j * integral(imu.stamps, imu.angular_rate[:, 2]))
+    heading = np.exp(1j * integral(imu.stamps, imu.angular_rate[:, 2]))
+    ahead = (x + 1j * y) * heading
     twice = integral(imu.stamps, integral(imu.stamps, np.column_stack([ahead.real, ahead.imag])))
-    return np.asarray(twice[:, 0] + 1j * twice[:, 1])
+    arm = np.conj(lever) if mirrored else lever
+    return np.asarray(twice[:, 0] + 1j * twice[:, 1] + arm * heading)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import GnssFixes
-from gnss_sem_map.preflight.dead_reckoning import beside_parabola, complex_at, windows_of
+from gnss_sem_map.preflight.dead_reckoning import beside_parabola, complex_at, independent_errors, windows_of
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.inertial_sums import integral, way_of
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 # No vehicle is longer.
 LONGEST_M = 20.0
-# An antenna is told to be elsewhere from here, m, and from so many standard deviations.
-NOTABLE_M, SURE = 1.0, 5.0
-# What one is found with at best, m, to say that it is where it is said to be.
-OBSERVED_M = 0.5
-# Slopes and biases make the ways differ for so long, s.
-CORRELATED_S = 5.0
+# An antenna is told to be elsewhere from here, m, and from so many standard deviations: one in a hundred by chance.
+NOTABLE_M, SURE = 1.4, 3.0
+# What is less sure than this, m, says nothing about an antenna on a car.
+OBSERVED_M = 0.9
+# An antenna alone explains the fixes as well as an antenna and a clock when it leaves so many times as much.
+AS_WELL = 1.2
 
 
 def check_lever_arm(given: Array, diagnosis: Diagnosis | None, fixes: GnssFixes) -> Iterator[Finding]:
@@ -31,12 +31,12 @@ def check_lever_arm(given: Array, diagnosis: Diagnosis | None, fixes: GnssFixes)
     if float(np.linalg.norm(given)) > LONGEST_M:
         yield red("GNSS antenna", evidence, "the lever arm is in mm or cm", "give p_imu_antenna in metres")
         return
-    found = None if diagnosis is None else found_lever_arm(diagnosis, fixes)
-    if found is None or found[1] > OBSERVED_M:
+    found = None if diagnosis is None else _simplest(diagnosis, fixes)
+    off = np.zeros(2) if found is None else found[0] - given[:2]
+    if found is None or (found[1] > OBSERVED_M and float(np.linalg.norm(off)) < SURE * found[1]):
         yield green("GNSS antenna", f"{evidence}; not observable: too few turns for the noise")
         return
     lever, stddev = found
-    off = lever - given[:2]
     evidence += f", the turns say ({lever[0]:.1f} {lever[1]:.1f}) ± {stddev:.1f} m horizontally"
     if float(np.linalg.norm(off)) > max(NOTABLE_M, SURE * stddev):
         yield amber(
@@ -49,8 +49,21 @@ def check_lever_arm(given: Array, diagnosis: Diagnosis | None, fixes: GnssFixes)
         yield green("GNSS antenna", evidence)
 
 
-def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, float] | None:
-    """The horizontal lever arm, (2,) m, and its standard deviation per axis; None: nothing to find it by.
+def _simplest(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, float] | None:
+    """The lever arm with the lag that was found, or without one where that explains the fixes as well."""
+    without = found_lever_arm(diagnosis, fixes, 0.0)
+    if not diagnosis.lag.is_certain:
+        return None if without is None else without[:2]
+    both = found_lever_arm(diagnosis, fixes, diagnosis.lag.seconds)
+    if both is None or without is None or without[2] > AS_WELL * both[2]:
+        return None if both is None else both[:2]
+    return without[:2]
+
+
+def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes, late: float) -> tuple[Array, float, float] | None:
+    """The horizontal lever arm, (2,) m, its standard deviation per axis, and what it leaves unexplained, m².
+
+    `late` s is how much later than its stamp a fix is. None: nothing to find it by.
 
     In every window the fixes are a parabola, the IMU's way turned by a heading, and the lever arm turned by the same.
     The heading of a window follows from all windows' answers with the lever arm held; both are found in turns.
@@ -59,12 +72,11 @@ def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, floa
     windows = windows_of(fixes, float(imu.stamps[0]), float(imu.stamps[-1]))
     if windows is None:
         return None
-    late = diagnosis.lag.seconds if diagnosis.lag.is_certain else 0.0
     way, heading = way_of(imu), np.exp(1j * integral(imu.stamps, imu.angular_rate[:, 2]))
     x = beside_parabola(windows, complex_at(windows, imu.stamps, way, late))
     e = beside_parabola(windows, complex_at(windows, imu.stamps, heading, late))
     y = beside_parabola(windows, np.conj(windows.places) if diagnosis.mirrored else windows.places)
-    lever, variance = 0j, np.inf
+    lever, variance, left = 0j, np.inf, np.inf
     for _ in range(10):
         regressor = x + lever * e
         power = np.maximum(np.sum(np.abs(regressor) ** 2, axis=1), 1e-12)
@@ -78,6 +90,7 @@ def found_lever_arm(diagnosis: Diagnosis, fixes: GnssFixes) -> tuple[Array, floa
             return None
         lever = complex(np.sum(np.conj(seen) * rest) / np.sum(np.conj(seen) * e))
         errors = rest - lever * e
-        independent = max(windows.seconds / 2 / CORRELATED_S, 1.0)  # windows overlap by a half
-        variance = float(np.sum(np.abs(errors) ** 2)) / (2.0 * information * independent)
-    return np.array([lever.real, lever.imag]), float(np.sqrt(variance))
+        independent = independent_errors(windows, errors)
+        left = float(np.sum(np.abs(errors) ** 2))
+        variance = left / (2.0 * information * independent)
+    return np.array([lever.real, lever.imag]), float(np.sqrt(variance)), left

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes
 from gnss_sem_map.preflight import poses
-from gnss_sem_map.preflight.clocks import Lag
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.fixes import Fixes
@@ -32,7 +31,9 @@ BEST_RECEIVER_M = 0.008
 SCATTER_RATIO, SCATTER_M = 5.0, 0.1
 THIRD_DIFFERENCE, MAD = np.sqrt(20.0), 1.4826
 # A lag is told of from the first, s, and makes a wrong map when it moves the vehicle by the second, m.
-NOTABLE_LAG_S, WRONG_LAG_M = 0.15, 2.0
+NOTABLE_LAG_S, WRONG_LAG_M = 0.25, 2.0
+# At a constant speed an antenna ahead is a clock that is early: up to here, m, it may be either.
+LEVER_ARM_M = 5.0
 
 
 def check(sample: Sample) -> Iterator[Finding]:
@@ -165,13 +166,16 @@ def _clock(diagnosis: Diagnosis) -> Finding:
     fast = float(np.quantile(track.speeds, 0.9)) if track is not None and len(track.speeds) else 0.0
     late = "late" if lag.seconds < 0 else "early"
     level = red if fast * abs(lag.seconds) > WRONG_LAG_M else amber
+    usual = (
+        float(np.median(track.speeds[track.is_moving]))
+        if track is not None and track.is_moving.any()
+        else 0.0
+    )
+    off, side = usual * abs(lag.seconds), "behind" if lag.seconds < 0 else "ahead of"
+    antenna = f", or the antenna is {off:.1f} m {side} where p_imu_antenna says" if off < LEVER_ARM_M else ""
     return level(
         "GNSS clock",
         f"fixes agree best with the IMU {lag.seconds:+.2f} s after their stamps, at up to {fast:.0f} m/s",
-        f"the stamps of the GNSS are {abs(lag.seconds):.2f} s {late}",
-        f"set gnss_time_offset_s: {_signed(lag)}",
+        f"the stamps of the GNSS are {abs(lag.seconds):.2f} s {late}{antenna}",
+        f"set gnss_time_offset_s: {lag.seconds:.2f}",
     )
-
-
-def _signed(lag: Lag) -> str:
-    return f"{lag.seconds:.2f}"

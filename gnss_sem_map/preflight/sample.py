@@ -67,8 +67,9 @@ class Sample:
         imu = between(log.imu, start, start + STRETCH_S)
         if len(imu) < LEAST_SAMPLES:
             return None
+        lever = complex(*log.calibration.p_imu_antenna[:2])
         within = (fixes.usable.stamps >= start) & (fixes.usable.stamps <= start + STRETCH_S)
-        return diagnose(imu, fixes.usable[within], log.frame, log.reference)
+        return diagnose(imu, fixes.usable[within], log.frame, log.reference, lever)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:

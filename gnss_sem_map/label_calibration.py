@@ -7,6 +7,7 @@ of several drives can be put together, and a reader can see what they rest on.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.untrusted.files import shown
 from gnss_sem_map.untrusted.structured import read_yaml
@@ -149,6 +150,19 @@ def _counts(rows: Any) -> NDArray[np.int64]:
     if counts.dtype.kind != "i" or np.abs(counts).max(initial=0) > LARGEST_COUNT:
         raise ValueError(f"found counts of {counts.dtype}, expected whole numbers up to {LARGEST_COUNT:.0e}")
     return counts.astype(np.int64)
+
+
+def check_replaceable(file: Path) -> None:
+    """Raise DataError when a file is there that is no label calibration: it would be lost."""
+    try:
+        if not os.path.lexists(file) or file.read_text("utf-8").startswith(f"format: {FORMAT}\nclass_set: "):
+            return
+        reason = "is no label calibration"
+    except UnicodeDecodeError:
+        reason = "is no label calibration"
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror})"
+    raise DataError(f"{file}: is there already, and {reason}; choose another -o")
 
 
 def opened(file: Path | None, label_set: LabelSet) -> LabelCalibration | None:

@@ -18,6 +18,11 @@ from gnss_sem_map.untrusted.pictures import read_picture
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 """Of two images of one frame the first kind is read."""
 MOST_POINTS = 10_000_000
+FARTHEST_M, NEAREST_M = 1000.0, 1e-6
+"""No LiDAR on a road sees farther; and a coordinate nearer to zero, but not zero, is no measurement."""
+NO_POINTS, EVERY = 0.1, 8
+"""With so many of its points out of these bounds a file is no scan: of random bytes nine in ten coordinates are. Every
+eighth point tells it at no cost."""
 LARGEST_NUMBER = 2**63 - 1
 
 State = tuple[int, int]
@@ -88,7 +93,20 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
                 )
         except OSError as error:
             raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
+    _refuse_other_bytes(rows, path)
     return rows
+
+
+def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
+    """Points that were not measured, zero or not finite, are no reason to refuse a scan."""
+    sizes = np.abs(rows[::EVERY, :3])
+    out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
+    share = float(out.any(axis=1).mean())
+    if share > NO_POINTS:
+        raise DataError(
+            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within {NEAREST_M:g} m of"
+            " zero, expected metres; are these other bytes, another count of columns, or mm?"
+        )
 
 
 def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:

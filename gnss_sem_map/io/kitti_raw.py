@@ -51,6 +51,8 @@ SPECIFIC_FORCE = slice(11, 14)
 """ax ay az: in the body; af al au are levelled with the unit's own attitude and would leak it."""
 ANGULAR_RATE = slice(17, 20)
 POSITION_ACCURACY = 23
+LEAST_ACCURACY_M = 1e-4
+"""Zero is no standard deviation; what is too small to be true is for the pre-flight to say."""
 
 
 def read(drive: Path) -> SensorLog:
@@ -69,7 +71,7 @@ def read(drive: Path) -> SensorLog:
     epoch_ns = int(oxts_ns[0])
     fixes = oxts[is_fix]
     frame = LocalFrame(*(float(v) for v in fixes[0, [LAT, LON, ALT]]))
-    accuracy = np.maximum(fixes[:, POSITION_ACCURACY], 0.01)
+    accuracy = np.maximum(fixes[:, POSITION_ACCURACY], LEAST_ACCURACY_M)
     gnss = GnssFixes(
         stamps[is_fix], frame.to_map(*fixes[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
     )
@@ -245,7 +247,7 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
             skips.append(Skip("scan", shown(path), fault))
         else:
             read = partial(_read_sweep, path, begun, ended, frames.state_of(path))
-            scans.append(Scan(path.stem, number, stamp, read))
+            scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
     return in_order("scan", scans, skips), skips
 
 

@@ -16,6 +16,7 @@ from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io.point_labels import label_files, read_confidence, read_labels, truth_folder
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.ownership import amend
 from gnss_sem_map.run_json import read_run
 from gnss_sem_map.untrusted.files import is_file, is_folder, read_lines, shown
 from gnss_sem_map.untrusted.structured import read_json
@@ -42,7 +43,7 @@ def score_run(
     path = truth / "trajectory_lidar.tum"
     if is_file(path):
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", "utf-8")
+    amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
 

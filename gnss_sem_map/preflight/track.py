@@ -11,7 +11,7 @@ from factor_graphs.measurements import GnssFixes
 
 Array = NDArray[np.float64]
 
-# Third differences of white noise of stddev s have stddev s √20; a median absolute deviation of 1 is a stddev of 1.4826.
+# Third differences of white noise of stddev s have stddev s √20; 1.4826 median absolute deviations are one stddev.
 THIRD_DIFFERENCE = np.sqrt(20.0)
 MAD = 1.4826
 # Lines are made longer, up to the last of these, s, until they give the velocity to this, m/s: a walker's pace is told.

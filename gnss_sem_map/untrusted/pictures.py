@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, ImageSizeError
 from gnss_sem_map.untrusted.files import read_bytes, shown
 
 MOST_PIXELS, LONGEST_SIDE = 64_000_000, 65_535
@@ -201,7 +201,8 @@ def _check_count(width: int, height: int) -> None:
 
 def _check_size(path: Path, found: tuple[int, int], size: tuple[int, int] | None) -> None:
     if size is not None and found != size:
-        raise DataError(
+        raise ImageSizeError(
             f"{shown(path)}: found {found[0]} x {found[1]} pixels, expected {size[0]} x {size[1]} as in the"
-            " calibration; is this the right camera, and the rectified image?"
+            " calibration; is this the right camera, and the rectified image?",
+            found,
         )

@@ -1,0 +1,220 @@
+"""Where the camera is, when it sees and how wide: the change under which depth edges and image edges agree best.
+
+Every kind of mistake is a family of changes: a turn about an axis, another moment, another focal length. Tried one
+family at a time, the one that makes the edges agree names the mistake; gains are paired over the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.preflight.depth_edges import UNCHANGED, Change, Edges
+from gnss_sem_map.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.preflight.sample import Sample
+
+Array = NDArray[np.float64]
+NAME = "camera against LiDAR"
+LEAST_VIEWS = 4
+SURE = 4.0
+"""Standard errors of a gain, over the images: a hundred changes are tried, of which chance lifts one by three."""
+LEAST_GAIN = 0.05
+"""And by this part: gains of 1 to 2 % are of the calibration's last tenth of a degree."""
+LEAST_COMMON, COMMON_SURE = 0.03, 2.5
+"""What an image and its own depth edges must have in common beyond other images of the drive (good drives: 0.15 up)."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Changes of one kind."""
+
+    name: str
+    of: Callable[[float], Change]
+    reach: tuple[float, ...]
+    """What is tried."""
+    same: float
+    """A difference that is no reason to warn."""
+
+
+def _about(axis: int) -> Callable[[float], Change]:
+    def of(angle: float) -> Change:
+        x, y, z = (angle * np.eye(3)[axis]).tolist()
+        return Change(rotation_deg=(x, y, z))
+
+    return of
+
+
+def _steps(reach: float, step: float) -> tuple[float, ...]:
+    return tuple(np.arange(-reach, reach + step / 2, step).tolist())
+
+
+TURNS = tuple(
+    Family(name, _about(axis), _steps(8.0, step), same)
+    for name, axis, step, same in (("y", 1, 0.8, 0.6), ("x", 0, 1.0, 1.2), ("z", 2, 1.6, 1.6))
+)
+TIME = Family("time", lambda s: Change(time_s=s), _steps(0.3, 0.03), 0.035)
+FOCAL = Family("focal", lambda x: Change(focal=float(np.exp(x))), _steps(0.8, 0.05), 0.05)
+SIZE = Family("size", lambda x: Change(size=float(np.exp(x))), _steps(0.8, 0.05), 0.05)
+FAMILIES = (*TURNS, TIME, FOCAL, SIZE)
+
+
+@dataclass(frozen=True)
+class Best:
+    """The best change of a family, and the gain in agreement (k,) of each image."""
+
+    family: Family
+    value: float
+    gains: Array
+
+    @property
+    def gain(self) -> float:
+        """Mean over the images."""
+        return float(self.gains.mean()) if len(self.gains) else 0.0
+
+    @property
+    def sigmas(self) -> float:
+        """The gain in standard errors; 0 where too few images tell."""
+        return in_errors(self.gains)
+
+
+def in_errors(gains: Array) -> float:
+    """A mean in its standard errors; 0 for less than four values."""
+    if len(gains) < LEAST_VIEWS:
+        return 0.0
+    error = max(float(gains.std(ddof=1)), 0.01) / np.sqrt(len(gains))
+    return float(gains.mean() / error)
+
+
+def best_change(edges: Edges, families: tuple[Family, ...] = FAMILIES) -> Best:
+    """The change of all families that makes edges agree best: coarse over the whole reach, then fine around it."""
+    given = edges.agreement()
+    found = []
+    for family in families:
+        tried = np.array([edges.agreement(family.of(value)) for value in family.reach])
+        means = _means(tried, given)
+        found.append((float(means.max()), family, family.reach[int(means.argmax())]))
+    _, family, value = max(found, key=lambda item: item[0])
+    step = family.reach[1] - family.reach[0]
+    values = value + step * np.arange(-1.0, 1.01, 0.25)
+    fine = np.array([edges.agreement(family.of(float(v)), fine=True) for v in values])
+    given_fine = edges.agreement(fine=True)
+    place = int(_means(fine, given_fine).argmax())
+    gains = fine[place] - np.where(
+        np.isfinite(given_fine), given_fine, 1.0
+    )  # 1: what points anywhere would have
+    return Best(family, float(values[place]), gains[np.isfinite(gains)])
+
+
+def _means(tried: Array, given: Array) -> Array:
+    """Mean gain of each change (n, k) over the images that it leaves in view; half of them at least."""
+    base = np.where(np.isfinite(given), given, 1.0)
+    counts = np.isfinite(tried).sum(axis=1)
+    gains = np.where(np.isfinite(tried), tried - base, 0.0).sum(axis=1) / np.maximum(counts, 1)
+    return np.where(counts >= max(LEAST_VIEWS, tried.shape[1] / 2), gains, -np.inf)
+
+
+def check(sample: Sample) -> Iterator[Finding]:
+    """Turned, late, inverted, of another lens: or fine."""
+    edges = sample.edges
+    if edges is None or len(edges.views) < LEAST_VIEWS:
+        yield green(NAME, "not observable: too few scans with an image and depth edges (points ring by ring)")
+        return
+    yield _pose(sample, edges)
+
+
+def _pose(sample: Sample, edges: Edges) -> Finding:
+    given, fine = edges.agreement(), edges.agreement(fine=True)
+    common = (given - edges.others())[np.isfinite(given)]
+    images = len(edges.views)
+    elsewhere = _elsewhere(edges)
+    best = best_change(edges)
+    seen = float(np.nanmean(fine)) if np.isfinite(fine).any() else float("nan")
+    found = f"depth edges of {images} scans: images are {seen:.2f} times as strong there as elsewhere"
+    if elsewhere is not None and elsewhere[1].gain > best.gain and elsewhere[1].sigmas > SURE:
+        return red(
+            NAME,
+            f"{found}; {1 + elsewhere[1].gain:.2f} times if so",
+            f"T_camera_lidar is {elsewhere[0]}",
+            "mend T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
+        )
+    is_sure = best.sigmas > SURE and best.gain > LEAST_GAIN * (seen if np.isfinite(seen) else 1.0)
+    if is_sure and abs(best.value) > best.family.same:
+        return _named(
+            sample, best, f"{found}, {best.gain:.2f} more with the change (+- {best.gain / best.sigmas:.2f})"
+        )
+    if len(common) < LEAST_VIEWS:
+        return red(
+            NAME,
+            f"{found}; {len(common)} of {images} images show enough depth edges",
+            "hardly any point lies in the images: T_camera_lidar is inverted, turned, or of another camera",
+            "check T_camera_lidar: it takes points from the LiDAR to the camera, x right, y down, z forward",
+        )
+    if common.mean() < LEAST_COMMON or in_errors(common) < COMMON_SURE:
+        if not sample.is_moving:
+            return green(NAME, f"{found}; not observable further: the vehicle stands")
+        return amber(
+            NAME,
+            f"{found}, only {common.mean():.2f} more than in other images of the drive",
+            "images and scans have nothing in common: another drive, clock or camera, or T_camera_lidar far off",
+            "check the stamps of the images, T_camera_lidar and K",
+        )
+    return green(NAME, f"{found}; the best {best.family.name} is {best.value:+.2f} off")
+
+
+def _elsewhere(edges: Edges) -> tuple[str, Best] | None:
+    """A camera that looks quite elsewhere: inverted, or turned by quarters."""
+    T = edges.calibration.T_camera_lidar
+    assert T is not None
+    given = edges.agreement(fine=True)
+    base = np.where(np.isfinite(given), given, 1.0)
+    tried = {"inverted: T_lidar_camera was given": np.asarray(np.linalg.inv(T))}
+    for quarter in (90, 180, 270):
+        turned = T.copy()
+        c, s = np.round(np.cos(np.radians(quarter))), np.round(np.sin(np.radians(quarter)))
+        turned[:3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ T[:3]
+        tried[f"turned by {quarter} deg about y: the camera looks elsewhere"] = turned
+    found = []
+    for name, camera in tried.items():
+        gains = edges.with_camera(camera).agreement(UNCHANGED, fine=True) - base
+        found.append((name, Best(TIME, 0.0, gains[np.isfinite(gains)])))
+    best = max(found, key=lambda item: item[1].gain if len(item[1].gains) >= LEAST_VIEWS else -1.0)
+    return best if len(best[1].gains) >= LEAST_VIEWS else None
+
+
+def _named(sample: Sample, best: Best, found: str) -> Finding:
+    family, value = best.family, best.value
+    level = red if abs(value) > 2 * family.same else amber
+    if family is TIME:
+        word = "late" if value < 0 else "early"
+        given = sample.settings.labelling.camera_time_offset_s
+        offset = (sample.log.calibration.camera_time_offset_s if given is None else given) + value
+        return level(
+            NAME,
+            found,
+            f"image stamps are {abs(value):.2f} s {word}",
+            f"set labelling.camera_time_offset_s: {offset:.3f}",
+        )
+    factor = float(np.exp(value))
+    if family is FOCAL:
+        return level(
+            NAME,
+            found,
+            f"the focal length is {1 / factor:.2f} times what it should be",
+            f"multiply fx and fy of K by {factor:.2f}",
+        )
+    if family is SIZE:
+        return level(
+            NAME,
+            found,
+            f"K is of images {1 / factor:.2f} times as large as these",
+            f"multiply fx, fy, cx and cy of K by {factor:.2f}",
+        )
+    return level(
+        NAME,
+        found,
+        f"the camera is turned by {abs(value):.1f} deg about its {family.name} axis against T_camera_lidar",
+        f"turn T_camera_lidar by {value:+.1f} deg about the camera's {family.name} axis (KITTI: calib_velo_to_cam.txt)",
+    )

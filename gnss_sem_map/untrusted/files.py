@@ -33,12 +33,20 @@ def status(path: Path, error: type[SemMapError] = DataError) -> os.stat_result |
     """What is at a path, links followed; None where nothing is. Raises `error` where that cannot be known."""
     try:
         return path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        if os.path.islink(path):
-            raise error(f"{shown(path)}: a link to what is not there") from None
+    except FileNotFoundError:
+        _check_links(path, error)
         return None
     except (OSError, ValueError) as problem:
         raise error(f"{shown(path)}: cannot read it ({reason(problem)})") from None
+
+
+def _check_links(path: Path, error: type[SemMapError]) -> None:
+    """Raise `error` where nothing is there because a link, here or above, leads nowhere."""
+    for place in (path, *path.parents):
+        if os.path.islink(place) and not os.path.exists(place):
+            raise error(f"{shown(place)}: a link to what is not there")
+        if os.path.exists(place):
+            return
 
 
 def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:

@@ -72,6 +72,7 @@ def claimed(
         with _explained(claim.work):
             _move_back(claim)
             refuse_foreign(claim)
+            ownership.remove_partials(claim.out)
             if claim.work.is_dir():
                 work_folder.drop_results(claim.work) if resume else work_folder.clear(claim.work)
         work_folder.make(claim.work)

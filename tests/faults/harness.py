@@ -118,7 +118,7 @@ def gnss_sem_map(
         (folder / "out").read_text(errors="replace"),
         (folder / "err").read_text(errors="replace"),
         time.perf_counter() - start,
-        float(peak.read_text()) if peak.exists() else 0.0,
+        float(peak.read_text() or 0.0) if peak.exists() else 0.0,
         tuple(sorted(path.name for path in temporary.iterdir())),
         _lives(process.pid or 0),
     )

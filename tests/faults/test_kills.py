@@ -1,4 +1,4 @@
-"""kill -9 at every change of the disk: the old result or the new one is there, whole, and --resume gives the same bytes."""
+"""kill -9 at every change of the disk: the old result or the new one is there, and --resume gives the same bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies at OUT, or above it, or beside it, and is not ours, stays; a run that cannot put its result there says so first."""
+"""What is at OUT, above it or beside it and not ours stays; who cannot put a result there says so first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from faults.harness import Outcome, gnss_sem_map
 from faults.killing import content, write_result
 from street import Street
 
-from gnss_sem_map.ownership import MARKER
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.output import new_folder
+from gnss_sem_map.ownership import MARKER, is_whole
 
 RUN = {
     "run.json": "{}",
@@ -208,7 +210,7 @@ def test_notes_in_the_folder_of_an_interrupted_run_stay(small_drive: Street, tri
         (work / name).write_text("important")
         before = content(work.parent)
         outcome = trajectory(small_drive, work.parent / "out", tmp_path / "trial")
-        trial("neighbours", refused(outcome, before, work.parent, name), outcome)
+        trial("neighbours", refused(outcome, before, work.parent, name.split("/")[0]), outcome)
 
 
 def test_an_interrupted_run_without_its_fingerprint_blocks_nobody(small_drive, trial, tmp_path: Path) -> None:
@@ -294,11 +296,11 @@ def test_a_mount_point_is_refused_and_a_folder_on_it_is_not(
     write_result(tiny_disk / "out", RUN)
     before = content(tiny_disk)
     outcome = trajectory(small_drive, tiny_disk / "out", tmp_path / "trial")
-    trial("full disk", refused(outcome, before, tiny_disk, "cannot"), outcome)
+    trial("full disk", refused(outcome, before, tiny_disk, "No space"), outcome)
     assert os.listdir(tiny_disk) == ["out"]
 
 
-@pytest.mark.parametrize("file_mb", [0.0, 0.0001, 0.001, 0.02])
+@pytest.mark.parametrize("file_mb", [0.0005, 0.001, 0.003, 0.02])
 def test_a_full_disk_leaves_the_earlier_result(small_drive, file_mb: float, trial, tmp_path: Path) -> None:
     out = tmp_path / "place" / "out"
     write_result(out, RUN)
@@ -352,6 +354,108 @@ def test_of_two_commands_the_second_is_refused_and_told_by_whom(small_drive, tri
     outcome = trajectory(small_drive, place / "out", tmp_path / "trial")
     faults = [*outcome.faults, *["refused"] * (outcome.code != 0)]
     trial("two into one OUT", [*faults, *["left"] * (os.listdir(place) != ["out"])], outcome)
+
+
+def replace_while_somebody_writes(out: Path, name: str) -> None:
+    with new_folder(out) as folder:
+        (folder / "run.json").write_text("new")
+        (out / name).write_text("important")
+
+
+def test_what_came_into_the_old_result_under_way_stays_and_the_new_one_is_named(
+    trial, tmp_path: Path
+) -> None:
+    for number, name in enumerate(("thesis.txt", "map/notes.md", "config.yaml")):
+        out = tmp_path / f"{number}" / "out"
+        write_result(out, RUN)
+        with pytest.raises(DataError, match="the new ones are in") as refusal:
+            replace_while_somebody_writes(out, name)
+        kept = Path(str(refusal.value).rpartition(" ")[2])
+        faults = ["lost"] * (
+            (out / name).read_text() != "important" or (out / "map/map.json").read_text() != "{}"
+        )
+        faults += ["no new result"] * ((kept / "run.json").read_text() != "new")
+        faults += ["left"] * (sorted(path.name for path in out.parent.iterdir()) != ["out", "out.new"])
+        trial("foreign files in OUT", faults)
+
+
+def held(path: Path) -> bool:
+    """Make a file such that nobody, not even root, can move or remove it; whether that is possible here."""
+    return subprocess.run(["chattr", "+i", path], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("what", [".", "map", "map/map.json"])
+def test_an_old_result_that_cannot_go_is_never_half_gone_with_the_new_one(
+    what: str, trial, tmp_path: Path
+) -> None:
+    out = tmp_path / "place" / "out"
+    write_result(out, RUN)
+    if not held(out / what):
+        pytest.skip("files cannot be held here")
+    try:
+        said = ""
+        for number in range(2):
+            try:
+                write_result(out, {"run.json": f"{number}"})
+            except DataError as error:
+                said += f"{error} "
+        whole = [path for path in out.parent.iterdir() if path.name.startswith("out")]
+        faults = ["half a result"] * (not all(is_whole(path) for path in whole))
+        faults += ["nothing at OUT"] * (not out.is_dir())
+        faults += ["not named"] * (str(tmp_path) not in said)
+        trial("rights", faults, said)
+    finally:
+        subprocess.run(["chattr", "-R", "-i", tmp_path], capture_output=True, check=True)
+
+
+def test_names_are_names_as_long_as_they_are_text(own_street: Street, trial, tmp_path: Path) -> None:
+    for name in (b"out\xff", "\u00e4 \u4e2d \U0001f697".encode(), b"-", b"a b'\"$(x)", b"out\n2"):
+        out = tmp_path / "place" / os.fsdecode(name)
+        outcome = trajectory(own_street, out, tmp_path / "trial")
+        is_text = b"\xff" not in name
+        faults = [*outcome.faults, *[f"exit code {outcome.code}"] * (outcome.code != 1 - is_text)]
+        faults += ["no result"] * ((out / "run.json").is_file() != is_text)
+        trial("names", faults, outcome)
+    assert len(os.listdir(tmp_path / "place")) == 4
+
+
+def test_a_lock_that_is_none_is_not_touched(small_drive: Street, trial, tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    place.mkdir()
+    makers: list[Callable[[Path], object]] = [
+        lambda path: path.write_bytes(b"\xff\xfe thesis"), lambda path: os.mkfifo(path), lambda path: path.mkdir(),
+        lambda path: path.symlink_to("/etc/hostname"), lambda path: path.symlink_to(path),
+    ]  # fmt: skip
+    for make in makers:
+        lock = place / ".out.lock"
+        make(lock)
+        before = lock.lstat()
+        outcome = trajectory(small_drive, place / "out", tmp_path / "trial")
+        faults = [*outcome.faults, *["not refused"] * (outcome.code != 1)]
+        trial(
+            "neighbours", [*faults, *["touched"] * (lock.lstat().st_mtime_ns != before.st_mtime_ns)], outcome
+        )
+        lock.rmdir() if lock.is_dir() and not lock.is_symlink() else lock.unlink()
+
+
+@pytest.mark.faults
+def test_a_full_tmpdir_costs_nothing(small_drive: Street, trial, tmp_path: Path) -> None:
+    full = tmp_path / "trial" / "tmp"
+    full.mkdir(parents=True)
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", full], capture_output=True, check=False
+    )
+    if done.returncode:
+        pytest.skip("mounting is not allowed here")
+    try:
+        labels = f"labels:{small_drive.labels}"
+        words = ("run", small_drive.drive, "--segmenter", labels, "-o", tmp_path / "out")
+        for workers in ("1", "2"):
+            chunks = ("--workers", workers, "--set", "mapping.scans_per_chunk=4")
+            outcome = gnss_sem_map(*words, *chunks, folder=tmp_path / "trial")
+            trial("full TMPDIR", [*outcome.faults, *["refused"] * (outcome.code != 0)], outcome)
+    finally:
+        subprocess.run(["umount", "-l", full], check=True)
 
 
 def test_other_commands_write_over_nothing_that_is_not_theirs(small_drive, trial, tmp_path: Path) -> None:

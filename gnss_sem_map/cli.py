@@ -88,7 +88,7 @@ def run(
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
     settings = _settings(config, set_)
-    with run_folder.claimed_run(out, _inputs(drive, config, settings, segmenter), resume) as claim:
+    with run_folder.claimed_run(out, _inputs(drive, config, settings, segmenter)) as claim:
         log = _open(drive, drive_format, frames)
         refuse_inputs(claim.out, sorted(log.folders))
         network = None

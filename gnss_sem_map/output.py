@@ -11,6 +11,7 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from gnss_sem_map.errors import DataError
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems that know no locks: there we go on without."""
 FIRST_WORDS = "gnss-sem-map writes"
-RESUMABLE = "what is done so far is kept: the same command with --resume goes on"
+RESUMABLE = "what is mapped so far is kept: `gnss-sem-map run ... --resume` goes on"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +51,13 @@ _HELD: dict[Path, Claim] = {}
 def claimed(
     out: Path,
     inputs: Iterable[Path | str | None] = (),
-    resume: bool = False,
     by_name: Callable[[str], bool] = lambda name: False,
 ) -> Iterator[Claim]:
     """Have a place for results for ourselves, and know before any work that they can be put there.
 
-    What an interrupted command left in the work folder is put right: an old result moved back, the rest removed, but
-    for what `resume` can use. Raises DataError when another command writes there, when what is there is not ours,
-    when it is, holds or lies in one of the `inputs`, and when it may not be changed.
+    What a killed command left in the work folder is put right: an old result moved back, a new one that was not
+    finished removed; what is mapped stays until a result is there. Raises DataError when another command writes there,
+    when what is there is not ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
     """
     real = real_path(out)
     if real in _HELD:
@@ -72,8 +72,8 @@ def claimed(
         with _explained(claim.work):
             _move_back(claim)
             refuse_foreign(claim)
-            if claim.work.is_dir():
-                work_folder.drop_results(claim.work) if resume else work_folder.clear(claim.work)
+            ownership.remove_partials(claim.out)
+            work_folder.drop_results(claim.work)
         work_folder.make(claim.work)
         _HELD[real] = claim
         try:
@@ -84,9 +84,7 @@ def claimed(
             raise
         finally:
             del _HELD[real]
-            with suppress(
-                OSError
-            ):  # the results are there, or an error is under way; the next command tries again
+            with suppress(OSError):  # the next command tries again
                 if not work_folder.holds_work(claim.work):
                     work_folder.clear(claim.work)
 
@@ -99,7 +97,7 @@ def new_folder(out: Path, by_name: Callable[[str], bool] = lambda name: False) -
     `claimed` does, when the disk is full, and when the old result can no longer be replaced: then it says where the
     new one is.
     """
-    with claimed(out, resume=True, by_name=by_name) as claim:
+    with claimed(out, by_name=by_name) as claim:
         part = claim.work / work_folder.PART
         try:
             part.mkdir()
@@ -157,7 +155,7 @@ def _explained(work: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DataError(
-            f"{error.filename or work}: left by an interrupted command, and cannot be removed ({error.strerror});"
+            f"{error.filename or work}: an earlier command could not remove it, nor can this one ({error.strerror});"
             " see to its rights, or remove it"
         ) from None
 
@@ -168,6 +166,7 @@ def real_path(out: Path) -> Path:
         real = Path(os.path.realpath(out))
         if real.is_symlink():
             raise DataError(f"{out}: is a link to itself; choose another -o")
+        str(real).encode()  # not every format's writer can open what is no text
     except (OSError, ValueError) as error:
         raise DataError(f"{str(out)!r}: is no place for results ({error}); choose another -o") from None
     return real
@@ -286,7 +285,11 @@ def locked(out: Path) -> Iterator[None]:
 
 def _lock(path: Path, out: Path) -> TextIO:
     while True:
-        file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644), "r+")
+        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            os.close(number)
+            raise DataError(f"{path}: is in the way, and no lock of ours; move it away")
+        file = os.fdopen(number, "r+", encoding="utf-8", errors="replace")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -73,13 +73,18 @@ def remove(folder: Path) -> None:
         path = folder / name
         if look(path) in listed[name]:
             path.rmdir() if name.endswith("/") else path.unlink()
-    for name in _content(folder):
-        if is_partial(name):
-            (folder / name).unlink()
+    remove_partials(folder)
     left = next(_content(folder), None)
     if left is None:
         (folder / MARKER).unlink(missing_ok=True)
     folder.rmdir()
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove the beginnings of lists and pages that somebody was killed at writing; raises OSError."""
+    for path in folder.glob(".*.part") if folder.is_dir() else ():
+        if is_partial(path.name):
+            path.unlink()
 
 
 def amend(folder: Path, name: str, content: bytes) -> None:

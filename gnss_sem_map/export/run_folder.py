@@ -50,11 +50,9 @@ def is_run_file(name: str) -> bool:
     return RUN_FILES.fullmatch(name) is not None
 
 
-def claimed_run(
-    out: Path, inputs: Iterable[Path | str | None] = (), resume: bool = False
-) -> AbstractContextManager[Claim]:
+def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> AbstractContextManager[Claim]:
     """A place for a run that is ours until the claim ends; see `output.claimed`."""
-    return claimed(out, inputs, resume, is_run_file)
+    return claimed(out, inputs, is_run_file)
 
 
 def write_run(
@@ -67,7 +65,7 @@ def write_run(
     segmenter: str | None = None,
 ) -> dict[str, Any]:
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
-    with claimed_run(out, [drive], resume=True), new_folder(out) as folder:
+    with claimed_run(out, [drive]), new_folder(out) as folder:
         with result.account.stage("export"):
             _write_trajectory(folder, log, result.trajectory, result.solution)
             tiles.write(result.raw, folder / "map", log.frame)
@@ -122,7 +120,7 @@ def write_trajectory_run(
     page: Preflight,
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
-    with claimed_run(out, [drive], resume=True), new_folder(out) as folder:
+    with claimed_run(out, [drive]), new_folder(out) as folder:
         _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, account) | {

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.output import locked
-from gnss_sem_map.ownership import read_list, write_list
+from gnss_sem_map.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
@@ -151,10 +151,11 @@ def simulate(
     for path in (drive, _twin(drive)):
         if path.exists():
             raise DataError(f"{path}: is already there; remove it or simulate into another folder")
-    simulation = prepare(seconds, seed, lidar, camera)
     with _for_us_alone(drive) as partial:
-        _write_still(simulation, partial)
+        write_calibration(partial / "calibration", camera or Camera())
         _refuse_other_calibration(partial / "calibration", drive.parent)
+        simulation = prepare(seconds, seed, lidar, camera)
+        _write_still(simulation, partial)
         frames = len(simulation.sweeps)
         seen: list[npt.NDArray[np.uint16]] = []
         with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
@@ -180,19 +181,29 @@ def _for_us_alone(drive: Path) -> Iterator[Path]:
     try:
         drive.parent.mkdir(parents=True, exist_ok=True)
         with locked(drive):
-            if os.path.lexists(partial) and read_list(partial) is None:
+            if os.path.lexists(partial) and read_list(partial) is None and os.listdir(partial):
                 raise DataError(f"{partial}: is in the way, and not ours; move it away")
             try:
-                shutil.rmtree(partial, ignore_errors=True)
+                _clear(partial)
                 partial.mkdir()
                 write_list(partial)
+                (partial / "calibration").mkdir()
                 yield partial
             finally:
-                shutil.rmtree(partial, ignore_errors=True)
+                _clear(partial)
     except OSError as error:
         raise DataError(
             f"{drive}: cannot be written ({error.strerror}); free the disk or simulate into another folder"
         ) from None
+
+
+def _clear(partial: Path) -> None:
+    """Remove an unfinished drive, last of all what says that it is ours."""
+    if partial.is_dir():
+        for part in ("sync", "extract", "calibration"):
+            shutil.rmtree(partial / part, ignore_errors=True)
+        (partial / MARKER).unlink(missing_ok=True)
+        partial.rmdir()
 
 
 def _refuse_other_calibration(new: Path, date: Path) -> None:
@@ -207,7 +218,7 @@ def _twin(drive: Path) -> Path:
 
 
 def _write_still(simulation: Simulation, folder: Path) -> None:
-    """Calibration, oxts, stamps, and the truth that needs no rendering."""
+    """Oxts, stamps, and the truth that needs no rendering."""
     partial = folder / "sync"
     for name in (
         "velodyne_points/data",
@@ -217,8 +228,6 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
         "truth/single_frame",
     ):
         (partial / name).mkdir(parents=True)
-    (folder / "calibration").mkdir()
-    write_calibration(folder / "calibration", simulation.camera)
     _write_oxts(partial, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
     _write_oxts(folder / "extract", simulation.oxts_stamps, simulation.oxts)
     stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}

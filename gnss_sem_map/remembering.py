@@ -86,7 +86,7 @@ def _fingerprint(about: Path) -> str | None:
 def _read(file: Path) -> NDArray[np.uint8] | None:
     """What was answered; None where nothing was, or the file is damaged (its checksum is in it)."""
     try:
-        with np.load(file, allow_pickle=False) as remembered:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as remembered:
             return np.asarray(remembered["probabilities"], np.uint8)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return None

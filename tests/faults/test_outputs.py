@@ -74,7 +74,10 @@ FOREIGN: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("name", FOREIGN)
 @pytest.mark.parametrize("listed", [True, False])
-@pytest.mark.parametrize("command", ["trajectory", "run", "merge", "demo"])
+@pytest.mark.parametrize(
+    "command",
+    ["trajectory", *(pytest.param(name, marks=pytest.mark.faults) for name in ("run", "merge", "demo"))],
+)
 def test_a_result_with_something_foreign_in_it_is_refused_before_any_work(
     small_drive: Street, name: str, listed: bool, command: str, trial, tmp_path: Path
 ) -> None:
@@ -171,19 +174,13 @@ def test_files_that_are_read_are_never_in_the_place_for_results(small_drive, tri
         shutil.rmtree(out)
 
 
-BESIDE = [
-    ".out.part",
-    ".out.work",
-    ".out.old",
-    "out.new",
-    ".out.lock",
-    "out_drive",
-    ".out.work/part",
-    ".out.work/3",
-]
+REFUSED = [".out.work", ".out.lock", ".out.work/part", ".out.work/3"]
+LEFT_ALONE = [".out.part", ".out.old", "out.new", "out_drive"]
 
 
-@pytest.mark.parametrize("name", BESIDE)
+@pytest.mark.parametrize(
+    "name", [*REFUSED, *(pytest.param(name, marks=pytest.mark.faults) for name in LEFT_ALONE)]
+)
 def test_what_lies_beside_is_somebody_elses(small_drive: Street, name: str, trial, tmp_path: Path) -> None:
     """The command does without it, or refuses; it stays in any case."""
     place = tmp_path / "place"
@@ -408,6 +405,7 @@ def test_an_old_result_that_cannot_go_is_never_half_gone_with_the_new_one(
         subprocess.run(["chattr", "-R", "-i", tmp_path], capture_output=True, check=True)
 
 
+@pytest.mark.faults
 def test_names_are_names_as_long_as_they_are_text(own_street: Street, trial, tmp_path: Path) -> None:
     for name in (b"out\xff", "\u00e4 \u4e2d \U0001f697".encode(), b"-", b"a b'\"$(x)", b"out\n2"):
         out = tmp_path / "place" / os.fsdecode(name)
@@ -419,6 +417,7 @@ def test_names_are_names_as_long_as_they_are_text(own_street: Street, trial, tmp
     assert len(os.listdir(tmp_path / "place")) == 4
 
 
+@pytest.mark.faults
 def test_a_lock_that_is_none_is_not_touched(small_drive: Street, trial, tmp_path: Path) -> None:
     place = tmp_path / "place"
     place.mkdir()

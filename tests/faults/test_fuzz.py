@@ -16,7 +16,7 @@ def _check(name: str, first: int, count: int, trial, folder: Path) -> None:
     # a line of a table, where pytest shows output (-s)
     print(
         f"\n| {name} | {report.inputs} | {report.refused} | {report.slowest_s:.2f} s | {report.peak_mb:.0f} MB |"
-    )  # noqa: T201
+    )
     trial("fuzzing", report.faults[:10])
 
 

@@ -230,7 +230,7 @@ def test_a_calibration_that_is_no_rotation_is_refused_with_its_file(kind, name, 
     lines = [
         f"{row}: {_matrix(TURNS[kind])}" if line.startswith(f"{row}:") else line
         for line in path.read_text().splitlines()
-    ]  # noqa: E501
+    ]
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(SemMapError, match=rf"{name}: .*{row}.*expected"):
         open_drive(copies["kitti"])

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 # Directions that are nearer than this to an axis, rad, are that axis: half of a right angle.
 NEAR_RAD = np.pi / 4
+# A unit that is turned by half a right angle is called askew, though noise adds to it.
+ASKEW_RAD = np.pi / 3
 X, Y, Z = np.eye(3)
 
 
@@ -69,8 +71,16 @@ RIGHT = AxesMistake("", "", np.eye(3), np.eye(3))
 
 def probable(seen: Seen) -> tuple[AxesMistake, ...]:
     """The mistakes that explain what was seen, the usual before the odd; `RIGHT` alone where there need be none."""
-    found = tuple(mistake for mistake in _KNOWN if mistake.misfit(seen) < NEAR_RAD)
-    return (RIGHT,) if RIGHT in found else found
+    if RIGHT.misfit(seen) < ASKEW_RAD:
+        return (RIGHT,)
+    return next(
+        (
+            found
+            for near in (NEAR_RAD, ASKEW_RAD)
+            if (found := tuple(m for m in _KNOWN if m.misfit(seen) < near))
+        ),
+        (),
+    )
 
 
 def askew(seen: Seen, mistake: AxesMistake) -> tuple[float, float, float]:

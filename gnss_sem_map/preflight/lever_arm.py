@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 
 # No vehicle is longer.
 LONGEST_M = 20.0
-# An antenna is told to be elsewhere from here, m, and from so many standard deviations: one in a hundred by chance.
-NOTABLE_M, SURE = 1.4, 3.0
+# An antenna is told to be elsewhere from here, m, and from so many standard deviations: slopes are no white noise.
+NOTABLE_M, SURE = 1.4, 3.5
 # What is less sure than this, m, says nothing about an antenna on a car.
 OBSERVED_M = 0.9
 # An antenna alone explains the fixes as well as an antenna and a clock when it leaves so many times as much.

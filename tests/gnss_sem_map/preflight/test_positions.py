@@ -1,0 +1,169 @@
+"""What is wrong with fixes and given poses is named; what is only rare is left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sensor_drives import FRAME, LEVER, drive, findings, wrong
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import GnssFixes, ImuNoise
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.conventions import SensorConventions
+from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def right() -> SensorLog:
+    return drive(4, 120.0, ImuNoise())
+
+
+def fixes_of(log: SensorLog) -> GnssFixes:
+    assert log.gnss is not None
+    return log.gnss
+
+
+def moved(log: SensorLog, positions: Array) -> SensorLog:
+    fixes = fixes_of(log)
+    return replace(log, gnss=GnssFixes(fixes.stamps, positions, fixes.stddevs))
+
+
+def written(log: SensorLog, lat: Array, lon: Array, alt: Array) -> SensorLog:
+    """The drive as a reader finds it whose columns hold these numbers."""
+    fixes, frame = fixes_of(log), LocalFrame(float(lat[0]), float(lon[0]), float(alt[0]))
+    return replace(log, frame=frame, gnss=GnssFixes(fixes.stamps, frame.to_map(lat, lon, alt), fixes.stddevs))
+
+
+def test_swapped_columns_mirror_the_track(right: SensorLog) -> None:
+    lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)
+    assert any("swapped" in said for said in wrong(findings(written(right, lon, lat, alt))))
+
+
+def test_radians_lie_at_sea(right: SensorLog) -> None:
+    lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)
+    said = wrong(findings(written(right, np.radians(lat), np.radians(lon), alt)))
+    assert len(said) == 1
+    assert "radians" in said[0]
+
+
+@pytest.mark.parametrize("height", [115.0, 3.0, -20.0])
+def test_heights_in_millimetres_are_no_road(right: SensorLog, height: float) -> None:
+    lat, lon, alt = FRAME.to_geodetic(fixes_of(right).positions)
+    said = wrong(findings(written(right, lat, lon, 1000.0 * (alt - FRAME.alt_m + height))))
+    assert any("altitude is in mm" in line for line in said)
+
+
+@pytest.mark.parametrize("late_s", [-2.0, -1.0, -0.5, 0.5, 1.0, 2.0])
+def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s: float) -> None:
+    fixes = fixes_of(right)
+    late = replace(right, gnss=GnssFixes(fixes.stamps + late_s, fixes.positions, fixes.stddevs))
+    said = [line for line in wrong(findings(late)) if "gnss_time_offset_s" in line]
+    assert len(said) == 1
+    offset = float(said[0].split("gnss_time_offset_s: ")[1])
+    assert offset == pytest.approx(-late_s, abs=0.2)
+    assert wrong(findings(late, SensorConventions(gnss_time_offset_s=offset))) == []
+
+
+@pytest.mark.parametrize(("start", "seconds"), [(20.0, 10.0), (30.0, 30.0), (80.0, 60.0), (0.0, 200.0)])
+def test_a_frozen_receiver_is_told_from_a_standing_vehicle(
+    right: SensorLog, start: float, seconds: float
+) -> None:
+    fixes = fixes_of(right)
+    inside = (fixes.stamps >= start) & (fixes.stamps <= start + seconds)
+    positions = fixes.positions.copy()
+    positions[inside] = positions[inside][0]
+    said = wrong(findings(moved(right, positions)))
+    assert any("frozen" in line for line in said)
+
+
+def test_a_receiver_that_holds_its_place_while_the_vehicle_stands_is_not_frozen() -> None:
+    standing = drive(4, 120.0, ImuNoise())
+    fixes = fixes_of(standing)
+    assert standing.imu is not None
+    rest = standing.imu.specific_force[:1].repeat(len(standing.imu), axis=0)
+    still = replace(standing.imu, specific_force=rest, angular_rate=np.zeros_like(rest))
+    held = moved(standing, fixes.positions[:1].repeat(len(fixes), axis=0))
+    assert not any("frozen" in line for line in wrong(findings(replace(held, imu=still))))
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.001])
+def test_standard_deviations_that_nobody_reaches_are_told_of(right: SensorLog, factor: float) -> None:
+    fixes = fixes_of(right)
+    sure = replace(right, gnss=GnssFixes(fixes.stamps, fixes.positions, fixes.stddevs * factor))
+    assert any("standard deviations are too small" in line for line in wrong(findings(sure)))
+
+
+def test_rows_without_an_accuracy_are_told_of(right: SensorLog) -> None:
+    skips = (Skip("gnss", "gnss.csv", "7 rows with a standard deviation that is not above 0"),)
+    assert any("negative" in line for line in wrong(findings(replace(right, skips=skips))))
+
+
+def test_a_lever_arm_in_millimetres_is_longer_than_any_vehicle(right: SensorLog) -> None:
+    calibration = Calibration(np.eye(4), p_imu_antenna=np.array(LEVER) * 1000.0)
+    assert any(
+        "lever arm is in mm" in line for line in wrong(findings(replace(right, calibration=calibration)))
+    )
+
+
+@pytest.mark.parametrize("off", [(2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, -2.0, 0.0)])
+def test_an_antenna_elsewhere_is_found_in_the_turns(off: tuple[float, float, float]) -> None:
+    good = drive(4, 120.0, ImuNoise(), stddev_m=0.02, every_s=0.2)
+    assert wrong(findings(good)) == []
+    calibration = Calibration(np.eye(4), p_imu_antenna=np.array(LEVER) + off)
+    assert any("antenna" in line for line in wrong(findings(replace(good, calibration=calibration))))
+
+
+def test_single_outliers_are_left_to_the_smoother(right: SensorLog) -> None:
+    positions = fixes_of(right).positions.copy()
+    positions[[20, 55], 0] += 1000.0
+    assert wrong(findings(moved(right, positions))) == []
+
+
+def poses(seconds: float = 20.0) -> Trajectory:
+    """A vehicle on a circle at 8 m/s, ten poses a second, looking ahead."""
+    stamps = np.arange(0.0, seconds, 0.1)
+    heading = 0.2 * stamps
+    T = np.tile(np.eye(4), (len(stamps), 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("z", heading[:, None]).as_matrix()
+    T[:, :2, 3] = 40.0 * np.column_stack([np.sin(heading), 1 - np.cos(heading)])
+    return Trajectory(stamps, T)
+
+
+def given(T: Array) -> SensorLog:
+    return SensorLog("x", 0, Calibration(np.eye(4)), (), (), given=Trajectory(poses().stamps, T))
+
+
+def test_poses_of_a_vehicle_are_green() -> None:
+    assert wrong(findings(given(poses().T_map_imu))) == []
+
+
+@pytest.mark.parametrize("jump_m", [5.0, 1000.0])
+@pytest.mark.parametrize("rows", [slice(100, None), slice(100, 101), slice(0, 1)])
+def test_poses_that_jump_are_named(jump_m: float, rows: slice) -> None:
+    T = poses().T_map_imu.copy()
+    T[rows, 0, 3] += jump_m
+    assert any("jump" in line for line in wrong(findings(given(T))))
+
+
+def test_a_pose_that_is_turned_is_named() -> None:
+    T = poses().T_map_imu.copy()
+    T[100, :3, :3] = T[100, :3, :3] @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    assert any("rotations jump" in line for line in wrong(findings(given(T))))
+
+
+def test_poses_in_millimetres_are_named() -> None:
+    T = poses().T_map_imu.copy()
+    T[:, :3, 3] *= 1000.0
+    assert any("unit" in line for line in wrong(findings(given(T))))
+
+
+def test_poses_of_a_camera_look_aside() -> None:
+    T = poses().T_map_imu.copy()
+    T[:, :3, :3] = T[:, :3, :3] @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    assert any("other axes" in line for line in wrong(findings(given(T))))

@@ -31,7 +31,12 @@ HEADING_STDDEV_RAD = np.radians(0.5)
 SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 4.0
 """Differences that are no reason to warn, about x, y and z: good drives reach 2 deg, roads tilt by 2 to 3."""
 SAME_SCALE, WRONG_SCALE = 0.1, 0.25
-SCALES = {1000.0: "in mm", 0.001: "in km", 57.2958: "in degrees taken for radians", 1 / 57.2958: "in radians taken for degrees"}
+SCALES = {
+    1000.0: "in mm",
+    0.001: "in km",
+    57.2958: "in degrees taken for radians",
+    1 / 57.2958: "in radians taken for degrees",
+}
 SHIFTS_S = np.arange(-20, 21) * 0.1
 LATE_S = 0.25
 
@@ -117,7 +122,9 @@ def _compare(sample: Sample, motions: _Motions, p: Array) -> Iterator[Finding]:
 def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
     ratios = np.log(np.maximum(by_track, 1e-6) / np.maximum(by_lidar, 1e-6))
     ratio, spread = float(np.median(ratios)), float(np.ptp(ratios))
-    found = f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees ({len(ratios)} stretches)"
+    found = (
+        f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees ({len(ratios)} stretches)"
+    )
     what = _track(sample)
     if abs(ratio) <= SAME_SCALE or (abs(ratio) <= WRONG_SCALE and len(ratios) < 2):
         return green(SCALE, found)
@@ -126,7 +133,12 @@ def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
         return _late(sample, shift, found)
     for factor, unit in SCALES.items():
         if abs(ratio - np.log(factor)) < SAME_SCALE + spread:
-            return red(SCALE, found, f"{what} are {unit}", "give positions in metres, or latitude and longitude in degrees")
+            return red(
+                SCALE,
+                found,
+                f"{what} are {unit}",
+                "give positions in metres, or latitude and longitude in degrees",
+            )
     if abs(ratio + np.log(1000)) < 1 or abs(ratio - np.log(1000)) < 1:
         return red(SCALE, found, f"{what} or the points of the LiDAR are in mm", "give both in metres")
     return (red if abs(ratio) > WRONG_SCALE and spread < abs(ratio) else amber)(
@@ -272,7 +284,10 @@ def _position(sample: Sample, motions: _Motions, rotation: Array, p: Array) -> I
     off = motions.ways_lidar @ rotation.T - motions.ways_imu - lever @ p
     if not turning.any():
         rest = np.sqrt(np.mean(np.sum(off**2, axis=1)))
-        yield green(LEVER, f"{np.linalg.norm(p):.2f} m from the IMU; by motion not observable without turns (rest {rest:.2f} m)")
+        yield green(
+            LEVER,
+            f"{np.linalg.norm(p):.2f} m from the IMU; by motion not observable without turns (rest {rest:.2f} m)",
+        )
         return
     J = lever[turning].reshape(-1, 3)
     track = np.repeat(np.linalg.norm(motions.ways_imu[turning], axis=1), 3)
@@ -285,8 +300,10 @@ def _position(sample: Sample, motions: _Motions, rotation: Array, p: Array) -> I
     shift = axes[:, known] @ (g[known] / values[known])
     sigma = np.sqrt(1 / values[known].min()) if known.any() else np.inf
     length = float(np.linalg.norm(shift))
-    found = f"turns put the LiDAR {length:.2f} +- {sigma:.2f} m from where T_imu_lidar has it" if known.any() else (
-        "by motion not observable: no turn is sharp enough"
+    found = (
+        f"turns put the LiDAR {length:.2f} +- {sigma:.2f} m from where T_imu_lidar has it"
+        if known.any()
+        else ("by motion not observable: no turn is sharp enough")
     )
     if not known.any() or length < max(0.7, SIGMAS * sigma):
         yield green(LEVER, found)
@@ -294,9 +311,16 @@ def _position(sample: Sample, motions: _Motions, rotation: Array, p: Array) -> I
     R = sample.log.calibration.T_imu_lidar[:3, :3]
     inverted = axes[:, known].T @ (-R.T @ p - p - shift)
     if float(np.linalg.norm(inverted)) < 0.5 * length:
-        yield amber(LEVER, found, "T_imu_lidar is inverted: T_lidar_imu was given", "give the inverse of T_imu_lidar")
+        yield amber(
+            LEVER, found, "T_imu_lidar is inverted: T_lidar_imu was given", "give the inverse of T_imu_lidar"
+        )
         return
-    yield amber(LEVER, found, "the translation of T_imu_lidar is wrong", "measure the LiDAR's place in the imu frame, m")
+    yield amber(
+        LEVER,
+        found,
+        "the translation of T_imu_lidar is wrong",
+        "measure the LiDAR's place in the imu frame, m",
+    )
 
 
 def _lever(turns: Array) -> Array:
@@ -310,7 +334,9 @@ def _time_shift(sample: Sample) -> float | None:
     assert trajectory is not None
     ends = np.array([s.stamps[[0, -1]] for s in sample.stretches])
     ways = np.array([np.linalg.norm(sample.deskewed(s)[0][-1][:3, 3]) for s in sample.stretches])
-    turns = np.array([Rotation.from_matrix(sample.deskewed(s)[0][-1][:3, :3]).magnitude() for s in sample.stretches])
+    turns = np.array(
+        [Rotation.from_matrix(sample.deskewed(s)[0][-1][:3, :3]).magnitude() for s in sample.stretches]
+    )
     costs = np.full(len(SHIFTS_S), np.inf)
     for k, shift in enumerate(SHIFTS_S):
         moved = ends + shift
@@ -340,5 +366,3 @@ def _late(sample: Sample, shift: float, found: str) -> Finding:
 
 def _track(sample: Sample) -> str:
     return "the given poses" if sample.log.given is not None else "the fixes"
-
-

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.preflight.camera_pose import LEAST_VIEWS, SURE, TURNS, best_change, in_errors
+from gnss_sem_map.preflight.camera_pose import LEAST_BEST, LEAST_VIEWS, SURE, TURNS, best_change, in_errors
 from gnss_sem_map.preflight.depth_edges import Edges, View, border_strength
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.sample import Sample
@@ -48,9 +48,16 @@ def check(sample: Sample) -> Iterator[Finding]:
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
     if not seen:
         why = f": {errors[0]}" if errors else ""
-        yield (amber if errors else green)(
-            NAME, f"none of {len(errors)} frames looked at has labels{why}", "labels are of other frames", "check the numbers in their names"
-        ) if errors else green(NAME, "not observable: no frame was looked at")
+        yield (
+            (amber if errors else green)(
+                NAME,
+                f"none of {len(errors)} frames looked at has labels{why}",
+                "labels are of other frames",
+                "check the numbers in their names",
+            )
+            if errors
+            else green(NAME, "not observable: no frame was looked at")
+        )
         return
     content = _content(seen, segmenter.class_names)
     yield content
@@ -102,7 +109,12 @@ def _place(sample: Sample, edges: Edges) -> Finding:
         f" {common.mean():+.2f} against labels of other frames"
     )
     best = best_change(edges, TURNS[:2])
-    if best.sigmas > SURE and abs(best.value) > 2 * best.family.same and best.gain > 2 * max(common.mean(), 0.0):
+    if (
+        best.sigmas > SURE
+        and best.agreement > LEAST_BEST
+        and abs(best.value) > 2 * best.family.same
+        and best.gain > 2 * max(common.mean(), 0.0)
+    ):
         K = edges.calibration.K
         assert K is not None
         pixels = abs(np.tan(np.radians(best.value)) * K[0, 0])

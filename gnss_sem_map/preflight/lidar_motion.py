@@ -215,7 +215,9 @@ def _surfaces(clouds: list[Array]) -> Surfaces:
     pack_keys(p, CUBE_M, keys)
     cubes, cube = distinct(keys)
     counts = np.bincount(cube, minlength=len(cubes))
-    sweeps = sum((np.bincount(cube[seen == k], minlength=len(cubes)) > 0).astype(int) for k in range(len(clouds)))
+    sweeps = sum(
+        (np.bincount(cube[seen == k], minlength=len(cubes)) > 0).astype(int) for k in range(len(clouds))
+    )
     enough = (counts >= LEAST_IN_CUBE) & (sweeps >= LEAST_SWEEPS) & (cubes != 0)
     p = p - (np.floor(p / CUBE_M) + 0.5) * CUBE_M
     means = [np.bincount(cube, p[:, i], len(cubes)) / counts for i in range(3)]

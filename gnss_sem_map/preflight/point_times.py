@@ -125,7 +125,8 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
     others = (NONE, REVERSED) if has_times else (CLOCKWISE, ANTICLOCKWISE)
     as_given = GIVEN if has_times else NONE
     surfaces = [
-        {times.name: _surfaces(s, times, interval, sample) for times in (as_given, *others)} for s in stretches
+        {times.name: _surfaces(s, times, interval, sample) for times in (as_given, *others)}
+        for s in stretches
     ]
     gains = {other.name: _gain(surfaces, as_given.name, other.name) for other in others}
     best = max(others, key=lambda other: sum(gains[other.name]))
@@ -148,7 +149,10 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
             "raw scans are called compensated (lidar_is_compensated), or their times are lost",
             "set lidar_is_compensated: false and give point times in a fifth column",
         )
-    reverse = "point times are reversed: the scanner turns the other way", "change the sign of the point times"
+    reverse = (
+        "point times are reversed: the scanner turns the other way",
+        "change the sign of the point times",
+    )
     twice = (
         "compensated scans are called raw: they are deskewed twice",
         "set lidar_is_compensated: true, with scans of four columns",

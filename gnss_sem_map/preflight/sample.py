@@ -25,10 +25,10 @@ from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
 """Of a longer drive so much is smoothed, and looked at closely."""
-SCANS_PER_STRETCH, MOST_STRETCHES = 40, 6
+SCANS_PER_STRETCH, MOST_STRETCHES = 40, 5
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
-SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 6, 10
+SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12
 LEAST_WAY_M = 5.0
 """Images of places so far apart are different."""
 UNMATCHED = "its sweeps cannot be laid onto each other"
@@ -87,7 +87,7 @@ class Sample:
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
             return {}
-        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 2, MOST_STRETCHES))
+        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 3, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
         found: dict[float, Stretch | str] = {}
@@ -122,7 +122,9 @@ class Sample:
             self._deskewed[id(seen)] = seen.deskewed(
                 tuple(
                     (s.after_s, s.dense_after_s)
-                    if s.after_s is not None and s.dense_after_s is not None and np.ptp(s.after_s) < LONGEST_SWEEP_S
+                    if s.after_s is not None
+                    and s.dense_after_s is not None
+                    and np.ptp(s.after_s) < LONGEST_SWEEP_S
                     else None
                     for s in seen.sweeps
                 )

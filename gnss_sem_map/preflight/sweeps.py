@@ -29,7 +29,9 @@ def _scans(sample: Sample) -> Iterator[Finding]:
         return
     unreadable = [why for why in tried.values() if isinstance(why, str) and why != UNMATCHED]
     unmatched = [why for why in tried.values() if why == UNMATCHED]
-    found = f"{len(sample.stretches)} of {len(tried)} stretches of a second have scans that fit onto each other"
+    found = (
+        f"{len(sample.stretches)} of {len(tried)} stretches of a second have scans that fit onto each other"
+    )
     if unreadable:
         yield (red if len(unreadable) > len(tried) / 2 else amber)(
             SCANS,

@@ -47,7 +47,9 @@ def _change_log(drive: Path, change: Callable[[dict[str, Any]], dict[str, Any]])
 
 
 def _change_scans(drive: Path, change: Callable[[NDArray[np.float32]], NDArray[Any]], columns: int) -> None:
-    folder = next(f for f in (drive / "lidar", drive / "velodyne_points/data", drive / "velodyne") if f.is_dir())
+    folder = next(
+        f for f in (drive / "lidar", drive / "velodyne_points/data", drive / "velodyne") if f.is_dir()
+    )
     for path in folder.glob("*.bin"):
         change(np.fromfile(path, "<f4").reshape(-1, columns)).astype("<f4").tofile(path)
 
@@ -62,7 +64,9 @@ def _change_stamps(path: Path, by_s: float) -> None:
     lines = []
     for line in path.read_text().splitlines():
         if line.strip():
-            stamp = np.datetime64(line.strip().replace(" ", "T"), "ns") + np.timedelta64(round(by_s * 1e9), "ns")
+            stamp = np.datetime64(line.strip().replace(" ", "T"), "ns") + np.timedelta64(
+                round(by_s * 1e9), "ns"
+            )
             line = str(stamp).replace("T", " ")
         lines.append(line)
     path.write_text("\n".join(lines) + "\n")
@@ -78,6 +82,7 @@ def turned_lidar(rotation_deg: Sequence[float]) -> Inject:
     def inject(drive: Path) -> None:
         R = Rotation.from_rotvec(rotation_deg, degrees=True).as_matrix()
         if (drive / "log.yaml").is_file():
+
             def change(about: dict[str, Any]) -> dict[str, Any]:
                 T = np.array(about["T_imu_lidar"])
                 T[:3, :3] = R @ T[:3, :3]
@@ -98,6 +103,7 @@ def scaled_lidar(factor: float) -> Inject:
 
     def inject(drive: Path) -> None:
         if (drive / "log.yaml").is_file():
+
             def change(about: dict[str, Any]) -> dict[str, Any]:
                 T = np.array(about["T_imu_lidar"])
                 T[:3, 3] *= factor
@@ -206,6 +212,7 @@ def turned_camera(rotation_deg: Sequence[float]) -> Inject:
     def inject(drive: Path) -> None:
         R = Rotation.from_rotvec(rotation_deg, degrees=True).as_matrix()
         if (drive / "log.yaml").is_file():
+
             def change(about: dict[str, Any]) -> dict[str, Any]:
                 T = np.array(about["T_camera_lidar"])
                 T[:3] = R @ T[:3]
@@ -390,7 +397,9 @@ def _camera() -> list[Mistake]:
         for angle in (3.0, -3.0, 5.0):
             rotation = angle * np.eye(3)[axis]
             found.append(
-                Mistake(f"camera turned {angle:+g} deg about {name}", "kitti-raw", turned_camera(rotation), turned)
+                Mistake(
+                    f"camera turned {angle:+g} deg about {name}", "kitti-raw", turned_camera(rotation), turned
+                )
             )
     found += [
         Mistake("camera turned (table)", "table", turned_camera((0, 3, 0)), turned),
@@ -403,7 +412,9 @@ def _camera() -> list[Mistake]:
         Mistake("focal length halved", "kitti-raw", scaled_K(0.5, centre=False), ("focal length",)),
         Mistake("focal length 1.2 times", "kitti-raw", scaled_K(1.2, centre=False), ("focal length",)),
         Mistake("K transposed", "kitti-raw", changed_K(np.transpose), ("camera matrix",)),
-        Mistake("K with skew", "table", changed_K(lambda K: K + np.eye(3, k=1) * 100.0), ("camera matrix", "skew")),
+        Mistake(
+            "K with skew", "table", changed_K(lambda K: K + np.eye(3, k=1) * 100.0), ("camera matrix", "skew")
+        ),
         Mistake("fx and fy far apart", "table", changed_K(lambda K: K * [[2], [1], [1]]), ("fx",)),
         Mistake("S_rect halved", "kitti-raw", scaled_S(0.5), ("size",)),
         Mistake("S_rect doubled", "kitti-raw", scaled_S(2.0), ("size",)),

@@ -30,14 +30,25 @@ def check(calibration: Calibration, size: tuple[int, int]) -> Finding:
             "give K as [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px",
         )
     if abs(K[0, 1]) > MOST_SKEW * fx:
-        return amber(NAME, f"found a skew of {K[0, 1]:.4g} px at fx {fx:.4g}", "K has a skew, rectified cameras have none",
-                     "set the skew in K to 0")  # fmt: skip
+        return amber(
+            NAME,
+            f"found a skew of {K[0, 1]:.4g} px at fx {fx:.4g}",
+            "K has a skew, rectified cameras have none",
+            "set the skew in K to 0",
+        )
     if abs(np.log(fx / fy)) > SAME_FOCAL:
-        return red(NAME, f"found fx {fx:.4g} and fy {fy:.4g} px, expected about the same", "fx and fy of K differ: pixels are square",
-                   "check fx and fy of K")  # fmt: skip
+        return red(
+            NAME,
+            f"found fx {fx:.4g} and fy {fy:.4g} px, expected about the same",
+            "fx and fy of K differ: pixels are square",
+            "check fx and fy of K",
+        )
     centre = np.array([K[0, 2] / size[0], K[1, 2] / size[1]])
     view = float(np.degrees(2 * np.arctan(size[0] / (2 * fx))))
-    found = f"fx {fx:.4g} px sees {view:.0f} deg; the principal point is at {centre[0]:.2f} of the width, {centre[1]:.2f} of the height"
+    found = (
+        f"fx {fx:.4g} px sees {view:.0f} deg; the principal point is at {centre[0]:.2f} of the width,"
+        f" {centre[1]:.2f} of the height"
+    )
     if ((centre < CENTRE[0]) | (centre > CENTRE[1])).all() and centre.max() - centre.min() < 0.1 * max(
         1.0, centre.max()
     ):
@@ -50,8 +61,12 @@ def check(calibration: Calibration, size: tuple[int, int]) -> Finding:
             f"multiply fx, fy, cx and cy by {factor:.2g}",
         )
     if ((centre < FAR_OFF[0]) | (centre > FAR_OFF[1])).any():
-        return amber(NAME, found, "principal point at the edge: K is of other images, or its numbers in another order",
-                     "check cx and cy of K, and the size of the images")  # fmt: skip
+        return amber(
+            NAME,
+            found,
+            "principal point at the edge: K is of other images, or its numbers in another order",
+            "check cx and cy of K, and the size of the images",
+        )
     if not VIEW_DEG[0] <= view <= VIEW_DEG[1]:
         return amber(
             NAME,

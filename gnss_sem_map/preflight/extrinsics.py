@@ -18,7 +18,6 @@ from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.lidar_motion import Stretch
 from gnss_sem_map.preflight.sample import Sample
 
-
 Array = NDArray[np.float64]
 NAME, LEVER, SCALE, FIT = "T_imu_lidar rotation", "T_imu_lidar position", "scale of motion", "motion"
 LONGEST_LEVER_M = 20.0
@@ -158,15 +157,15 @@ def _rotation(
     variances: list[float] = []
     seen = []
     yaw_pitch = np.sqrt(motions.attitude_variances[:, 1:].max(axis=1))
-    for k in np.flatnonzero(moved):
-        way = np.linalg.norm(motions.ways_lidar[k])
+    for k in np.flatnonzero(moved).tolist():
+        way = float(np.linalg.norm(motions.ways_lidar[k]))
         a.append(motions.ways_lidar[k] / max(way, 1e-9))
         b.append(ways[k] / max(np.linalg.norm(ways[k]), 1e-9))
         variances.append((WAY_STDDEV_M / max(way, 1e-9)) ** 2)
     if moved.any():
         seen.append("the way driven")
     turning = np.linalg.norm(motions.turns_imu, axis=1)
-    for k in np.flatnonzero(turning > LEAST_TURN_RAD):
+    for k in np.flatnonzero(turning > LEAST_TURN_RAD).tolist():
         a.append(motions.turns_lidar[k] / max(np.linalg.norm(motions.turns_lidar[k]), 1e-9))
         b.append(motions.turns_imu[k] / turning[k])
         variances.append((TURN_STDDEV_RAD / turning[k]) ** 2)
@@ -256,7 +255,8 @@ def _rotation_finding(
         return green(NAME, "not observable: the vehicle stood, and no ground was seen")
     deg, angle = np.degrees(turn), float(np.linalg.norm(turn))
     found = (
-        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
+        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by"
+        f" {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
         f" about x, y, z (+- {', '.join(f'{v:.1f}' for v in np.degrees(spread))})"
     )
     if (np.abs(turn) <= np.maximum(SAME_RAD, SIGMAS * spread)).all():

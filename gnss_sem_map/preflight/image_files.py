@@ -63,14 +63,15 @@ def _clock(sample: Sample) -> Finding:
     )
     share = float((nearest <= settings.image_within_s + abs(exposed[0] - log.images[0].stamp)).mean())
     found = (
-        f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s; images are of {exposed[0]:.1f} to"
-        f" {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"
+        f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s;"
+        f" images are of {exposed[0]:.1f} to {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"
     )
     overlap = min(exposed[-1], scans[-1]) - max(exposed[0], scans[0])
     shorter = min(np.ptp(exposed), np.ptp(scans))
     if share == 0.0 or overlap < 0.5 * shorter:
         return red(
-            CLOCK, found, f"image stamps are of another clock, about {exposed[0] - scans[0]:+.1f} s off, or of another drive",
+            CLOCK, found,
+            f"image stamps are of another clock, about {exposed[0] - scans[0]:+.1f} s off, or of another drive",
             "give all stamps on one clock",
         )  # fmt: skip
     inside = (scans >= exposed[0] - 0.1) & (scans <= exposed[-1] + 0.1)

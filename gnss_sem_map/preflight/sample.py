@@ -199,14 +199,14 @@ class Sample:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the vehicle is elsewhere at the first and the last scan that is looked at, by more than a few metres."""
+        """Whether the first and the last scan that are looked at see different places."""
         scans = self._moving_scans
         if self.trajectory is None or len(scans) < 2:
             return False
         return _way(*self.trajectory.at([scans[0].stamp, scans[-1].stamp], EXTRAPOLATE_S)) > LEAST_WAY_M
 
     def _starts(self, first: int) -> tuple[Array, ...]:
-        """Where the second sweep may be by the trajectory, T_first_second: straight ahead, and as the extrinsics say."""
+        """T_first_second of the second sweep by the trajectory: as the extrinsics say, and straight ahead."""
         track, stamps = self.trajectory, [scan.stamp for scan in self.log.scans[first : first + 2]]
         if track is None:
             return ()

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuNoise, ImuSamples
 
 Array = NDArray[np.float64]
@@ -19,6 +20,8 @@ ALIASED_BELOW_HZ = 50.0
 MAX_STEP_S = 0.01
 # What a road vehicle may do unseen while the IMU is silent: acceleration m/s², rate rad/s.
 UNSEEN_FORCE, UNSEEN_RATE = 2.0, 0.3
+# A whole day of steps; each costs 300 bytes.
+MOST_STEPS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +131,13 @@ def _distinct(stamps: Array, keep: Array | None = None) -> Array:
 
 
 def _fill(stamps: Array, max_interval_s: float) -> Array:
-    parts = np.maximum(1, np.ceil(np.diff(stamps) / max_interval_s - 0.05)).astype(int)
+    exact = np.maximum(1, np.ceil(np.diff(stamps) / max_interval_s - 0.05))
+    if exact.sum() > MOST_STEPS:
+        raise MeasurementError(
+            f"the IMU spans {stamps[-1] - stamps[0]:.6g} s, {exact.sum():.3g} steps of {max_interval_s:g} s;"
+            f" expected at most {MOST_STEPS}: are its stamps in seconds?"
+        )
+    parts = exact.astype(int)
     first = np.repeat(np.cumsum(parts) - parts, parts)
     share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
     filled = np.repeat(stamps[:-1], parts) + share * np.repeat(np.diff(stamps), parts)

@@ -14,6 +14,11 @@ from factor_graphs.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
+# No accelerometer or gyroscope says more, in whatever unit.
+LARGEST_OF_IMU = 1e6
+# Rows farther than a break from all others are of the same drive when they are many, or within a day.
+BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
@@ -98,17 +103,19 @@ class Repairs:
     not_finite: int = 0
     repeated: int = 0
     out_of_order: int = 0
+    far_off: int = 0
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def dropped(self) -> int:
         """Number of rows that are not in the cleaned data."""
-        return self.not_finite + self.repeated
+        return self.not_finite + self.repeated + self.far_off
 
     def __str__(self) -> str:
         parts = [
             (self.not_finite, "not finite, dropped"),
             (self.repeated, "repeated, dropped"),
+            (self.far_off, "with a stamp far off all others, dropped"),
             (self.out_of_order, "out of order, sorted"),
             (len(self.gaps), f"gaps, longest {np.ptp(self.gaps, axis=1).max(initial=0.0):.2f} s"),
         ]
@@ -121,10 +128,13 @@ def clean_imu(
     """Raw IMU rows -> samples in order of time, once each, and the report of what was repaired.
 
     `stamps` (n,) s; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s. Rows that are not finite
-    are dropped (GTSAM would integrate them), so is every row after the first with the same stamp.
-    Raises MeasurementError for another shape and when fewer than two rows are left.
+    or beyond any sensor are dropped (GTSAM would integrate them), so is every row after the first with the same
+    stamp, and every row whose stamp is `far_off`. Raises MeasurementError for another shape and when fewer than
+    two rows are left.
     """
-    columns, repairs = _clean("IMU", stamps, specific_force, angular_rate)
+    values = [np.asarray(c, dtype=np.float64) for c in (specific_force, angular_rate)]
+    sensible = [np.where(np.abs(c) <= LARGEST_OF_IMU, c, np.nan) for c in values]
+    columns, repairs = _clean("IMU", stamps, *sensible)
     if len(columns[0]) < 2:
         raise MeasurementError(f"{repairs}: {len(columns[0])} left, expected at least 2")
     return ImuSamples(*columns), repairs
@@ -138,6 +148,26 @@ def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> t
     """
     columns, repairs = _clean("GNSS", stamps, positions, stddevs)
     return GnssFixes(*columns), repairs
+
+
+def far_off(stamps: Array) -> NDArray[np.bool_]:
+    """Which stamps (n,) s, finite, in any order, are not of the same drive as most: (n,).
+
+    Between groups are breaks of ten minutes. A group is far off the largest one when it has a hundredth of its
+    stamps or less, or is but one, or when it lies more than a day away.
+    """
+    off = np.zeros(len(stamps), dtype=bool)
+    if len(stamps) < 2:
+        return off
+    order = np.argsort(stamps, kind="stable")
+    with np.errstate(over="ignore"):
+        group = np.concatenate([[0], np.cumsum(np.diff(stamps[order]) > BREAK_S)])
+        sizes = np.bincount(group)
+        largest = int(sizes.argmax())
+        few = (sizes <= FEW * sizes[largest]) | ((sizes == 1) & (sizes[largest] >= 3))
+        centre = stamps[order][group == largest].mean()
+        off[order] = few[group] | ((np.abs(stamps[order] - centre) > DAY_S) & (group != largest))
+    return off
 
 
 def gaps(stamps: Array, longer_than: float = 2.0) -> Array:
@@ -158,12 +188,14 @@ def _clean(sensor: str, stamps: ArrayLike, *vectors: ArrayLike) -> tuple[list[Ar
         [np.isfinite(c.reshape(n, c.size // max(n, 1))).all(axis=1) for c in columns]
     )
     columns = [c[finite] for c in columns]
+    off = far_off(columns[0])
+    columns = [c[~off] for c in columns]
     out_of_order = int(np.count_nonzero(np.diff(columns[0]) < 0))
     _, first = np.unique(columns[0], return_index=True)
     repeated = len(columns[0]) - len(first)
     columns = [c[first] for c in columns]
     missing = int(n - np.count_nonzero(finite))
-    return columns, Repairs(sensor, n, missing, repeated, out_of_order, gaps(columns[0]))
+    return columns, Repairs(sensor, n, missing, repeated, out_of_order, int(off.sum()), gaps(columns[0]))
 
 
 def _freeze(value: ImuSamples | GnssFixes) -> None:

@@ -134,8 +134,6 @@ def pose_problem(
         silent = np.diff(intervals.keyframes)[intervals.blind].sum()
         notes.append(f"the IMU is silent for {silent:.2f} s: bridged as an unseen vehicle")
     noise = noise_as_sampled(imu, settings.imu_noise)
-    if noise != settings.imu_noise:
-        notes.append("the IMU is logged too slowly for its own noise: more is assumed, as its samples show")
     guess = first_guess(intervals, kept, p_imu_antenna, attitude)
     unknown = np.array([*[settings.start_tilt_stddev_rad] * 2, settings.start_heading_stddev_rad])
     attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown)

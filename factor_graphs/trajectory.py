@@ -1,5 +1,6 @@
 """Where the vehicle was: poses over stamps, at any stamp in between, and on disk."""
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
 _COVARIANCE_COLUMNS = [f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
+MOST_BYTES, MOST_ROWS, MOST_COLUMNS = 1 << 30, 5_000_000, 100
 _METADATA = {
     "frame": "pose of the imu frame (x forward, y left, z up) in the map frame (east, north, up)",
     "units": "stamp_s s; x y z m; qx qy qz qw unit quaternion, scalar last; vx vy vz m/s in the map frame",
@@ -171,31 +173,62 @@ class Trajectory:
     @staticmethod
     def load(path: Path | str) -> "Trajectory":
         """Read a trajectory that `save` wrote; raises MeasurementError when the file is not such a table."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        try:
-            table = pq.read_table(path)
-        except pa.ArrowInvalid as error:
-            raise MeasurementError(f"{path}: not a Parquet file ({error})") from error
-        except FileNotFoundError:
-            raise MeasurementError(f"{path}: no such file; expected a saved trajectory") from None
+        columns = _columns(Path(path))
         pose = ("stamp_s", "x", "y", "z", "qx", "qy", "qz", "qw")
-        missing = [name for name in pose if name not in table.column_names]
+        missing = [name for name in pose if name not in columns]
         if missing:
             raise MeasurementError(f"{path}: no column {', '.join(missing)}; expected {', '.join(pose)}")
-        stamps, *position_and_quat = (table[name].to_numpy() for name in pose)
+        stamps, *position_and_quat = (columns[name] for name in pose)
+        quat_xyzw = np.column_stack(position_and_quat[3:])
+        if not ((np.abs(quat_xyzw) <= 1.001).all() and np.allclose((quat_xyzw**2).sum(axis=1), 1, atol=2e-3)):
+            raise MeasurementError(
+                f"{path}: found quaternions that are no rotation; expected qx qy qz qw of length one"
+            )
         T = np.tile(np.eye(4), (len(stamps), 1, 1))
         T[:, :3, 3] = np.column_stack(position_and_quat[:3])
-        T[:, :3, :3] = Rotation.from_quat(np.column_stack(position_and_quat[3:])).as_matrix()
+        T[:, :3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
         velocities = covariances = None
-        if "vx" in table.column_names:
-            velocities = np.column_stack([table[name].to_numpy() for name in ("vx", "vy", "vz")])
-        if _COVARIANCE_COLUMNS[0] in table.column_names:
-            covariances = np.zeros((len(stamps), 6, 6))
-            covariances[:, *_UPPER] = np.column_stack(
-                [table[name].to_numpy() for name in _COVARIANCE_COLUMNS]
-            )
-            lower = _UPPER[::-1]
-            covariances[:, *lower] = covariances[:, *_UPPER]
+        try:
+            if "vx" in columns:
+                velocities = np.column_stack([columns[name] for name in ("vx", "vy", "vz")])
+            if _COVARIANCE_COLUMNS[0] in columns:
+                covariances = np.zeros((len(stamps), 6, 6))
+                covariances[:, *_UPPER] = np.column_stack([columns[name] for name in _COVARIANCE_COLUMNS])
+                lower = _UPPER[::-1]
+                covariances[:, *lower] = covariances[:, *_UPPER]
+        except KeyError as error:
+            raise MeasurementError(
+                f"{path}: no column {error.args[0]} beside the others of its kind"
+            ) from None
         return Trajectory(stamps, T, velocities, covariances)
+
+
+def _columns(path: Path) -> dict[str, Array]:
+    """The columns of a Parquet table of numbers; raises MeasurementError for anything else, before it is unpacked."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        if path.exists() and not path.is_file():
+            raise MeasurementError(f"{path}: found no ordinary file; expected a saved trajectory")
+        with path.open("rb") as file:
+            if (size := os.fstat(file.fileno()).st_size) > MOST_BYTES:
+                raise MeasurementError(f"{path}: found {size} bytes, expected at most {MOST_BYTES}")
+            content = file.read()
+        table_file = pq.ParquetFile(pa.BufferReader(content))
+        rows, schema = table_file.metadata.num_rows, table_file.schema_arrow
+        other = [field.name for field in schema if field.type != pa.float64()]
+        if rows > MOST_ROWS or len(schema) > MOST_COLUMNS or other:
+            raise MeasurementError(
+                f"{path}: found {rows} rows of {len(schema)} columns, other than numbers {other[:5]}; expected a saved"
+                " trajectory"
+            )
+        table = table_file.read()
+        return {name: np.asarray(table[name].to_numpy(), np.float64) for name in table.column_names}
+    except FileNotFoundError:
+        raise MeasurementError(f"{path}: no such file; expected a saved trajectory") from None
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        if isinstance(error, MeasurementError):
+            raise
+        reason = " ".join(str(error).split())[:200]
+        raise MeasurementError(f"{path}: not a Parquet file ({reason})") from None

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import signal
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
@@ -78,37 +82,35 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
-    import shutil
-
     from gnss_sem_map import labels, pipeline
     from gnss_sem_map.export import run_folder
+    from gnss_sem_map.output import refuse_inputs
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
-    run_folder.check_replaceable(out)
     settings = _settings(config, set_)
-    log = _open(drive, drive_format, frames)
-    network = None
-    if segmenter is None and log.images:
-        typer.echo(no_segmenter_message(str(drive)), err=True)
-        raise typer.Exit(1)
-    if segmenter not in (None, "none"):
-        label_set = labels.label_set(settings.classes)
-        network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
-    work = out.with_name(f".{out.name}.work")
-    with progress_bars() as progress:
-        result = pipeline.run(
-            log,
-            network,
-            settings,
-            progress,
-            work=work,
-            resume=resume,
-            workers=workers,
-            labels_from=str(segmenter),
-            force=force,
-        )
-        about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
-    shutil.rmtree(work, ignore_errors=True)
+    with run_folder.claimed_run(out, _inputs(drive, config, settings, segmenter)) as claim:
+        log = _open(drive, drive_format, frames)
+        refuse_inputs(claim.out, sorted(log.folders))
+        network = None
+        if segmenter is None and log.images:
+            typer.echo(no_segmenter_message(str(drive)), err=True)
+            raise typer.Exit(1)
+        if segmenter not in (None, "none"):
+            label_set = labels.label_set(settings.classes)
+            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
+        with progress_bars() as progress:
+            result = pipeline.run(
+                log,
+                network,
+                settings,
+                progress,
+                work=claim.work,
+                resume=resume,
+                workers=workers,
+                labels_from=str(segmenter),
+                force=force,
+            )
+            about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
     warn(result.account.warnings)
     print_run(about, out, as_json)
 
@@ -125,10 +127,8 @@ def merge(
     as_json: Json = False,
 ) -> None:
     """One map of two runs of the same place, refined again."""
-    from gnss_sem_map.export import run_folder
     from gnss_sem_map.export.merged_run import merge_run_folders
 
-    run_folder.check_replaceable(out)
     about = merge_run_folders(first, second, out, match)
     if as_json:
         typer.echo(json.dumps(about))
@@ -151,14 +151,14 @@ def trajectory(
     from gnss_sem_map.account import Account
     from gnss_sem_map.export import run_folder
 
-    run_folder.check_replaceable(out)
     settings = _settings(config, set_)
-    log = _open(drive, drive_format, None)
-    account = Account(skips=list(log.skips))
-    page = pipeline.check_drive(log, None, settings, account, force)
-    with progress_bars() as progress, account.stage("trajectory"):
-        estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
-    about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings, page)
+    with run_folder.claimed_run(out, _inputs(drive, config, settings)):
+        log = _open(drive, drive_format, None)
+        account = Account(skips=list(log.skips))
+        page = pipeline.check_drive(log, None, settings, account, force)
+        with progress_bars() as progress, account.stage("trajectory"):
+            estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
+        about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings, page)
     warn(account.warnings)
     if as_json:
         typer.echo(json.dumps(about))
@@ -191,7 +191,11 @@ def segment(
     label_set = labels.label_set(classes)
     network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
     with progress_bars() as progress:
-        report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
+        try:
+            report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
+        except Stopped as stopped:
+            stopped.add_note("what is segmented is kept: the same command goes on")
+            raise
     warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
     print_cache(report, out)
 
@@ -229,19 +233,23 @@ def train(
     settings = config.parse(TrainingSettings, set_ or ())
     learnt, checked = ([LabelledFolder.parse(text) for text in texts] for texts in (data, validation))
     with progress_bars() as progress:
-        report = train_network(
-            learnt,
-            checked,
-            out,
-            labels.label_set(classes),
-            taxonomy,
-            ids,
-            settings,
-            initial,
-            device,
-            resume,
-            progress,
-        )
+        try:
+            report = train_network(
+                learnt,
+                checked,
+                out,
+                labels.label_set(classes),
+                taxonomy,
+                ids,
+                settings,
+                initial,
+                device,
+                resume,
+                progress,
+            )
+        except Stopped as stopped:
+            stopped.add_note("the same command with --resume goes on from the last validation")
+            raise
     typer.echo(
         f"{report.network}: validation mean IoU {report.best_mean_iou:.3f} at step {report.best_step} of {report.steps}"
     )
@@ -259,11 +267,21 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
+    from gnss_sem_map.errors import DataError
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
+    from gnss_sem_map.output import locked, real_path
+    from gnss_sem_map.run_json import read_run
+    from gnss_sem_map.untrusted.files import shown
 
-    metrics = score_run(run_folder, truth, restrict_to=restrict_to)
-    write_report(run_folder, json.loads((run_folder / "run.json").read_text("utf-8")), metrics)
+    with locked(real_path(run_folder)):
+        metrics = score_run(run_folder, truth, restrict_to=restrict_to)
+        try:
+            write_report(run_folder, read_run(run_folder), metrics)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise DataError(
+                f"{shown(run_folder / 'run.json')}: damaged ({type(error).__name__} {error}); make the run again"
+            ) from None
     if as_json:
         typer.echo(json.dumps(metrics))
     else:
@@ -287,9 +305,11 @@ def calibrate(
     """Measure what the network's answers are worth; use it with --set calibration=FILE."""
     from gnss_sem_map.export.atomic import replacing
     from gnss_sem_map.io.calibrating import calibrate as measure
+    from gnss_sem_map.label_calibration import check_replaceable
 
     if len(truth) != len(run_folders):
         raise typer.BadParameter(f"found {len(truth)} for {len(run_folders)} runs", param_hint="--truth")
+    check_replaceable(out)
     with progress_bars() as progress:
         found = measure(list(zip(run_folders, truth, strict=True)), drive, segmenter, progress)
     with replacing(out) as file:
@@ -391,6 +411,15 @@ def _settings(file: Path | None, overrides: list[str] | None) -> Settings:
     return config.load(file, overrides or ())
 
 
+def _inputs(
+    drive: Path, config: Path | None, settings: Settings, segmenter: str | None = None
+) -> list[Path | str | None]:
+    """Every place that a run reads, as far as it is known before the drive is opened."""
+    place = (segmenter or "").partition(":")[2].partition("?")[0]
+    classes = settings.classes if Path(settings.classes).suffix else None
+    return [drive, config, place or None, settings.calibration, classes]
+
+
 def _open(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
     from dataclasses import replace
 
@@ -419,18 +448,66 @@ def _frame_range(frames: str) -> tuple[int, float]:
         ) from None
 
 
+class Stopped(BaseException):
+    """Somebody asked us to stop: Ctrl-C, `kill`, or a terminal that was closed."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(number).name}")
+        self.number = number
+
+
+def _stop(number: int, _: object) -> None:
+    raise Stopped(number)
+
+
 def main() -> None:
-    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours."""
+    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours.
+
+    A signal ends it as orderly, with 128 and its number.
+    """
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # those of other packages; ours are printed as such
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
-        sys.exit(app(prog_name="gnss-sem-map", standalone_mode=False))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` wants it
+                signal.signal(number, _stop)
+        code = app(prog_name="gnss-sem-map", standalone_mode=False)
+        sys.stdout.flush()
+    except Stopped as stopped:
+        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped.number)
     except typer.TyperException as error:
-        sys.exit(_wrong_usage(error))
+        code = _wrong_usage(error)
     except (SemMapError, FactorGraphError) as error:
-        typer.echo(f"gnss-sem-map: {' '.join(str(error).split())}", err=True)
-        sys.exit(1)
+        code = _say(str(error), 1)
+    except MemoryError as error:
+        code = _say(
+            f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive", 1
+        )
+    except OSError as error:  # what the system refused, and nobody explained better
+        code = _say(f"{error.filename or 'output'}: {error.strerror or error}", 1)
+        _close_stdout()
+    except (UnicodeError, RecursionError) as error:
+        code = _say(f"{type(error).__name__} {error}", 1)
+    sys.exit(code)
+
+
+def _say(message: str, code: int) -> int:
+    """One line on stderr; returns the exit code."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # we are ending already
+    typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _close_stdout() -> None:
+    """What could not be printed will not be tried again at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wrong_usage(error: typer.TyperException) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -16,20 +15,11 @@ from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labelling import LabellingSettings
 from gnss_sem_map.refinement import RefinementSettings
 from gnss_sem_map.scan_matching import TrajectorySettings
+from gnss_sem_map.untrusted.files import shown
+from gnss_sem_map.untrusted.structured import not_finite, parse_yaml, read_yaml
 from gnss_sem_map.voxel_map import MappingSettings
 
 Model = TypeVar("Model", bound=BaseModel)
-
-
-class _Yaml(yaml.SafeLoader):
-    """YAML in which only true and false are truth values: `vehicles: off` is a word, as it looks."""
-
-
-_Yaml.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:bool"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Yaml.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("^(true|false)$"), list("tf"))
 
 
 EQUATION_6: dict[str, dict[str, Any]] = {
@@ -81,6 +71,8 @@ class Settings(BaseModel):
             return content
         if any(isinstance(content.get(section, {}), BaseModel) for section in EQUATION_6):
             return content
+        if not all(isinstance(content.get(section, {}), dict) for section in EQUATION_6):
+            return content  # refused when the sections are looked at
         return content | {
             section: values | content.get(section, {}) for section, values in EQUATION_6.items()
         }
@@ -103,6 +95,9 @@ def parse(
     content = content if content is not None else {}
     for override in overrides:
         _apply(content, override)
+    place = not_finite(content)
+    if place is not None:
+        raise ConfigError(f"{where}: {place[:100]}: found a number that is not finite, expected a finite one")
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -110,17 +105,12 @@ def parse(
 
 
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        content = yaml.load(file.read_text("utf-8"), _Yaml)
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot read the settings ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: not YAML ({str(error).splitlines()[0]})") from None
+    content = read_yaml(file, ConfigError)
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(
-            f"{file}: found {type(content).__name__}, expected sections {sorted(Settings.model_fields)}"
+            f"{shown(file)}: found {type(content).__name__}, expected sections {sorted(Settings.model_fields)}"
         )
     return content
 
@@ -128,27 +118,27 @@ def _read(file: Path) -> dict[str, Any]:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, value = override.partition("=")
     if not equals or not key:
-        raise ConfigError(f"--set {override!r}: expected section.name=value")
+        raise ConfigError(f"--set {override[:200]!r}: expected section.name=value")
     *sections, name = key.split(".")
     for section in sections:
         content = content.setdefault(section, {})
         if not isinstance(content, dict):
-            raise ConfigError(f"--set {override!r}: {section!r} is a value, not a section")
+            raise ConfigError(f"--set {override[:200]!r}: {section[:100]!r} is a value, not a section")
     try:
-        content[name] = yaml.load(value, _Yaml)
-    except yaml.YAMLError:
-        raise ConfigError(f"--set {override!r}: the value is not YAML") from None
+        content[name] = parse_yaml(value)
+    except ValueError:
+        raise ConfigError(f"--set {override[:200]!r}: the value is not YAML") from None
 
 
 def _explain(error: ValidationError, root: type[BaseModel], where: str) -> str:
     first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
+    place = ".".join(str(part) for part in first["loc"])[:100]
     if first["type"] == "extra_forbidden":
         known = _keys_beside(root, first["loc"])
         close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"known are {known}"
         return f"{where}: unknown setting {place!r}; {hint}"
-    return f"{where}: {place}: {first['msg']} (found {first['input']!r})"
+    return f"{where}: {place}: {first['msg'][:200]} (found {repr(first['input'])[:100]})"
 
 
 def _keys_beside(root: type[BaseModel], place: Sequence[int | str]) -> list[str]:
@@ -157,6 +147,7 @@ def _keys_beside(root: type[BaseModel], place: Sequence[int | str]) -> list[str]
     for part in place[:-1]:
         if not (isinstance(model, type) and issubclass(model, BaseModel)):
             return []
-        model = model.model_fields[str(part)].annotation
+        field = model.model_fields.get(str(part))
+        model = None if field is None else field.annotation
     is_section = isinstance(model, type) and issubclass(model, BaseModel)
     return sorted(model.model_fields) if is_section else []

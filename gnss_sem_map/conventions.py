@@ -46,12 +46,12 @@ Axes = Annotated[str, AfterValidator(_known)]
 
 
 class SensorConventions(BaseModel):
-    """How the sensors of a drive report. What is set here wins over what the drive's own `log.yaml` says."""
+    """How the sensors of a drive report. What is empty is as the drive's `log.yaml` says, and else as ours."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    imu_axes: Axes = Field(
-        "flu",
+    imu_axes: Axes | None = Field(
+        None,
         description='Axes of the IMU: flu, frd, rfu, or our x, y, z in its own axes, for example "y -x z".',
     )
     force_axes: Axes | None = Field(
@@ -59,41 +59,44 @@ class SensorConventions(BaseModel):
         description='Those of the accelerometer, where they differ: "-x -y -z" when it points down at rest.',
     )
     rate_axes: Axes | None = Field(None, description="Those of the gyroscope, where they differ.")
-    imu_rotation_deg: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0),
+    imu_rotation_deg: tuple[float, float, float] | None = Field(
+        None,
         description="Roll, pitch, yaw of a unit that is mounted askew, after `imu_axes`: its attitude in ours.",
     )
-    force_unit: Literal["m/s2", "g", "mg"] = Field("m/s2", description="Unit of the specific force.")
-    rate_unit: Literal["rad/s", "deg/s"] = Field("rad/s", description="Unit of the angular rate.")
-    gnss_time_offset_s: float = Field(
-        0.0, ge=-3600, le=3600, description="Moment of a fix minus its stamp: -1 when stamps are 1 s late."
+    force_unit: Literal["m/s2", "g", "mg"] | None = Field(None, description="Unit of the specific force.")
+    rate_unit: Literal["rad/s", "deg/s"] | None = Field(None, description="Unit of the angular rate.")
+    gnss_time_offset_s: float | None = Field(
+        None, ge=-3600, le=3600, description="Moment of a fix minus its stamp: -1 when stamps are 1 s late."
     )
-    lidar_time_offset_s: float = Field(
-        0.0, ge=-3600, le=3600, description="Moment of a point minus its stamp."
+    lidar_time_offset_s: float | None = Field(
+        None, ge=-3600, le=3600, description="Moment of a point minus its stamp."
     )
 
     def over(self, drive: SensorConventions) -> SensorConventions:
         """These, and where nothing is set here those of the drive."""
-        return drive.model_copy(update={name: getattr(self, name) for name in self.model_fields_set})
+        return drive.model_copy(update=self.model_dump(exclude_none=True))
 
     def imu_in_ours(self, imu: ImuSamples) -> ImuSamples:
         """The same samples in our axes and units; the very same object where nothing is to be done."""
         force, rate = (self._to_ours(axes) for axes in (self.force_axes, self.rate_axes))
-        force, rate = force * FORCE_UNITS[self.force_unit], rate * RATE_UNITS[self.rate_unit]
+        force, rate = (
+            force * FORCE_UNITS[self.force_unit or "m/s2"],
+            rate * RATE_UNITS[self.rate_unit or "rad/s"],
+        )
         if np.array_equal(force, np.eye(3)) and np.array_equal(rate, np.eye(3)):
             return imu
         return ImuSamples(imu.stamps, imu.specific_force @ force.T, imu.angular_rate @ rate.T)
 
     def fixes_in_ours(self, fixes: GnssFixes) -> GnssFixes:
         """The same fixes on our clock."""
-        if self.gnss_time_offset_s == 0.0:
+        if not self.gnss_time_offset_s:
             return fixes
         return GnssFixes(fixes.stamps + self.gnss_time_offset_s, fixes.positions, fixes.stddevs)
 
     def _to_ours(self, axes: str | None) -> Array:
-        roll, pitch, yaw = self.imu_rotation_deg
-        matrix = matrix_of(axes if axes is not None else self.imu_axes)
-        if not any(self.imu_rotation_deg):
+        matrix = matrix_of(axes or self.imu_axes or "flu")
+        if self.imu_rotation_deg is None or not any(self.imu_rotation_deg):
             return matrix
+        roll, pitch, yaw = self.imu_rotation_deg
         turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
         return np.asarray(turn @ matrix)

@@ -5,22 +5,20 @@ What `simulate`, `segment`, `run` and `evaluate` do one after another, and how t
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from gnss_sem_map import config, labels, pipeline
 from gnss_sem_map.account import Account, Progress, silent
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.report import write_report
-from gnss_sem_map.export.run_folder import check_replaceable, write_run
+from gnss_sem_map.export.run_folder import claimed_run, write_run
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.io.scoring import score_run
+from gnss_sem_map.output import claimed, new_folder, real_path
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
-from gnss_sem_map.simulation.drive import DATE
 
 PROBABILITIES = "probabilities"
 """Folder of the class probabilities, beside the drive."""
@@ -54,28 +52,32 @@ def demonstrate(
     Earlier demos in both folders are replaced. Raises DataError when either holds what no demo wrote, and ConfigError
     when the network needs a package that is not installed.
     """
-    world = out.with_name(f"{out.name}_drive")
-    check_replaceable(out)
-    _check_drive_replaceable(world)
+    world = real_path(out).with_name(f"{real_path(out).name}_drive")
+    with claimed_run(out), claimed(world):
+        return _demonstrate(out, world, seconds, seed, source, progress)
+
+
+def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str, progress: Progress) -> Demo:
     label_set = labels.label_set()
     # what is missing is said now, not after the simulation
     network = open_segmenter("demo", label_set) if source == "network" else None
     settings = config.load(overrides=[f"calibration={DEMO_CALIBRATION}"] if network else [])
 
-    account, probabilities = Account(), world / PROBABILITIES
-    shutil.rmtree(world, ignore_errors=True)
-    with account.stage("simulate"):
-        drive = simulate(world, seconds, seed, lambda done, total: progress("simulate", done, total))
-    log = open_drive(drive)
-    with account.stage("segment"):
-        if network is not None:
-            write_cache(log.images, network, label_set, probabilities, "demo", 1, progress)
-        else:
-            write_corrupted_labels(
-                drive, probabilities, seed, lambda done, total: progress("segment", done, total)
-            )
+    account = Account()
+    with new_folder(world) as folder:
+        with account.stage("simulate"):
+            drive = simulate(folder, seconds, seed, lambda done, total: progress("simulate", done, total))
+        log = open_drive(drive)
+        with account.stage("segment"):
+            if network is not None:
+                write_cache(log.images, network, label_set, folder / PROBABILITIES, "demo", 1, progress)
+            else:
+                write_corrupted_labels(
+                    drive, folder / PROBABILITIES, seed, lambda done, total: progress("segment", done, total)
+                )
 
-    spec = f"labels:{probabilities}"
+    drive, spec = world / drive.relative_to(folder), f"labels:{world / PROBABILITIES}"
+    log = open_drive(drive)
     segmenter = open_segmenter(spec, label_set, expected_size=log.calibration.image_size)
     result = pipeline.run(log, segmenter, settings, progress)
     about = write_run(out, drive, log, result, settings, write_labels=True, segmenter=spec)
@@ -86,13 +88,3 @@ def demonstrate(
         metrics,
         tuple(out / name for name in PICTURES if (out / name).is_file()),
     )
-
-
-def _check_drive_replaceable(world: Path) -> None:
-    """Raise DataError when the folder holds anything that no demo wrote."""
-    foreign = {path.name for path in world.iterdir()} - {DATE, PROBABILITIES} if world.is_dir() else set()
-    if foreign or world.is_file():
-        raise DataError(
-            f"{world}: the demo's drive goes here, but it holds {sorted(foreign)[:3] or 'a file'}; choose another -o"
-            " or move that away"
-        )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import scan_kernels
 from gnss_sem_map.sensor_log import Points
@@ -98,7 +99,7 @@ def knots_of(
 ) -> tuple[NDArray[np.float64], Knots]:
     """The stamps of one sweep (n,), or none where one pose holds for all, and the poses that they lie between.
 
-    Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
+    Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s, or takes more than a second.
     """
     if points.stamps is None:
         T_map_lidar = trajectory.at([stamp], EXTRAPOLATE_S)[:, :3] @ T_imu_lidar
@@ -109,6 +110,10 @@ def knots_of(
         scan_kernels.mark_usable(points.rows, nearest_m, farthest_m, valid)
         used = points.stamps[valid]
         first, last = used.min(initial=np.inf), used.max(initial=-np.inf)
+        if last - first > LONGEST_SWEEP_S:
+            raise MeasurementError(
+                f"the sweep takes {last - first:.6g} s, expected at most {LONGEST_SWEEP_S:g}; are its times in s?"
+            )
     if not first <= last:  # no point is usable
         return points.stamps, Knots(0, np.zeros((1, 3, 8)))
     numbers = np.arange(np.floor(first * KNOTS_PER_S), np.floor(last * KNOTS_PER_S) + 2)

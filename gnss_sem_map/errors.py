@@ -13,6 +13,10 @@ class DataError(SemMapError, ValueError):
     """A drive, a map or a label file that is not what it must be."""
 
 
+class WriteError(DataError):
+    """What is needed later cannot be written: no fault of the one scan or image that it was about."""
+
+
 class ImageSizeError(DataError):
     """An image is not of the size that the calibration says; `found` is its own (width, height)."""
 

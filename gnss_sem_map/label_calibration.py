@@ -7,6 +7,7 @@ of several drives can be put together, and a reader can see what they rest on.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +17,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.untrusted.files import shown
+from gnss_sem_map.untrusted.structured import read_yaml
 
 HEIGHT_EDGES_M = (-0.3, -0.15, -0.05, 0.05, 0.15, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 6.0)
 FLATNESS_EDGES = (0.3, 0.6, 0.8, 0.9, 0.96)
@@ -26,6 +29,7 @@ CELLS = (len(HEIGHT_EDGES_M) + 1, len(FLATNESS_EDGES) + 2)
 ANSWER_PSEUDO_COUNTS, CELL_PSEUDO_COUNTS = 300, 200
 """So many points, spread as the classes are on average, are added to each class: few points prove little."""
 FORMAT = 1
+LARGEST_COUNT = 10**15
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,32 +118,51 @@ def cells_of(heights: NDArray[np.floating], flatness: NDArray[np.floating]) -> N
 
 def read(file: Path, label_set: LabelSet) -> LabelCalibration:
     """Read a calibration file; raises ConfigError for a damaged one, or one of another class set."""
+    content = read_yaml(file, ConfigError)
     try:
-        content: Any = yaml.safe_load(file.read_text("utf-8"))
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"no label calibration of format {FORMAT}")
         found = LabelCalibration(
-            class_set=str(content["class_set"]),
-            names=tuple(str(name) for name in content["classes"]),
+            class_set=str(content["class_set"])[:100],
+            names=tuple(str(name)[:100] for name in content["classes"]),
             streets=tuple(
-                Street(str(s["name"]), np.array(s["answers"], np.int64), np.array(s["cells"], np.int64))
+                Street(str(s["name"])[:100], _counts(s["answers"]), _counts(s["cells"]))
                 for s in content["streets"]
             ),
             temperature=float(content["temperature"]),
         )
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot read the label calibration ({error.strerror})") from None
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        reason = str(error).splitlines()[0]
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        reason = " ".join(str(error).split())[:300]
         raise ConfigError(
-            f"{file}: {type(error).__name__} {reason}; expected a file of `gnss-sem-map calibrate`"
+            f"{shown(file)}: {type(error).__name__} {reason}; expected a file of `gnss-sem-map calibrate`"
         ) from None
     if found.names != label_set.names:
         raise ConfigError(
-            f"{file}: is of the class set {found.class_set!r} with {list(found.names)}, the map's is"
+            f"{shown(file)}: is of the class set {found.class_set!r} with {list(found.names)}, the map's is"
             f" {label_set.name!r} with {list(label_set.names)}; calibrate with the same class set"
         )
     return found
+
+
+def _counts(rows: Any) -> NDArray[np.int64]:
+    """Whole numbers in nested lists; raises ValueError, or TypeError, for anything else."""
+    counts = np.array(rows)
+    if counts.dtype.kind != "i" or np.abs(counts).max(initial=0) > LARGEST_COUNT:
+        raise ValueError(f"found counts of {counts.dtype}, expected whole numbers up to {LARGEST_COUNT:.0e}")
+    return counts.astype(np.int64)
+
+
+def check_replaceable(file: Path) -> None:
+    """Raise DataError when a file is there that is no label calibration: it would be lost."""
+    try:
+        if not os.path.lexists(file) or file.read_text("utf-8").startswith(f"format: {FORMAT}\nclass_set: "):
+            return
+        reason = "is no label calibration"
+    except UnicodeDecodeError:
+        reason = "is no label calibration"
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror})"
+    raise DataError(f"{file}: is there already, and {reason}; choose another -o")
 
 
 def opened(file: Path | None, label_set: LabelSet) -> LabelCalibration | None:

@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.untrusted.files import is_file, shown
+from gnss_sem_map.untrusted.structured import read_yaml
 
 OTHER = "other"
 """The name of the evidence that belongs to none of the map's classes."""
@@ -113,10 +114,10 @@ class Taxonomy:
     def lookup(self, label_set: LabelSet, kind: str, size: int = 256) -> NDArray[np.int16]:
         """Table from id to class index: c is `other`, -1 void, -2 an id that the taxonomy does not know."""
         table = np.full(size, -2, np.int16)
-        table[[i for i in self.void[kind] if i < size]] = UNLABELLED
+        table[[i for i in self.void[kind] if 0 <= i < size]] = UNLABELLED
         rows = label_set.table_from(self.names, self.name).argmax(1)
         for name, row in zip(self.names, rows, strict=True):
-            if name in self.ids[kind]:
+            if 0 <= self.ids[kind].get(name, -1) < size:
                 table[self.ids[kind][name]] = row
         return table
 
@@ -127,16 +128,23 @@ def label_set(name_or_file: str | Path = "urban") -> LabelSet:
     try:
         classes = content["classes"]
         return LabelSet(
-            name=str(content["name"]),
-            names=tuple(str(c["name"]) for c in classes),
-            colours=np.array([c["colour"] for c in classes], np.uint8).reshape(-1, 3),
-            semantic_kitti_ids=np.array([c["semantic_kitti_id"] for c in classes], np.uint32),
-            asprs_codes=np.array([c["asprs_code"] for c in classes], np.uint8),
-            sources={str(s): dict(table) for s, table in content.get("sources", {}).items()},
+            name=_word(content["name"]),
+            names=tuple(_word(c["name"]) for c in classes),
+            colours=np.array([[_whole(v, 256) for v in c["colour"]] for c in classes], np.uint8).reshape(
+                -1, 3
+            ),
+            semantic_kitti_ids=np.array(
+                [_whole(c["semantic_kitti_id"], 1 << 16) for c in classes], np.uint32
+            ),
+            asprs_codes=np.array([_whole(c["asprs_code"], 256) for c in classes], np.uint8),
+            sources={
+                _word(s): {_word(theirs): _word(ours) for theirs, ours in table.items()}
+                for s, table in content.get("sources", {}).items()
+            },
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except _CONTENT_ERRORS as error:
         raise ConfigError(
-            f"class set {name_or_file}: {type(error).__name__} {error};"
+            f"class set {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]};"
             " expected name, classes (name, colour, semantic_kitti_id, asprs_code) and sources"
         ) from None
 
@@ -145,17 +153,42 @@ def taxonomy(name_or_file: str | Path) -> Taxonomy:
     """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
     content = _read(name_or_file)
     try:
-        classes, kinds = content["classes"], content["ids"]
+        classes, kinds = content["classes"], [_word(kind) for kind in content["ids"]]
+        void = content.get("void", {})
         return Taxonomy(
-            name=str(content["name"]),
-            names=tuple(str(c["name"]) for c in classes),
-            ids={kind: {c["name"]: int(c[kind]) for c in classes if kind in c} for kind in kinds},
-            void={kind: tuple(content.get("void", {}).get(kind, ())) for kind in kinds},
+            name=_word(content["name"]),
+            names=tuple(_word(c["name"]) for c in classes),
+            ids={
+                kind: {_word(c["name"]): _whole(c[kind], 1 << 16) for c in classes if kind in c}
+                for kind in kinds
+            },
+            void={kind: tuple(_whole(i, 1 << 16) for i in void.get(kind, ())) for kind in kinds},
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except _CONTENT_ERRORS as error:
         raise ConfigError(
-            f"taxonomy {name_or_file}: {type(error).__name__} {error}; expected name, ids and classes with those ids"
+            f"taxonomy {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]}; expected name, ids and classes"
+            " with those ids"
         ) from None
+
+
+_CONTENT_ERRORS = (KeyError, TypeError, ValueError, OverflowError, AttributeError, IndexError)
+LONGEST_WORD = 100
+
+
+def _word(value: Any) -> str:
+    if (
+        not isinstance(value, str | int)
+        or not 0 < len(str(value)) <= LONGEST_WORD
+        or not str(value).isprintable()
+    ):
+        raise ValueError(f"found {str(value)[:100]!r}, expected a name")
+    return str(value)
+
+
+def _whole(value: Any, below: int) -> int:
+    if type(value) is not int or not -1 <= value < below:
+        raise ValueError(f"found {str(value)[:100]!r}, expected a whole number below {below}")
+    return value
 
 
 _CACHE: dict[str, dict[str, Any]] = {}
@@ -168,15 +201,12 @@ def _read(name_or_file: str | Path) -> dict[str, Any]:
     if name in _CACHE:
         return _CACHE[name]
     if name in available:
-        text = (shipped / f"{name}.yaml").read_text("utf-8")
-    elif Path(name).is_file():
-        text = Path(name).read_text("utf-8")
+        file = Path(str(shipped / f"{name}.yaml"))
+    elif is_file(Path(name), ConfigError):
+        file = Path(name)
     else:
-        raise ConfigError(f"no class set {name!r}: expected one of {available} or a YAML file")
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{name}: not YAML ({str(error).splitlines()[0]})") from None
+        raise ConfigError(f"no class set {shown(name)!r}: expected one of {available} or a YAML file")
+    content = read_yaml(file, ConfigError)
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: found {type(content).__name__}, expected a mapping with name and classes")
     if name in available:

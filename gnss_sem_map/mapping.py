@@ -8,12 +8,9 @@ interrupted run goes on where it was. Sums are integers: all of these give the s
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import pickle
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,10 +27,10 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.seen_scans import Drive, look_at
 from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log import Image, Scan, SensorLog, Skip, file_of
 from gnss_sem_map.voxel_map import VoxelMap, VoxelTable
+from gnss_sem_map.worker_processes import in_processes
 
-SCANS_PER_CHUNK = 100
 STATIC, REMOVED = "static", "removed"
 
 
@@ -66,7 +63,6 @@ def build_maps(
     resume: bool = False,
     workers: int = 1,
     labels_from: str = "",
-    scans_per_chunk: int = SCANS_PER_CHUNK,
 ) -> Maps:
     """Every point of every scan, at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
 
@@ -83,11 +79,10 @@ def build_maps(
     else:
         with _folder(work) as folder:
             store = map_chunks(
-                drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from,
-                scans_per_chunk=scans_per_chunk,
-            )  # fmt: skip
+                drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from
+            )
             maps = Maps(store.whole(STATIC), store.whole(REMOVED))
-    _check(drive, account)
+    _check(drive, account, maps)
     return maps
 
 
@@ -100,24 +95,17 @@ def map_chunks(
     resume: bool = False,
     workers: int = 1,
     labels_from: str = "",
-    scans_per_chunk: int = SCANS_PER_CHUNK,
 ) -> ChunkStore:
     """Map a drive into a folder of chunks, whose tiles can be read one by one; memory does not grow with the drive."""
-    scans = drive.log.scans
-    label_set = labels.label_set(drive.settings.classes)
+    scans, mapping = drive.log.scans, drive.settings.mapping
+    chunks = _chunks(drive)
     store = open_store(
-        work,
-        fingerprint(drive, labels_from, scans_per_chunk),
-        resume,
-        drive.settings.mapping.voxel_size_m,
-        label_set,
+        work, fingerprint(drive, labels_from), len(chunks), resume, mapping.voxel_size_m, drive.label_set
     )
-    chunks = dict(enumerate(scans[i : i + scans_per_chunk] for i in range(0, len(scans), scans_per_chunk)))
-    done = sum(len(chunks[number]) for number in store.done())
-    pending = [number for number in chunks if number not in store.done()]
-    for number in _map_all(
-        drive, store, {n: chunks[n] for n in pending}, workers, _shifted(progress, done, len(scans))
-    ):
+    there = store.done()
+    done = sum(len(chunks[number]) for number in there)
+    pending = [number for number in range(len(chunks)) if number not in there]
+    for number in _map_all(drive, store, pending, workers, _shifted(progress, done, len(scans))):
         done += len(chunks[number])
         progress("mapping", done, len(scans))
     for record in store.records():
@@ -162,16 +150,27 @@ def _table(settings: Settings) -> VoxelTable:
 def _warn(drive: Drive, account: Account) -> None:
     if drive.segmenter is None:
         account.warnings.append("no segmenter: the map shows geometry only")
-    elif not drive.log.images or not drive.log.calibration.has_camera:
+    elif not _has_camera(drive):
         account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _check(drive: Drive, account: Account) -> None:
+def _check(drive: Drive, account: Account, maps: Maps) -> None:
     if not account.counts["scans"]:
-        why = f"; first reason: {account.skips[0].where}: {account.skips[0].reason}" if account.skips else ""
+        why = _first_reason(account, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
-    if not account.counts["points labelled"]:
-        account.warnings.append("no point got a label: the map shows geometry only")
+    is_labelled = maps.static.observed.any() or maps.removed.observed.any()
+    if drive.segmenter is not None and _has_camera(drive) and not is_labelled:
+        why = _first_reason(account, "labels")
+        account.warnings.append(f"no point got a label, and the map shows geometry only{why}")
+
+
+def _has_camera(drive: Drive) -> bool:
+    return bool(drive.log.images) and drive.log.calibration.has_camera
+
+
+def _first_reason(account: Account, what: str) -> str:
+    """Why the first one was left out, as the end of a sentence; nothing where none was."""
+    return next((f"; first reason: {s.where}: {s.reason}" for s in account.skips if s.what == what), "")
 
 
 @contextmanager
@@ -187,58 +186,31 @@ def _shifted(progress: Progress, done: int, total: int) -> Progress:
     return lambda stage, more, _: progress(stage, done + more, total)
 
 
-Chunks = Mapping[int, Sequence[Scan]]
+def _chunks(drive: Drive) -> list[Sequence[Scan]]:
+    scans, count = drive.log.scans, drive.settings.mapping.scans_per_chunk
+    return [scans[i : i + count] for i in range(0, len(scans), count)]
 
 
 def _map_all(
-    drive: Drive, store: ChunkStore, chunks: Chunks, workers: int, progress: Progress
+    drive: Drive, store: ChunkStore, numbers: Sequence[int], workers: int, progress: Progress
 ) -> Iterator[int]:
     """Map these chunks and put them away; yields the number of each that is done."""
-    if workers == 1 or len(chunks) < 2:
-        done = 0
-        for number, scans in chunks.items():
-            _map_chunk(drive, store, number, scans, _shifted(progress, done, 0))
-            done += len(scans)
-            yield number
+    if workers > 1 and len(numbers) > 1:
+        _check_sendable(drive)
+        yield from in_processes(_map_chunk, (drive, store), numbers, workers)
         return
-    _check_sendable(drive)
-    context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
-    try:
-        with ProcessPoolExecutor(min(workers, len(chunks)), context, _start, (drive, store)) as pool:
-            jobs = {pool.submit(_work, number, scans): number for number, scans in chunks.items()}
-            try:
-                for job in as_completed(jobs):
-                    job.result()
-                    yield jobs[job]
-            except BaseException:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
-    except BrokenProcessPool:
-        raise DataError(
-            f"{store.folder}: a worker process died: for lack of memory (take fewer --workers, and --resume), or"
-            " because a script calls this outside `if __name__ == '__main__':`"
-        ) from None
+    done = 0
+    for number in numbers:
+        _map_chunk(drive, store, number, _shifted(progress, done, 0))
+        done += len(_chunks(drive)[number])
+        yield number
 
 
-def _map_chunk(
-    drive: Drive, store: ChunkStore, number: int, scans: Sequence[Scan], progress: Progress = silent
-) -> None:
+def _map_chunk(drive: Drive, store: ChunkStore, number: int, progress: Progress = silent) -> None:
     account = Account()
-    static, removed = fuse_scans(drive, scans, account, progress)
+    static, removed = fuse_scans(drive, _chunks(drive)[number], account, progress)
     record = {"counts": dict(account.counts), "skips": [asdict(skip) for skip in account.skips]}
     store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)
-
-
-_OF_THIS_WORKER: list[tuple[Drive, ChunkStore]] = []
-
-
-def _start(drive: Drive, store: ChunkStore) -> None:
-    _OF_THIS_WORKER[:] = [(drive, store)]
-
-
-def _work(number: int, scans: Sequence[Scan]) -> None:
-    drive, store = _OF_THIS_WORKER[0]
-    _map_chunk(drive, store, number, scans)
 
 
 def _check_sendable(drive: Drive) -> None:
@@ -251,21 +223,55 @@ def _check_sendable(drive: Drive) -> None:
         ) from None
 
 
-def fingerprint(drive: Drive, labels_from: str, scans_per_chunk: int) -> str:
+def fingerprint(drive: Drive, labels_from: str) -> str:
     """What two runs share when one may go on with what the other left: everything that decides the map."""
     log, settings = drive.log, drive.settings
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
-        log.name, scans_per_chunk, labels_from, list(names), settings.classes,
+        log.name, labels_from, list(names), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
-        [(scan.name, scan.number, scan.stamp) for scan in log.scans],
-        [(image.number, image.stamp) for image in log.images],
+        [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
+        [(image.number, image.stamp, _state(image)) for image in log.images], _states(labels_from),
         log.calibration.image_size, log.calibration.camera_time_offset_s,
     ]  # fmt: skip
     digest = hashlib.sha256(repr(said).encode())
     for array in _arrays(drive):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def answers_fingerprint(drive: Drive, labels_from: str) -> str:
+    """What two runs share when one may use what a network told the other: the network, the images, the classes."""
+    log = drive.log
+    names = () if drive.segmenter is None else drive.segmenter.class_names
+    said = [
+        log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_size,
+        [(image.number, _state(image)) for image in log.images], _states(labels_from),
+    ]  # fmt: skip
+    return hashlib.sha256(repr(said).encode()).hexdigest()
+
+
+def _state(item: Scan | Image) -> tuple[int, int] | None:
+    """Size and time of the file that a scan or an image is read from."""
+    path = file_of(item)
+    return None if path is None else _size_and_time(path)
+
+
+def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
+    """Sizes and times of the files that a segmenter's description names: label files, or those of a network."""
+    place = Path(labels_from.partition(":")[2].partition("?")[0])
+    if not labels_from.partition(":")[2] or not place.exists():
+        return []
+    files = sorted(path for path in place.iterdir() if path.is_file()) if place.is_dir() else [place]
+    return [(path.name, _size_and_time(path)) for path in files]
+
+
+def _size_and_time(path: Path) -> tuple[int, int] | None:
+    try:
+        about = path.stat()
+    except OSError:  # reading it will say so
+        return None
+    return about.st_size, about.st_mtime_ns
 
 
 def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:

@@ -12,7 +12,8 @@ Files are the business of `io` and `export`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -28,13 +29,13 @@ from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.camera_check import check_projection, check_stamps
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import build_maps
+from gnss_sem_map.mapping import answers_fingerprint, build_maps
 from gnss_sem_map.motion import find_moving
 from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.refinement.moving_objects import MovingObjects
-from gnss_sem_map.remembering import RememberedSegmenter
+from gnss_sem_map.remembering import RememberedSegmenter, answers_folder
 from gnss_sem_map.scan_matching import match_scans
 from gnss_sem_map.seen_scans import Drive
 from gnss_sem_map.segmentation import Segmenter
@@ -100,9 +101,9 @@ def run(
     with account.stage("sharpness"):
         figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
-    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
-        drive, found = _without_moving(whole, Path(folder), account, progress)
+    whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
+    with _answers(whole, work, resume, labels_from) as folder:
+        drive, found = _without_moving(whole, folder, account, progress)
         with account.stage("mapping"):
             maps = build_maps(
                 drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -145,6 +146,16 @@ def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Setting
     if segmenter is not None and log.images and log.calibration.has_camera:
         check_projection(log)
         check_stamps(log, settings.labelling.image_within_s)
+
+
+@contextmanager
+def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
+    """Where a network's answers are kept: with what is mapped, so that --resume asks for none twice."""
+    if work is not None:
+        yield answers_folder(work, answers_fingerprint(drive, labels_from), resume)
+        return
+    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        yield Path(folder)
 
 
 def _without_moving(

@@ -19,7 +19,7 @@ from gnss_sem_map.account import Account
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.config import Settings
 from gnss_sem_map.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labelling import (
     NEAREST_DEPTH_M,
     NO_VIEW,
@@ -217,6 +217,8 @@ class _Look:
             )
             names = self._segmenter.class_names
             return points, (image, class_image(seen, names, self._label_set, size, where))
+        except WriteError:
+            raise
         except DataError as error:  # of this one image; the others have theirs
             self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None

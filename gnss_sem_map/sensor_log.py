@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,12 @@ class Image:
     """s since the log's epoch, as the camera reports it (see `Calibration.camera_time_offset_s`)."""
     read: Callable[[], NDArray[np.uint8]] = field(repr=False)
     """The RGB pixels, (h, w, 3); raises DataError when the file is damaged."""
+
+
+def file_of(item: Scan | Image) -> Path | None:
+    """The file that a scan or an image is read from: the first argument of its `read`; None where there is none."""
+    first = item.read.args[:1] if isinstance(item.read, partial) else ()
+    return next((path for path in first if isinstance(path, Path)), None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,12 +189,18 @@ class SensorLog:
         if self.given is None and (self.imu is None or self.gnss is None):
             raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
 
+    @property
+    def folders(self) -> set[Path]:
+        """Where the files of scans and images are."""
+        files = {*map(file_of, self.scans), *map(file_of, self.images)}
+        return {file.parent for file in files if file is not None}
+
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
         """The same log in our axes, units and clock, once: what is chosen wins over what the drive says of itself."""
         if self.conventions is None:
             return self
         theirs = chosen.over(self.conventions)
-        offset = theirs.lidar_time_offset_s
+        offset = theirs.lidar_time_offset_s or 0.0
         return replace(
             self,
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),

@@ -25,6 +25,8 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.untrusted.files import is_file, read_bytes, shown
+from gnss_sem_map.untrusted.structured import read_json
 from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_OFFSET
 from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, pack, unpack
 
@@ -35,7 +37,7 @@ FORMAT = 2
 HITS_REMOVED = "hits_removed"
 """Column of maps in which something moved through voxels that stand."""
 Tile = tuple[int, int]
-NAME = re.compile(r"(-?\d+)_(-?\d+)\.parquet")
+NAME = re.compile(r"(-?\d{1,6})_(-?\d{1,6})\.parquet", re.ASCII)
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
@@ -91,13 +93,15 @@ def read(
     about = _read_about(folder / "map.json")
     label_set = label_set or labels.label_set(str(about.get("class_set")))
     if tuple(about["classes"]) != label_set.names:
-        raise DataError(f"{folder}: found classes {about['classes']}, expected {list(label_set.names)}")
+        raise DataError(
+            f"{shown(folder)}: found classes {about['classes']}, expected {list(label_set.names)}"
+        )
     voxel_size_m = float(about["voxel_size_m"])
-    missing = [name for name in about["files"] if not (folder / name).is_file()]
+    missing = [name for name in about["files"] if not is_file(folder / name)]
     if missing:
         raise DataError(
-            f"{folder}: found {len(about['files']) - len(missing)} tiles, expected {len(about['files'])}, such as"
-            f" {missing[0]}; make the map again"
+            f"{shown(folder)}: found {len(about['files']) - len(missing)} tiles, expected {len(about['files'])}, such"
+            f" as {missing[0]}; make the map again"
         )
     names = [name for name in about["files"] if _touches(_tile_of(name), box, voxel_size_m)]
     parts = [_decode(folder / name, about["files"][name], label_set) for name in sorted(names)]
@@ -161,17 +165,30 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
     import pyarrow.parquet as pq
 
     names = ["key", *(f"log_{name}" for name in label_set.names), "hits", "label", "confidence", "state"]
+    content = read_bytes(path)
     try:
-        content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != about["sha256"]:
             raise ValueError("its checksum is not that of map.json")
-        tile = pq.ParquetFile(pa.BufferReader(content))
-        names += [HITS_REMOVED] * (HITS_REMOVED in tile.schema_arrow.names)
-        table = tile.read(names)
-        columns = {name: table[name].to_numpy() for name in names}
+        file = pq.ParquetFile(pa.BufferReader(content))
+        if file.metadata.num_rows != about["voxels"]:
+            raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
+        names += [HITS_REMOVED] * (HITS_REMOVED in file.schema_arrow.names)
+        table = file.read(columns=names)
+        columns = {name: _column(table, name) for name in names}
+        if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
+            raise ValueError("it has labels of no class")
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        raise DataError(f"{path}: damaged tile ({str(error).splitlines()[0]}); make the map again") from None
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None
     return columns | {"key": _global(_tile_of(path.name), columns["key"])}
+
+
+def _column(table: Any, name: str) -> NDArray[Any]:
+    """A column as numbers without gaps; raises ValueError for anything else."""
+    values: NDArray[Any] = table[name].to_numpy()
+    if table[name].null_count or values.dtype.kind not in "iuf":
+        raise ValueError(f"column {name} is {values.dtype} with {table[name].null_count} gaps")
+    return values
 
 
 def _join(
@@ -282,26 +299,45 @@ def read_frame(folder: Path) -> LocalFrame | None:
     """The local frame of a map; None for one in its drive's own poses. Raises DataError."""
     origin = _read_about(folder / "map.json").get("origin")
     try:
-        return None if origin is None else LocalFrame(**origin)
-    except (TypeError, ValueError) as error:
+        return (
+            None if origin is None else LocalFrame(**{name: float(value) for name, value in origin.items()})
+        )
+    except (TypeError, ValueError, AttributeError) as error:
         raise DataError(
-            f"{folder / 'map.json'}: found origin {origin}, expected lat_deg, lon_deg, alt_m ({error})"
+            f"{shown(folder / 'map.json')}: found origin {origin}, expected lat_deg, lon_deg, alt_m ({error})"
         ) from None
 
 
 def _read_about(path: Path) -> dict[str, Any]:
-    try:
-        about = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path}: no map here ({error})") from None
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: no map here; expected the folder of a map")
+    about = read_json(path)
+    if about.get("format") != FORMAT:
         raise DataError(
-            f"{path}: found format {about.get('format') if isinstance(about, dict) else about!r},"
-            f" expected {FORMAT}; make the map again"
+            f"{shown(path)}: found format {about.get('format')!r}, expected {FORMAT}; make the map again"
         )
-    missing = {"voxel_size_m", "classes", "files"} - set(about)
-    if missing or not isinstance(about["files"], dict):
-        raise DataError(f"{path}: damaged, missing {sorted(missing) or ['files']}; make the map again")
+    damaged = [name for name, is_right in (
+        ("voxel_size_m", _is_size(about.get("voxel_size_m"))),
+        ("classes", _is_list_of_words(about.get("classes"))),
+        ("files", _is_table_of_files(about.get("files"))),
+    ) if not is_right]  # fmt: skip
+    if damaged:
+        raise DataError(f"{shown(path)}: damaged, missing {damaged}; make the map again")
     for name in about["files"]:
         _tile_of(name)
     return about
+
+
+def _is_size(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 1e-3 <= value <= 1e3
+
+
+def _is_list_of_words(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(word, str) for word in value)
+
+
+def _is_table_of_files(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        isinstance(about, dict) and type(about.get("voxels")) is int and isinstance(about.get("sha256"), str)
+        for about in value.values()
+    )

@@ -44,6 +44,12 @@ class MappingSettings(BaseModel):
     farthest_m: float = Field(
         120.0, gt=0, description="Returns farther from the LiDAR than this are left out."
     )
+    scans_per_chunk: int = Field(
+        100,
+        ge=1,
+        description="Scans that one process maps before it puts them away: its memory, and what an interruption loses."
+        " The map is the same.",
+    )
 
 
 class State(IntEnum):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,3 +92,37 @@ def log_of(points: dict[int, Points], trajectory: Trajectory) -> SensorLog:
 def trajectory_of(motion: Motion, sweeps: int) -> Trajectory:
     """The exact trajectory, 100 Hz."""
     return motion.trajectory(np.arange(-0.1, (sweeps + 1) * SWEEP_S, 0.01))
+
+
+def write_table_log(folder: Path, boxes: Sequence[Box], sweeps: int) -> Path:
+    """The drive through these boxes as a table log without a camera."""
+    motion = drive(sweeps * SWEEP_S)
+    (folder / "lidar").mkdir(parents=True)
+    imu = np.arange(-0.5, (sweeps + 4) * SWEEP_S, 0.01)
+    fixes = imu[::20]
+    lat_lon_alt = np.column_stack(FRAME.to_geodetic(motion.poses(fixes)[:, :3, 3]))
+    tables = {
+        "imu.csv": (
+            "stamp_s,ax,ay,az,wx,wy,wz",
+            [imu, motion.specific_force(imu, FRAME), motion.angular_rate(imu, FRAME)],
+        ),
+        "gnss.csv": (
+            "stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m",
+            [fixes, lat_lon_alt, np.full((len(fixes), 3), 0.05)],
+        ),
+    }
+    for name, (header, columns) in tables.items():
+        np.savetxt(
+            folder / name, np.column_stack(columns), delimiter=",", fmt="%.11f", header=header, comments=""
+        )
+    stamps = [f"{k},{(k + 0.5) * SWEEP_S:.9f}" for k in range(sweeps)]
+    (folder / "lidar/stamps.csv").write_text("\n".join(["number,stamp_s", *stamps]) + "\n")
+    (folder / "log.yaml").write_text(json.dumps({"T_imu_lidar": T_IMU_LIDAR.tolist()}))
+    for k in range(sweeps):
+        points = sweep(motion, boxes, k)
+        assert points.stamps is not None
+        after = points.stamps - (k + 0.5) * SWEEP_S
+        np.column_stack([points.xyz, points.intensity, after]).astype("<f4").tofile(
+            folder / f"lidar/{k:06d}.bin"
+        )
+    return folder

@@ -6,7 +6,8 @@ from html import escape
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.report import findings_table, write_page
+from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.export.report import findings_table, page_of
 from gnss_sem_map.preflight.findings import Level, Preflight
 
 VERDICTS = {
@@ -31,4 +32,5 @@ def write_check_page(path: Path, name: str, page: Preflight) -> None:
     facts = f'<p class="facts">{escape(VERDICTS[page.level])} Checked in {page.seconds:.1f} s.</p>'
     title = f"Pre-flight of {name}"
     body = (f"<h1>{escape(title)}</h1>", facts, findings_table(page.as_dict()["findings"]))
-    write_page(path, title, body)
+    with replacing(path) as file:
+        file.write(page_of(title, body))

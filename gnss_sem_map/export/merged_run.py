@@ -13,10 +13,12 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
-from gnss_sem_map.export.run_folder import new_folder
+from gnss_sem_map.export.run_folder import claimed_run
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.merging import Laid, merge_runs
+from gnss_sem_map.output import new_folder
 from gnss_sem_map.refinement import refine
+from gnss_sem_map.run_json import read_run
 from gnss_sem_map.voxel_map import SemanticMap
 
 
@@ -27,12 +29,16 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
     folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
-        if not (run / "run.json").is_file():
-            raise DataError(f"{run}: no run folder here; expected the -o of an earlier `gnss-sem-map run`")
+        read_run(run)
     if first.resolve() == second.resolve():
         raise DataError(
             f"{second}: is the first run as well; merged with itself, all it saw would count twice; give another run"
         )
+    with claimed_run(out, [first, second]):
+        return _merge(first, second, out, match)
+
+
+def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     settings = config.load(first / "config.yaml")
     label_set = labels.label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)

@@ -44,6 +44,8 @@ HOLLOWS = ((2, 6.0, 0.1), (8, 2.5, 0.15), (24, 1.5, 0.25), (64, 1.0, 0.35))
 """Pixels to the neighbour, strength, and the largest step in log depth that counts: edges, then wide shadows."""
 
 UNLABELLED_BY_DAY, UNLABELLED_BY_NIGHT = (214, 217, 222), (72, 80, 97)
+UNLABELLED_ALONE = (150, 158, 172)
+"""In a map without any label."""
 
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
@@ -64,7 +66,7 @@ def write_topview(
     label_set = semantic_map.voxels.label_set
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
-    entries = _legend_entries(view.labels, label_set, UNLABELLED_BY_DAY)
+    entries = _legend_entries(view.labels, label_set, _unlabelled(view.labels, UNLABELLED_BY_DAY))
     if trajectory is not None:
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
@@ -84,7 +86,8 @@ def write_topview(
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     """(rows, columns, 3) RGB: the class colours, lighter with height, darker beside something higher."""
     # labels -2 (nothing) and -1 (unlabelled) count from the end
-    palette = np.vstack([label_set.colours, (255, 255, 255), UNLABELLED_BY_DAY]) / 255
+    unlabelled = _unlabelled(view.labels, UNLABELLED_BY_DAY)
+    palette = np.vstack([label_set.colours, (255, 255, 255), unlabelled]) / 255
     empty = view.labels == NOTHING
     low, high = np.nanpercentile(view.heights, [2, 98])
     lightness = np.clip((view.heights - low) / max(high - low, 1.0), 0, 1)
@@ -102,7 +105,13 @@ def _legend_entries(
         for i, (name, colour) in enumerate(zip(label_set.names, label_set.colours, strict=True))
         if (labels == i).any()
     ]
-    return entries + [("no camera saw it", unlabelled)] * bool((labels == UNLABELLED).any())
+    what = "no camera saw it" if entries else "no labels"
+    return entries + [(what, unlabelled)] * bool((labels == UNLABELLED).any())
+
+
+def _unlabelled(labels: NDArray[np.int8], beside_others: Colour) -> Colour:
+    """The colour of what has no label."""
+    return beside_others if (labels >= 0).any() else UNLABELLED_ALONE
 
 
 def _frame(view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int) -> tuple[Figure, Any]:
@@ -203,10 +212,11 @@ def write_perspective(
             camera = _behind(trajectory, at_s)
     track = np.empty((0, 3)) if trajectory is None else _beads(trajectory)
     half_m = np.repeat([semantic_map.voxels.voxel_size_m / 2, BEAD_M / 2], [len(centres), len(track)])
-    palette = np.vstack([semantic_map.voxels.label_set.colours, UNLABELLED_BY_NIGHT])  # -1 is the last
+    unlabelled = _unlabelled(labels, UNLABELLED_BY_NIGHT)
+    palette = np.vstack([semantic_map.voxels.label_set.colours, unlabelled])  # -1 is the last
     rgb = np.vstack([palette[labels], np.tile(TRACK_COLOUR, (len(track), 1))])
     image = _lit(np.vstack([centres, track]), half_m, rgb, camera)
-    entries = _legend_entries(labels, semantic_map.voxels.label_set, UNLABELLED_BY_NIGHT)
+    entries = _legend_entries(labels, semantic_map.voxels.label_set, unlabelled)
     if trajectory is not None:
         entries.append(("track", TRACK_COLOUR))
     figure = _with_legend(image, entries)

@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.ownership import amend
 
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
@@ -90,7 +90,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _section("Files", _files(folder)),
         _section("Versions", _pairs(run.get("versions", {}))),
     ]
-    write_page(folder / "report.html", title, sections)
+    amend(folder, "report.html", page_of(title, sections))
 
 
 def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
@@ -106,12 +106,11 @@ def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
     return f'<div class="scroll"><table><tr>{titles}</tr>{rows}</table></div>' if rows else ""
 
 
-def write_page(path: Path, title: str, sections: Iterable[str]) -> None:
-    """Write one self-contained page of HTML sections; raises DataError when the file cannot be written."""
+def page_of(title: str, sections: Iterable[str]) -> bytes:
+    """One self-contained page of HTML sections."""
     template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
     page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    with replacing(path) as file:
-        file.write(page.encode("utf-8"))
+    return page.encode("utf-8", "backslashreplace")
 
 
 def _section(title: str, *parts: str) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-import shutil
+import re
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from dataclasses import asdict, astuple
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,14 +19,14 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import tiles
 from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
-from gnss_sem_map.export.report import write_report
+from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
+from gnss_sem_map.output import Claim, claimed, new_folder
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.point_labels import label_points
 from gnss_sem_map.preflight.findings import Preflight
@@ -37,33 +37,22 @@ from gnss_sem_map.sensor_log import SensorLog
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
 
 
-@contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into; it becomes `out` when the block ends well and vanishes when it does not.
-
-    An earlier run at `out` is replaced; raises DataError when something else lies there, or the disk is full.
-    """
-    check_replaceable(out)
-    beside = out.with_name(f".{out.name}.part")
-    shutil.rmtree(beside, ignore_errors=True)
-    try:
-        beside.mkdir(parents=True)
-        yield beside
-        if out.exists():
-            shutil.rmtree(out)
-        beside.rename(out)
-    except OSError as error:
-        raise DataError(
-            f"{out}: cannot write the results ({error.strerror}); free the disk or choose another -o"
-        ) from None
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+RUN_FILES = re.compile(
+    "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
+    + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
+    r"|(labels|labels_raw|removed)/(\d+\.label)?|confidence/(\d+\.bin)?"
+)
+"""Paths of everything that runs write: those of older versions have no list of it."""
 
 
-def check_replaceable(out: Path) -> None:
-    """Raise DataError when `out` is something that no run wrote."""
-    if out.exists() and not (out / "run.json").is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise DataError(f"{out}: exists and is no run folder; choose another -o or remove it")
+def is_run_file(name: str) -> bool:
+    """Whether a run writes a file, or a folder (ending in '/'), of this path."""
+    return RUN_FILES.fullmatch(name) is not None
+
+
+def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> AbstractContextManager[Claim]:
+    """A place for a run that is ours until the claim ends; see `output.claimed`."""
+    return claimed(out, inputs, is_run_file)
 
 
 def write_run(
@@ -76,7 +65,7 @@ def write_run(
     segmenter: str | None = None,
 ) -> dict[str, Any]:
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
-    with new_folder(out) as folder:
+    with claimed_run(out, [drive]), new_folder(out) as folder:
         with result.account.stage("export"):
             _write_trajectory(folder, log, result.trajectory, result.solution)
             tiles.write(result.raw, folder / "map", log.frame)
@@ -131,7 +120,7 @@ def write_trajectory_run(
     page: Preflight,
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
-    with new_folder(out) as folder:
+    with claimed_run(out, [drive]), new_folder(out) as folder:
         _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, account) | {

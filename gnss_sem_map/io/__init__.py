@@ -7,23 +7,24 @@ from typing import Literal
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.untrusted.files import inside, is_file, is_folder, shown
 
 DriveFormat = Literal["kitti-raw", "kitti-odometry", "table"]
 
 
 def detect_format(drive: Path) -> DriveFormat:
     """Say what kind of drive a folder holds, from what is there; raises DataError when it is none."""
-    if not drive.is_dir():
-        raise DataError(f"{drive}: no such folder; expected a drive")
-    if (drive / "oxts").is_dir():
+    if not is_folder(drive):
+        raise DataError(f"{shown(drive)}: no such folder; expected a drive")
+    if is_folder(drive / "oxts"):
         return "kitti-raw"
-    if (drive / "imu.csv").is_file() or (drive / "gnss.csv").is_file():
+    if is_file(drive / "imu.csv") or is_file(drive / "gnss.csv"):
         return "table"
-    if (drive / "calib.txt").is_file() or (drive / "poses.txt").is_file():
+    if is_file(drive / "calib.txt") or is_file(drive / "poses.txt"):
         return "kitti-odometry"
-    found = sorted(path.name for path in drive.iterdir())[:8]
+    found = [shown(path.name) for path in inside(drive)][:8]
     raise DataError(
-        f"{drive}: no drive that we know; found {found}, expected oxts/ (KITTI raw), calib.txt and poses.txt"
+        f"{shown(drive)}: no drive that we know; found {found}, expected oxts/ (KITTI raw), calib.txt and poses.txt"
         " (KITTI odometry, SemanticKITTI), or imu.csv and gnss.csv (table log)"
     )
 

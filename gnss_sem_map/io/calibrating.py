@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -23,8 +22,10 @@ from gnss_sem_map.refinement.flatness import flatness
 from gnss_sem_map.refinement.ground import height_over_ground
 from gnss_sem_map.refinement.recapture import doubted
 from gnss_sem_map.refinement.smoothing import LEAST_PROBABILITY
+from gnss_sem_map.run_json import inputs_of
 from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
 from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.untrusted.files import shown
 from gnss_sem_map.voxel_map import VoxelMap, keys_of, softmax
 
 LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE = 0.5, 20.0
@@ -131,14 +132,18 @@ def _open(out: Path, drive: Path | None, segmenter: str | None) -> tuple[Drive, 
     settings = config.load(out / "config.yaml")
     if settings.calibration is not None:
         raise DataError(f"{out}: was made with a calibration file; calibrate with a run made without one")
-    try:
-        inputs = json.loads((out / "run.json").read_text("utf-8")).get("inputs", {})
-    except (OSError, ValueError) as error:
-        raise DataError(f"{out}: cannot read run.json ({error}); expected the folder of a run") from None
-    drive = drive or (Path(inputs["drive"]) if inputs.get("drive") else None)
+    inputs = inputs_of(out)
+    if segmenter is None and inputs.get("segmenter", "").startswith("python:"):
+        raise DataError(
+            f"{shown(out)}: its run.json names {inputs['segmenter']!r}, which is code to run; say --segmenter"
+            f" {inputs['segmenter']} if you mean it"
+        )
+    drive = drive or (Path(inputs["drive"]) if "drive" in inputs else None)
     segmenter = segmenter or inputs.get("segmenter")
-    if drive is None or segmenter is None:
-        raise DataError(f"{out}: its run.json names no drive and segmenter; give --drive and --segmenter")
+    if drive is None or segmenter is None or segmenter == "none":
+        raise DataError(
+            f"{shown(out)}: its run.json names no drive and segmenter; give --drive and --segmenter"
+        )
     log, label_set = open_drive(drive), labels.label_set(settings.classes)
     network = open_segmenter(segmenter, label_set, expected_size=log.calibration.image_size)
     trajectory = Trajectory.load(out / "trajectory.parquet")

@@ -14,8 +14,15 @@ from factor_graphs.accuracy import errors, pose_nees, relative_error
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.io.point_labels import label_files, read_labels, truth_folder
+from gnss_sem_map.io.point_labels import label_files, read_confidence, read_labels, truth_folder
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.ownership import amend
+from gnss_sem_map.run_json import read_run
+from gnss_sem_map.untrusted.files import is_file, is_folder, read_lines, shown
+from gnss_sem_map.untrusted.structured import read_json
+
+LARGEST = 1e12
+"""No stamp in s, and no length in m, is larger."""
 
 ONE_SECOND = 10
 """Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
@@ -34,41 +41,34 @@ def score_run(
     label_set = label_set or labels.label_set(config.load(out / "config.yaml").classes)
     metrics = _known_metrics(out) | _score_points(out, truth, label_set, restrict_to)
     path = truth / "trajectory_lidar.tum"
-    if path.is_file():
+    if is_file(path):
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", "utf-8")
+    amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
 
 def _check_scorable(out: Path) -> None:
     """Raise DataError for a folder that says nothing of single points, which are what is scored."""
-    about = _read_json(out / "run.json")
+    about = read_run(out)
     if "merged" in about:
+        made_of = about["merged"] if isinstance(about["merged"], list) else [about["merged"]]
         raise DataError(
-            f"{out}: a merged map has no labels of single points; evaluate the runs that it was made of,"
-            f" {' and '.join(about['merged'])}"
+            f"{shown(out)}: a merged map has no labels of single points; evaluate the runs that it was made of,"
+            f" {' and '.join(map(str, made_of))}"
         )
-    if not (out / "map").is_dir():
+    if not is_folder(out / "map"):
         raise DataError(
-            f"{out}: found a trajectory without a map; make the map with `gnss-sem-map run ... --write-labels`"
+            f"{shown(out)}: found a trajectory without a map; make the map with `gnss-sem-map run ... --write-labels`"
         )
-    if not (out / "labels").is_dir():
-        raise DataError(f"{out / 'labels'}: no point labels in this run; make it again with --write-labels")
+    if not is_folder(out / "labels"):
+        raise DataError(
+            f"{shown(out / 'labels')}: no point labels in this run; make it again with --write-labels"
+        )
 
 
 def _known_metrics(out: Path) -> dict[str, Any]:
     """What the run itself measured without a truth."""
-    return _read_json(out / "metrics.json")
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text("utf-8")))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "damaged"
-        raise DataError(
-            f"{path}: no run folder here ({reason}); expected the -o of an earlier `gnss-sem-map run`"
-        ) from None
+    return read_json(out / "metrics.json")
 
 
 def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
@@ -85,12 +85,17 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
             read_labels(out / "removed" / f"{name}.label"), true, tables, where
         )
         if restrict_to is not None:
-            true = np.where(read_labels(restrict_to / f"{name}.label") & 0xFFFF != 0, true, 0).astype(
-                np.uint32
-            )
+            chosen = read_labels(restrict_to / f"{name}.label")
+            if len(chosen) != len(true):
+                raise DataError(
+                    f"{shown(restrict_to / name)}.label: found {len(chosen)} labels for {len(true)} points"
+                )
+            true = np.where(chosen & 0xFFFF != 0, true, 0).astype(np.uint32)
         refined += evaluation.confusion(predicted, true, tables, where)
         raw += evaluation.confusion(before, true, tables, where)
-        confidence = np.fromfile(out / "confidence" / f"{name}.bin", "<f2")
+        confidence = read_confidence(out / "confidence" / f"{name}.bin")
+        if len(confidence) != len(predicted):
+            raise DataError(f"{where}: found {len(confidence)} probabilities for {len(predicted)} labels")
         sure += evaluation.calibration_counts(confidence, predicted, true, tables)
     return {
         "semantics": {
@@ -152,12 +157,17 @@ def _aligned_rms(points: NDArray[np.float64], reference: NDArray[np.float64]) ->
 
 def read_tum(path: Path) -> Trajectory:
     """Read `stamp tx ty tz qx qy qz qw`; raises DataError for anything else."""
+    lines = [line.split("#")[0] for line in read_lines(path)]
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.array([[float(word) for word in line.split()] for line in lines if line.strip()])
     except ValueError as error:
-        raise DataError(f"{path}: {str(error).splitlines()[0]}; expected eight numbers per line") from None
-    if rows.shape[1] != 8 or not np.isfinite(rows).all():
-        raise DataError(f"{path}: found {rows.shape[1]} numbers per line, expected eight finite ones")
+        raise DataError(f"{shown(path)}: {str(error)[:100]}; expected eight numbers per line") from None
+    if rows.ndim != 2 or rows.shape[1] != 8 or not (np.abs(rows) <= LARGEST).all():
+        raise DataError(f"{shown(path)}: found {rows.shape} numbers, expected eight finite ones per line")
+    if not np.allclose((rows[:, 4:] ** 2).sum(axis=1), 1, atol=2e-2):
+        raise DataError(
+            f"{shown(path)}: found quaternions that are no rotation, expected qx qy qz qw of length one"
+        )
     T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))
     T_map_imu[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     T_map_imu[:, :3, 3] = rows[:, 1:4]

@@ -1,4 +1,4 @@
-"""IMU against physics and against the course of the fixes."""
+"""IMU against physics and against the course of the fixes: units, turn rates, axes, mounting."""
 
 from __future__ import annotations
 
@@ -9,5 +9,6 @@ from gnss_sem_map.preflight.sample import Sample
 
 
 def check(sample: Sample) -> Iterator[Finding]:
-    """Nothing is checked yet."""
-    yield from ()
+    """What the IMU's probable mistakes are; nothing where poses are given."""
+    if sample.diagnosis is not None:
+        yield from sample.diagnosis.findings

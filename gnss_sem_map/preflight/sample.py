@@ -17,6 +17,8 @@ from gnss_sem_map.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labelling import exposure_stamp
 from gnss_sem_map.preflight.depth_edges import Edges, View, depth_edges, edge_strength
+from gnss_sem_map.preflight.diagnosis import Diagnosis, diagnose
+from gnss_sem_map.preflight.fixes import Fixes, examine
 from gnss_sem_map.preflight.lidar_motion import STEPS, Stretch, Surfaces, stretch
 from gnss_sem_map.registration import inverse
 from gnss_sem_map.segmentation import Segmenter
@@ -33,6 +35,11 @@ LEAST_WAY_M = 5.0
 """Images of places so far apart are different."""
 UNMATCHED = "its sweeps cannot be laid onto each other"
 
+# So much of a long drive, s, shows any mistake in the axes and clocks; it begins where the fixes begin to move.
+STRETCH_S = 600.0
+# A stretch with fewer samples shows nothing.
+LEAST_SAMPLES = 10
+
 
 @dataclass(frozen=True, eq=False)
 class Sample:
@@ -41,6 +48,28 @@ class Sample:
     log: SensorLog
     settings: Settings
     segmenter: Segmenter | None
+
+    @cached_property
+    def fixes(self) -> Fixes | None:
+        """The GNSS fixes, which of them can be used, and what is odd about them; None: poses are given."""
+        log = self.log
+        if log.given is not None or log.imu is None or log.gnss is None or log.frame is None:
+            return None
+        return examine(log.gnss, log.frame, log.imu, self.settings.trajectory.max_speed_mps)
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis | None:
+        """What is probably wrong with the IMU; None: poses are given, or there is too little of it."""
+        log, fixes = self.log, self.fixes
+        if fixes is None or log.imu is None or log.frame is None:
+            return None
+        start = max(fixes.moves_from_s - 10.0, float(log.imu.stamps[0]))
+        imu = between(log.imu, start, start + STRETCH_S)
+        if len(imu) < LEAST_SAMPLES:
+            return None
+        lever = complex(*log.calibration.p_imu_antenna[:2])
+        within = (fixes.usable.stamps >= start) & (fixes.usable.stamps <= start + STRETCH_S)
+        return diagnose(imu, fixes.usable[within], log.frame, log.reference, lever)
 
     @cached_property
     def trajectory(self) -> Trajectory | None:
@@ -236,3 +265,9 @@ def _way(a: Array, b: Array) -> float:
     """Between two poses, m, a turn counted as at 10 m."""
     turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)
+
+
+def between(imu: ImuSamples, start: float, end: float) -> ImuSamples:
+    """The samples between two stamps, s."""
+    within = slice(*np.searchsorted(imu.stamps, [start, end]))
+    return ImuSamples(imu.stamps[within], imu.specific_force[within], imu.angular_rate[within])

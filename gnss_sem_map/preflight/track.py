@@ -11,12 +11,14 @@ from factor_graphs.measurements import GnssFixes
 
 Array = NDArray[np.float64]
 
-# Third differences of white noise of stddev s have stddev s √20; a median absolute deviation of 1 is a stddev of 1.4826.
+# Third differences of white noise of stddev s have stddev s √20; 1.4826 median absolute deviations are one stddev.
 THIRD_DIFFERENCE = np.sqrt(20.0)
 MAD = 1.4826
 # Lines are made longer, up to the last of these, s, until they give the velocity to this, m/s: a walker's pace is told.
 WIDTHS_S = (0.5, 1.0, 2.0, 4.0)
 WANTED_STDDEV_MPS = 0.15
+# Lines that share more than most of their fixes say the same.
+KNOTS_PER_LINE = 5
 # What is slower than this, m/s, or than so many of its standard deviations, has no course.
 MIN_COURSE_SPEED_MPS, MIN_COURSE_STDDEVS = 0.8, 4.0
 
@@ -58,7 +60,8 @@ def track_of(fixes: GnssFixes) -> Track:
         stddev = scatter * np.sqrt(12.0 / count) / span
         if stddev <= WANTED_STDDEV_MPS or span >= WIDTHS_S[-1]:
             break
-    stamps, velocities = _slopes(fixes, min(count, len(fixes)), 1.5 * span)
+    every = max(1, count // KNOTS_PER_LINE)
+    stamps, velocities = (a[::every] for a in _slopes(fixes, min(count, len(fixes)), 1.5 * span))
     return Track(stamps, velocities, float(stddev), float(span), scatter)
 
 

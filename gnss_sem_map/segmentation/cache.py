@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -16,12 +19,18 @@ from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, LabelSet
+from gnss_sem_map.output import locked, real_path
+from gnss_sem_map.ownership import write_whole
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
+from gnss_sem_map.untrusted.structured import read_json
 
 ABOUT = "about.json"
 """Says who wrote a cache; frames of two segmenters are not mixed."""
 
+
+PARTIAL = re.compile(r"\.(\d+\.npz|about\.json)\.\d+\.part")
+"""Files that were being written when somebody killed us."""
 
 STEP = 3
 """Probabilities are kept to 3/255: no network knows them better, and the files are a third smaller."""
@@ -78,7 +87,19 @@ def write_cache(
     segmenter's SPEC) must be the one that began the folder. Frames whose image is damaged are skipped and reported.
     Raises ConfigError for a folder of another segmenter, DataError when it cannot be written or nothing was segmented.
     """
-    _claim(folder, {"segmenter": description, "class_names": [*label_set.names, OTHER]})
+    with _for_us_alone(folder):
+        _claim(folder, {"segmenter": description, "class_names": [*label_set.names, OTHER]})
+        return _write_all(images, segmenter, label_set, folder, batch_size, progress)
+
+
+def _write_all(
+    images: Sequence[Image],
+    segmenter: Segmenter,
+    label_set: LabelSet,
+    folder: Path,
+    batch_size: int,
+    progress: Progress,
+) -> CacheReport:
     waiting = [image for image in images if not _file(folder, image).exists()]
     kept, skips, sizes, start = len(images) - len(waiting), list[Skip](), list[int](), time.perf_counter()
     progress("segmenting", kept, len(images))
@@ -132,19 +153,35 @@ def _segment(
             skips.append(Skip("image", f"frame {image.number}", str(error)))
 
 
+@contextmanager
+def _for_us_alone(folder: Path) -> Iterator[None]:
+    """Two calls do not write one folder at the same time."""
+    real = real_path(folder)
+    try:
+        real.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
+    with locked(real):
+        yield
+
+
 def _claim(folder: Path, about: dict[str, object]) -> None:
     file = folder / ABOUT
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not file.exists():
-            if any(folder.glob("*.npz")):
-                raise ConfigError(f"cache {folder}: found .npz files but no {ABOUT}; choose an empty folder")
-            file.write_text(json.dumps(about) + "\n")
-        found = json.loads(file.read_text())
+            strange = sorted(path.name for path in folder.iterdir() if not PARTIAL.fullmatch(path.name))
+            if strange:
+                raise ConfigError(
+                    f"cache {folder}: found {strange[0]} but no {ABOUT}; choose an empty folder"
+                )
+            write_whole(file, (json.dumps(about) + "\n").encode())
+        for path in folder.iterdir():
+            if PARTIAL.fullmatch(path.name):
+                path.unlink()  # of a call that was killed
     except OSError as error:
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
-    except json.JSONDecodeError:
-        raise DataError(f"{file}: damaged; remove the folder and write it again") from None
+    found = read_json(file)
     if found != about:
         raise ConfigError(
             f"cache {folder}: was begun with {found}, now asked for {about}; choose another folder"
@@ -156,16 +193,12 @@ def _file(folder: Path, image: Image) -> Path:
 
 
 def _write(path: Path, probabilities: NDArray[np.uint8], label_set: LabelSet) -> int:
-    beside = path.with_suffix(".part")
+    content = io.BytesIO()
+    np.savez_compressed(content, probabilities=probabilities, class_names=np.array([*label_set.names, OTHER]))
     try:
-        with beside.open("wb") as file:
-            np.savez_compressed(
-                file, probabilities=probabilities, class_names=np.array([*label_set.names, OTHER])
-            )
-        beside.replace(path)
+        write_whole(path, content.getvalue())
         return path.stat().st_size
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise DataError(
             f"{path}: cannot be written ({error.strerror}); free some space and run again"
         ) from None

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +10,18 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
 from gnss_sem_map.segmentation import MissingLabels
-from gnss_sem_map.segmentation.probabilities import LabelImage, check_size, checked_probabilities
+from gnss_sem_map.segmentation.probabilities import LabelImage, check_shape, check_size, checked_probabilities
 from gnss_sem_map.sensor_log import Image
+from gnss_sem_map.untrusted.archives import open_archive
+from gnss_sem_map.untrusted.files import inside, is_folder, shown
+from gnss_sem_map.untrusted.pictures import read_ids
 
 HARD_LABEL_PROBABILITY = 0.9
 """What a label image's class gets; the rest is spread evenly over the other classes, for no network is always right."""
 MOST_TRIED = 20
 """Files, from all over the folder, that are tried before it is given up."""
+
+MOST_NAME_BYTES = 1 << 20
 
 
 class CachedLabels:
@@ -115,65 +117,50 @@ def read_probabilities(
     path: Path, expected_size: tuple[int, int] | None = None
 ) -> tuple[NDArray[np.uint8] | NDArray[np.float32], tuple[str, ...]]:
     """The probabilities (h, w, c) and class names (c,) of one `.npz`; raises DataError for anything else in it."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
-            probabilities, names = content["probabilities"], content["class_names"]
-    except KeyError as error:
-        raise DataError(
-            f"{path}: {error.args[0]}; expected probabilities (h, w, c) and class_names (c,)"
-        ) from None
-    except (OSError, ValueError, TypeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(
-            f"{path}: damaged file, or no .npz of plain arrays ({' '.join(str(error).split())})"
-        ) from None
-    if names.ndim != 1 or names.dtype.kind != "U":
-        raise DataError(f"{path}: found class_names of {names.dtype} {names.shape}, expected a list of names")
-    checked = checked_probabilities(probabilities, len(names), str(path))
-    check_size(checked.shape, expected_size, str(path))
-    return checked, tuple(map(str, names))
+    with open_archive(path) as archive:
+        stored, named = archive.array("probabilities"), archive.array("class_names", MOST_NAME_BYTES)
+        if len(named.shape) != 1 or named.dtype.kind != "U":
+            raise DataError(
+                f"{shown(path)}: found class_names of {named.dtype} {named.shape}, expected a list of names"
+            )
+        check_shape(stored.shape, stored.dtype, named.shape[0], shown(path))
+        check_size(stored.shape, expected_size, shown(path))
+        try:
+            names = tuple(map(str, named.read()))
+        except ValueError:
+            raise DataError(f"{shown(path)}: class_names are no text") from None
+        return checked_probabilities(stored.read(), len(names), shown(path)), names
 
 
 def read_class_ids(path: Path) -> NDArray[np.uint8]:
     """The ids (h, w) of a label image; raises DataError unless it is an 8-bit image of one channel."""
-    import cv2
-
-    try:
-        content = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DataError(f"{path}: cannot read the labels ({error.strerror})") from None
-    ids: NDArray[Any] | None = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
-    if ids is None:
-        raise DataError(f"{path}: damaged label image; expected an 8-bit grey PNG of class ids")
-    if ids.ndim != 2 or ids.dtype != np.uint8:
-        raise DataError(
-            f"{path}: found {ids.dtype} {ids.shape}, expected an 8-bit grey PNG of class ids, not colours"
-        )
-    return ids
+    return read_ids(path)
 
 
 def _label_files(folder: Path) -> tuple[dict[int, Path], str]:
-    if not folder.is_dir():
-        raise DataError(f"labels {folder}: no such folder")
-    found = {suffix: _numbered(folder, suffix) for suffix in (".npz", ".png")}
+    if not is_folder(folder):
+        raise DataError(f"labels {shown(folder)}: no such folder")
+    paths = inside(folder)
+    found = {suffix: _numbered(paths, suffix) for suffix in (".npz", ".png")}
     if all(found.values()):
         raise DataError(
-            f"labels {folder}: found both .npz and .png; expected one kind, keep them in two folders"
+            f"labels {shown(folder)}: found both .npz and .png; expected one kind, keep them in two folders"
         )
     for suffix, files in found.items():
         if files:
             return files, suffix
-    inside = [d.name for d in sorted(folder.iterdir()) if d.is_dir()]
-    hint = f"; did you mean one of its folders {inside[:8]}?" if inside else ""
-    raise DataError(f"labels {folder}: found no <frame number>.npz or .png in it{hint}")
+    folders = [shown(path.name) for path in paths if path.is_dir()]
+    hint = f"; did you mean one of its folders {folders[:8]}?" if folders else ""
+    raise DataError(f"labels {shown(folder)}: found no <frame number>.npz or .png in it{hint}")
 
 
-def _numbered(folder: Path, suffix: str) -> dict[int, Path]:
+def _numbered(paths: list[Path], suffix: str) -> dict[int, Path]:
     files: dict[int, Path] = {}
-    for path in sorted(folder.glob(f"*{suffix}")):
-        if path.stem.isdecimal():
+    for path in paths:
+        if path.suffix == suffix and path.stem.isdecimal():
             if int(path.stem) in files:
                 raise DataError(
-                    f"{path}: same frame as {files[int(path.stem)].name}; expected one file per frame"
+                    f"{shown(path)}: same frame as {files[int(path.stem)].name}; expected one file per frame"
                 )
             files[int(path.stem)] = path
     return files

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +22,14 @@ from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, for_inference, from_logits
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
+from gnss_sem_map.untrusted.files import is_file, shown
 
 METADATA = "gnss_sem_map"
 """The entry of a safetensors file that holds what we know beyond the tensors, as JSON."""
 
 LOAD_ERRORS = (
     pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, IndexError,
+    TypeError, OverflowError, ImportError, struct.error, zipfile.BadZipFile,
 )  # fmt: skip
 """What torch raises for a file that is damaged, or that holds more than tensors."""
 
@@ -66,8 +70,8 @@ def open_refinenet(
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """The tensors of a safetensors file, or of a torch file read with `weights_only=True`; raises DataError."""
-    if not path.is_file():
-        raise DataError(f"checkpoint {path}: no such file")
+    if not is_file(path):
+        raise DataError(f"checkpoint {shown(path)}: no such file")
     if path.suffix == ".safetensors":
         return _read_safetensors(path)
     try:
@@ -161,8 +165,9 @@ def _read_safetensors(path: Path) -> Checkpoint:
         return Checkpoint(
             path, tensors, tuple(map(str, names)) if names else None, float(about.get("scale", 1.0))
         )
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(f"checkpoint {path}: no safetensors file ({error}); get it again") from None
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"checkpoint {shown(path)}: no safetensors file ({reason}); get it again") from None
 
 
 def _only_tensors(content: Any, path: Path) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels, scale_and_shrink, scaled
 from gnss_sem_map.segmentation.probabilities import resized_softmax
 from gnss_sem_map.sensor_log import Image
+from gnss_sem_map.untrusted.files import is_file, open_file, shown
 
 IMAGENET_MEAN = "0.485,0.456,0.406"
 IMAGENET_STD = "0.229,0.224,0.225"
@@ -82,8 +84,10 @@ class OnnxSegmenter:
 
 
 def _open_session(path: Path, device: str) -> Any:
-    if not path.is_file():
-        raise DataError(f"onnx {path}: no such file")
+    if not is_file(path):
+        raise DataError(f"onnx {shown(path)}: no such file")
+    with os.fdopen(open_file(path), "rb"):
+        pass  # says why it may not be read
     wanted = (
         ["CPUExecutionProvider"] if device == "cpu" else ["CUDAExecutionProvider", "CPUExecutionProvider"]
     )
@@ -102,7 +106,9 @@ def _open_session(path: Path, device: str) -> Any:
     try:
         return onnxruntime.InferenceSession(path, options, available)
     except ONNX_ERRORS as error:
-        raise DataError(f"onnx {path}: cannot be read ({_first_line(error)}); export it again") from None
+        raise DataError(
+            f"onnx {shown(path)}: cannot be read ({_first_line(error)}); export it again"
+        ) from None
 
 
 def _layout(session: Any, path: Path) -> tuple[str, tuple[int, int] | None, int]:
@@ -136,4 +142,4 @@ def _three_numbers(text: str, name: str, path: Path) -> NDArray[np.float32]:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:300]

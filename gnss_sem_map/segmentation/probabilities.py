@@ -52,23 +52,29 @@ def check_size(shape: tuple[int, ...], image_size: tuple[int, int] | None, where
         )
 
 
+def check_shape(shape: tuple[int, ...], dtype: np.dtype[Any], count: int, where: str) -> None:
+    """Raise DataError unless this is the shape and type of the probabilities of `count` classes."""
+    if len(shape) != 3 or shape[2] != count or 0 in shape:
+        raise DataError(f"{where}: found probabilities {shape}, expected (h, w, {count})")
+    if dtype != np.uint8 and dtype.kind != "f":
+        raise DataError(
+            f"{where}: found probabilities of {dtype}, expected uint8 round(255 p) or floating 0..1"
+        )
+
+
 def checked_probabilities(
     probabilities: NDArray[Any], count: int, where: str
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
     """The array (h, w, count) as uint8 or float32; raises DataError unless every pixel's sum is one, or nothing."""
-    if probabilities.ndim != 3 or probabilities.shape[2] != count or 0 in probabilities.shape:
-        raise DataError(f"{where}: found probabilities {probabilities.shape}, expected (h, w, {count})")
+    check_shape(probabilities.shape, probabilities.dtype, count, where)
     one, slack = 1.0, 0.02
     if probabilities.dtype == np.uint8:
         one, slack = 255.0, 2.0 * count  # of rounding
-    elif probabilities.dtype.kind == "f":
-        probabilities = probabilities.astype(np.float32)
+    else:
+        with np.errstate(over="ignore"):
+            probabilities = probabilities.astype(np.float32)
         if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):
             raise DataError(f"{where}: found probabilities that are negative or not finite, expected 0..1")
-    else:
-        raise DataError(
-            f"{where}: found probabilities of {probabilities.dtype}, expected uint8 round(255 p) or floating 0..1"
-        )
     # Every 64th pixel tells logits, percentages and 0/1 masks from probabilities, at no cost.
     largest = float(probabilities[::8, ::8].sum(2, dtype=np.float64).max(initial=0.0))
     if largest > one + slack or 0 < largest < one / 2:

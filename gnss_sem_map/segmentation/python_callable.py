@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import LabelSet
 from gnss_sem_map.segmentation.classes import named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels
@@ -28,6 +28,8 @@ class PythonSegmenter:
         self._where = f"python:{place}"
         self._function = _import(place)
         own: Sequence[str] | None = getattr(self._function, "class_names", None)
+        if own is not None and not (isinstance(own, Sequence) and all(isinstance(name, str) for name in own)):
+            raise ConfigError(f"{self._where}: found class_names {str(own)[:100]}, expected a list of names")
         if classes is None and own is None:
             raise ConfigError(
                 f"{self._where} has no class_names; give it that attribute, or say ?classes=road,..."
@@ -39,7 +41,11 @@ class PythonSegmenter:
         """Class probabilities (h, w, c) of one image."""
         pixels = checked_pixels(image)
         where = f"{self._where} on image {image.number}"
-        seen = checked_probabilities(np.asarray(self._function(pixels)), len(self.class_names), where)
+        try:
+            answer = np.asarray(self._function(pixels))
+        except Exception as error:
+            raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
+        seen = checked_probabilities(answer, len(self.class_names), where)
         check_size(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
         return seen
 
@@ -54,6 +60,10 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
         raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
+    except Exception as error:
+        raise ConfigError(
+            f"python:{place}: cannot be imported, {type(error).__name__} {str(error)[:200]}"
+        ) from error
     if not callable(function):
         raise ConfigError(f"python:{place}: found {type(function).__name__}, expected a callable")
     return cast("Callable[[NDArray[np.uint8]], Any]", function)

@@ -26,6 +26,7 @@ from torch.nn.functional import cross_entropy, interpolate
 from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.ownership import MARKER, write_list
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,
@@ -179,8 +180,7 @@ class _Run:
             raise ConfigError(f"{out}: holds a training; go on with it (resume), or choose another folder")
         if (out / STATE).exists():
             self._load()
-        with _writing(out):
-            out.mkdir(parents=True, exist_ok=True)
+        _claim(out)
 
     def steps(self, progress: Progress) -> Iterator[tuple[int, float]]:
         """Train step by step; after each, its number and the mean loss since the last validation."""
@@ -333,6 +333,22 @@ def _to_input(pixels: NDArray[np.uint8], device: torch.device) -> Tensor:
     batch = torch.from_numpy(pixels).to(device).permute(0, 3, 1, 2).float() / 255
     mean, std = (torch.tensor(v, device=device).reshape(3, 1, 1) for v in (MEAN, STD))
     return (batch - mean) / std
+
+
+def _claim(out: Path) -> None:
+    """Have a folder for a training; raises ConfigError for one with files that no training wrote."""
+    with _writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        strange = sorted(
+            {path.name for path in out.iterdir()} - {STATE, NETWORK, LOG, f"{STATE}.part", MARKER}
+        )
+        ours = (out / STATE).exists() or (out / MARKER).exists()
+        if any(out.iterdir()) and not ours:
+            raise ConfigError(
+                f"{out}: holds {(strange or [NETWORK])[0]} and no training; choose an empty folder"
+            )
+        if not ours:
+            write_list(out)
 
 
 @contextmanager

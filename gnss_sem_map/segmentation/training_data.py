@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
 from gnss_sem_map.segmentation.cached import read_class_ids
+from gnss_sem_map.untrusted.pictures import read_picture
 
 IGNORE = 255
 """Truth of a pixel that nothing is learnt from."""
@@ -57,26 +57,19 @@ class LabelledImages:
 
     def read(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """RGB pixels (h, w, 3) and truth (h, w); raises DataError for damaged files, other sizes and unknown ids."""
-        import cv2
-
         image_file, label_file = self.pairs[index]
-        content = np.frombuffer(image_file.read_bytes(), np.uint8)
-        bgr: NDArray[Any] | None = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
-        if bgr is None:
-            raise DataError(f"{image_file}: damaged image; expected PNG or JPEG")
-        if bgr.dtype != np.uint8 or bgr.ndim != 3 or bgr.shape[2] != 3:
-            raise DataError(f"{image_file}: found {bgr.dtype} {bgr.shape}, expected 8-bit colour (h, w, 3)")
+        pixels = read_picture(image_file, needs_colour=True)
         ids = read_class_ids(label_file)
-        if bgr.shape[:2] != ids.shape:
+        if pixels.shape[:2] != ids.shape:
             raise DataError(
-                f"{label_file}: found {ids.shape} pixels, expected {bgr.shape[:2]} as in {image_file.name}"
+                f"{label_file}: found {ids.shape} pixels, expected {pixels.shape[:2]} as in {image_file.name}"
             )
         used = np.flatnonzero(np.bincount(ids.ravel(), minlength=256))
         if not self.known[used].all():
             raise DataError(
                 f"{label_file}: found unknown ids {used[~self.known[used]].tolist()}; are they other ids?"
             )
-        return np.asarray(bgr[:, :, ::-1], np.uint8), self.class_of_id[ids]
+        return pixels, self.class_of_id[ids]
 
 
 def labelled_images(

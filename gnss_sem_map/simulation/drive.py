@@ -3,8 +3,9 @@
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ import numpy.typing as npt
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.output import locked
+from gnss_sem_map.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
@@ -148,30 +151,75 @@ def simulate(
     for path in (drive, _twin(drive)):
         if path.exists():
             raise DataError(f"{path}: is already there; remove it or simulate into another folder")
-    simulation = prepare(seconds, seed, lidar, camera)
-    partial = drive.with_name(f".{drive.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    _write_still(simulation, partial, drive)
-    frames = len(simulation.sweeps)
-    seen: list[npt.NDArray[np.uint16]] = []
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        for done, instances in enumerate(
-            pool.map(lambda k: _write_frame(simulation, k, partial), range(frames)), 1
-        ):
-            seen.append(instances)
-            if progress is not None:
-                progress(done, frames)
-    write_tracklets(partial / "tracklet_labels.xml", seen_boxes(simulation.world, simulation.sweeps, seen))
-    partial.rename(drive)
+    with _for_us_alone(drive) as partial:
+        write_calibration(partial / "calibration", camera or Camera())
+        _refuse_other_calibration(partial / "calibration", drive.parent)
+        simulation = prepare(seconds, seed, lidar, camera)
+        _write_still(simulation, partial)
+        frames = len(simulation.sweeps)
+        seen: list[npt.NDArray[np.uint16]] = []
+        with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+            for done, instances in enumerate(
+                pool.map(lambda k: _write_frame(simulation, k, partial / "sync"), range(frames)), 1
+            ):
+                seen.append(instances)
+                if progress is not None:
+                    progress(done, frames)
+        boxes = seen_boxes(simulation.world, simulation.sweeps, seen)
+        write_tracklets(partial / "sync" / "tracklet_labels.xml", boxes)
+        for path in (partial / "calibration").iterdir():
+            path.rename(drive.parent / path.name)
+        (partial / "extract").rename(_twin(drive))
+        (partial / "sync").rename(drive)  # the last: a drive is there whole or not at all
     return drive
+
+
+@contextmanager
+def _for_us_alone(drive: Path) -> Iterator[Path]:
+    """A marked folder beside a drive, to write it in; what an interrupted simulation left there goes."""
+    partial = drive.with_name(f".{drive.name}.partial")
+    try:
+        drive.parent.mkdir(parents=True, exist_ok=True)
+        with locked(drive):
+            if os.path.lexists(partial) and read_list(partial) is None and os.listdir(partial):
+                raise DataError(f"{partial}: is in the way, and not ours; move it away")
+            try:
+                _clear(partial)
+                partial.mkdir()
+                write_list(partial)
+                (partial / "calibration").mkdir()
+                yield partial
+            finally:
+                _clear(partial)
+    except OSError as error:
+        raise DataError(
+            f"{drive}: cannot be written ({error.strerror}); free the disk or simulate into another folder"
+        ) from None
+
+
+def _clear(partial: Path) -> None:
+    """Remove an unfinished drive, last of all what says that it is ours."""
+    if partial.is_dir():
+        for part in ("sync", "extract", "calibration"):
+            shutil.rmtree(partial / part, ignore_errors=True)
+        (partial / MARKER).unlink(missing_ok=True)
+        partial.rmdir()
+
+
+def _refuse_other_calibration(new: Path, date: Path) -> None:
+    for path in sorted(new.iterdir()):
+        there = date / path.name
+        if os.path.lexists(there) and there.read_bytes() != path.read_bytes():
+            raise DataError(f"{there}: is the calibration of another drive; simulate into another folder")
 
 
 def _twin(drive: Path) -> Path:
     return drive.with_name(drive.name.replace("_sync", "_extract"))
 
 
-def _write_still(simulation: Simulation, partial: Path, drive: Path) -> None:
-    """Calibration, oxts, stamps, and the truth that needs no rendering."""
+def _write_still(simulation: Simulation, folder: Path) -> None:
+    """Oxts, stamps, and the truth that needs no rendering."""
+    partial = folder / "sync"
     for name in (
         "velodyne_points/data",
         "image_02/data",
@@ -180,9 +228,8 @@ def _write_still(simulation: Simulation, partial: Path, drive: Path) -> None:
         "truth/single_frame",
     ):
         (partial / name).mkdir(parents=True)
-    write_calibration(drive.parent, simulation.camera)
     _write_oxts(partial, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
-    _write_oxts(_twin(drive), simulation.oxts_stamps, simulation.oxts)
+    _write_oxts(folder / "extract", simulation.oxts_stamps, simulation.oxts)
     stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}
     for name, values in stamps.items():
         _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", values)

@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,9 +24,14 @@ PRELOAD = [
     "gnss_sem_map.io.semantic_kitti",
     "gnss_sem_map.io.table_log",
     "gnss_sem_map.segmentation.cached",
+    "laspy",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.figure",
+    "pyarrow.parquet",
+    "rasterio",
 ]
 TIMEOUT_S = 120.0
-OUR_CODES = {0, 1, 2, 130, 143}
+OUR_CODES = {0, 1, 2, 129, 130, 143}
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,8 @@ class Outcome:
     peak_mb: float
     left: tuple[str, ...]
     """What it left in its TMPDIR."""
+    orphans: bool = False
+    """Whether processes that it started live on."""
 
     @property
     def faults(self) -> list[str]:
@@ -53,10 +61,12 @@ class Outcome:
         if "Traceback" in self.err or "Traceback" in self.out:
             found.append("traceback")
         lines = [line for line in self.err.splitlines() if not line.startswith("warning: ")]
-        if self.code in (1, 2) and len(lines) != 1:
+        if self.code in OUR_CODES - {0} and len(lines) != 1:
             found.append(f"{len(lines)} lines on stderr, expected 1")
         if self.left:
             found.append(f"left in TMPDIR: {self.left}")
+        if self.orphans:
+            found.append("processes left")
         return found
 
     def __str__(self) -> str:
@@ -71,10 +81,15 @@ def gnss_sem_map(
     timeout_s: float = TIMEOUT_S,
     memory_mb: int | None = None,
     cwd: Path | None = None,
+    interrupt: tuple[float, signal.Signals] | None = None,
+    file_mb: float | None = None,
+    user: int | None = None,
+    stdout: Path | None = None,
 ) -> Outcome:
     """Run a command; `folder` is where its output and its TMPDIR go, a new one for each trial.
 
-    `memory_mb` limits its address space.
+    `memory_mb` limits its address space, `file_mb` every file that it writes (as if the disk were full there); after
+    the seconds of `interrupt` it and all that it started get that signal; `user` is whose rights it has.
     """
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / "tmp"
@@ -83,8 +98,14 @@ def gnss_sem_map(
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOAD)
     start = time.perf_counter()
-    process = context.Process(target=_child, args=(words, folder, temporary, memory_mb, cwd))
+    process = context.Process(
+        target=_child, args=(words, folder, temporary, memory_mb, cwd, file_mb, user, stdout)
+    )
     process.start()
+    if interrupt is not None:
+        process.join(interrupt[0])
+        if process.exitcode is None:
+            os.killpg(process.pid or 0, interrupt[1])
     process.join(timeout_s)
     code = process.exitcode
     if code is None:
@@ -97,23 +118,53 @@ def gnss_sem_map(
         (folder / "out").read_text(errors="replace"),
         (folder / "err").read_text(errors="replace"),
         time.perf_counter() - start,
-        float(peak.read_text()) if peak.exists() else 0.0,
+        float(peak.read_text() or 0.0) if peak.exists() else 0.0,
         tuple(sorted(path.name for path in temporary.iterdir())),
+        _lives(process.pid or 0),
     )
 
 
+def _lives(group: int, within_s: float = 3.0) -> bool:
+    """Whether some process of a group is still there; one that is ending has a moment for it."""
+    end = time.monotonic() + within_s
+    while time.monotonic() < end:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return False
+        time.sleep(0.05)
+    os.killpg(group, signal.SIGKILL)
+    return True
+
+
 def _child(
-    arguments: tuple[str, ...], folder: Path, temporary: Path, memory_mb: int | None, cwd: Path | None
+    arguments: tuple[str, ...],
+    folder: Path,
+    temporary: Path,
+    memory_mb: int | None,
+    cwd: Path | None,
+    file_mb: float | None,
+    user: int | None,
+    stdout: Path | None,
 ) -> None:
     os.setsid()
-    for number, name in ((1, "out"), (2, "err")):
-        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    (folder / "out").touch()
+    for number, path in ((1, stdout or folder / "out"), (2, folder / "err")):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
     sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)
     os.environ["TMPDIR"] = str(temporary)
     if cwd is not None:
         os.chdir(cwd)
     if memory_mb is not None:
         resource.setrlimit(resource.RLIMIT_AS, (memory_mb << 20, memory_mb << 20))
+    if file_mb is not None:
+        limit = int(file_mb * (1 << 20))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    if user is not None:
+        os.chown(temporary, user, user)
+        os.setgroups([])
+        os.setgid(user)
+        os.setuid(user)
     sys.argv = ["gnss-sem-map", *arguments]
     code: int | str | None = 0
     try:
@@ -126,6 +177,7 @@ def _child(
         traceback.print_exc()
         code = 99
     finally:
-        sys.stdout.flush()
-        (folder / "peak").write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
+        with suppress(OSError):
+            sys.stdout.flush()
+            (folder / "peak").write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
     os._exit(code if isinstance(code, int) else 1 if code else 0)

@@ -75,6 +75,28 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
     )
 
 
+def test_merged_runs_keep_what_moved_through_standing_voxels_apart(tmp_path: Path) -> None:
+    """Twice the same run: twice the evidence of what stands, and twice that of what moved, in the voxels of both."""
+    stands, moved = street(HERE, 0), street(HERE, 1)
+    refined, _ = refine(stands, removed=moved)
+    assert refined.hits_removed is not None
+    for name in ("a", "b"):
+        tiles.write(SemanticMap.of(stands + moved), tmp_path / name / "map", HERE)
+        tiles.write(refined, tmp_path / name / "refined", HERE)
+    runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
+    for found, once in ((runs.stands, stands), (runs.removed, moved)):
+        np.testing.assert_array_equal(found.keys, once.keys)
+        np.testing.assert_array_equal(found.hits, 2 * once.hits)
+        np.testing.assert_array_equal(found.evidence, 2 * once.evidence)
+
+
+def test_maps_of_different_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
+    tiles.write(SemanticMap.of(street(HERE, 0)), tmp_path / "a" / "map", HERE)
+    tiles.write(SemanticMap.of(street(HERE, 1)), tmp_path / "a" / "refined", HERE)
+    with pytest.raises(DataError, match="not of one run"):
+        merge_runs(tmp_path / "a", tmp_path / "a")
+
+
 def corner(seed: int, length_m: float = 60.0) -> NDArray[np.float64]:
     """Points on a road between two facades, and on one across its end; other ones for every seed."""
     rng = np.random.default_rng(seed)

@@ -41,6 +41,16 @@ def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
     assert about["utm_epsg"] == 32632
 
 
+def test_hits_of_what_moved_come_back_from_every_tile(tmp_path: Path) -> None:
+    written = random_map()
+    gone = written.voxels.hits // 2
+    tiles.write(replace(written, hits_removed=gone), tmp_path / "map", FRAME)
+    np.testing.assert_array_equal(tiles.read(tmp_path / "map", URBAN).hits_removed, gone)
+    low, high = written.voxels.centres.min(axis=0), written.voxels.centres.max(axis=0)
+    inside = tiles.read(tmp_path / "map", URBAN, (low, (low + high) / 2))
+    np.testing.assert_array_equal(inside.hits_removed, inside.voxels.hits // 2)
+
+
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         tiles.write(random_map(), tmp_path / name, FRAME)

@@ -135,6 +135,17 @@ def test_any_order_and_any_merge_give_the_same_bits(order: list[int], split: int
     assert_same(halves[0] + halves[1], whole)
 
 
+def test_what_was_added_can_be_taken_out_again() -> None:
+    whole, part = by_table(batches(1)), by_table(batches(2))
+    assert_same(whole + part - part, whole)
+    assert len(whole - whole) == 0
+    for other in (part, replace(whole, hits=whole.hits + np.uint32(1)), replace(whole, voxel_size_m=0.4)):
+        with pytest.raises(DataError, match="does not hold it"):
+            whole - other
+    with pytest.raises(DataError, match="other evidence"):
+        whole - replace(whole, evidence=whole.evidence - np.int32(1))
+
+
 def test_the_table_grows_without_losing_anything() -> None:
     parts = batches(4, count=4, points=120_000, spread=60.0)
     fused = by_table(parts)

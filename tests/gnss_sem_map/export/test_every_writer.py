@@ -3,19 +3,21 @@
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.pictures import write_topview
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.pictures import write_perspective, write_topview
+from gnss_sem_map.export.point_cloud import visible, write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxel_map import SemanticMap, State
 
 Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
 
@@ -23,6 +25,7 @@ WRITERS: dict[str, Writer] = {
     "map.ply": lambda m, t, f, path: write_ply(m, path, f),
     "map.laz": lambda m, t, f, path: write_laz(m, f, path),
     "topview.png": lambda m, t, f, path: write_topview(m, path, t),
+    "perspective.png": lambda m, t, f, path: write_perspective(m, path, t),
     "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(m, f, path),
     "viewer.html": lambda m, t, f, path: write_viewer(m, t, path),
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
@@ -42,6 +45,19 @@ def test_writing_twice_gives_the_same_bytes_and_leaves_one_file(
     WRITERS[name](street, track, karlsruhe, path)
     assert path.read_bytes() == first != b"an earlier run"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_map_that_shows_no_label_is_written_all_the_same(
+    name: str, street: SemanticMap, track: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    """Nothing but what was removed has a label; and everything was removed."""
+    removed = street.states == State.REMOVED
+    unlabelled = replace(street, labels=np.where(removed, street.labels, -1).astype(np.int8))
+    for semantic_map in (unlabelled, replace(street, states=np.full_like(street.states, State.REMOVED))):
+        WRITERS[name](semantic_map, track, karlsruhe, tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 500
+    np.testing.assert_array_equal(visible(unlabelled), ~removed)
 
 
 @contextmanager

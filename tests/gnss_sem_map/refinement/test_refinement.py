@@ -134,6 +134,20 @@ def test_removed_voxels_come_back_as_a_layer_only_where_nothing_else_stands():
         with_removed(refined, VoxelTable(0.5, URBAN).to_map())
 
 
+def test_what_moved_through_standing_voxels_is_counted_there_and_changes_nothing_else():
+    static = voxel_map([(0, 0, 0), (1, 0, 0)], [ROAD, ROAD], hits=4)
+    moving = voxel_map([(1, 0, 0), (2, 0, 0)], [VEHICLE, VEHICLE], hits=3)
+    off = RefinementSettings(geometry="off", smoothing="off")
+    refined, alone = refine(static, off, removed=moving)[0], refine(static, off)[0]
+    np.testing.assert_array_equal(refined.voxels.hits, [4, 7, 3])
+    np.testing.assert_array_equal(refined.removed_hits, [0, 3, 3])
+    np.testing.assert_array_equal(refined.standing.hits, static.hits)
+    np.testing.assert_array_equal(refined.standing.evidence, static.evidence)
+    for name in ("labels", "confidence", "states", "entropy"):
+        np.testing.assert_array_equal(getattr(refined, name)[:2], getattr(alone, name))
+    np.testing.assert_array_equal((static + moving - refined.standing).evidence, moving.evidence)
+
+
 @pytest.mark.parametrize("mode", ["evidence", "paper", "off"])
 def test_empty_maps_and_maps_of_one_class_are_refined_without_error(mode):
     settings = RefinementSettings(vehicles=mode, building_vegetation=mode)

@@ -181,6 +181,28 @@ def test_what_is_not_right_is_refused_on_opening(
     assert str(tmp_path) in str(caught.value)
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".png"])
+def test_damaged_files_spoil_their_own_frames_only(tmp_path: Path, suffix: str) -> None:
+    """Whichever they are: the first good one says what the others are like."""
+    for number in range(50):
+        if suffix == ".npz":
+            write_npz(tmp_path / f"{number:06d}.npz", some_probabilities(number))
+        else:
+            write_png(tmp_path / f"{number:06d}.png", np.full((9, 13), number % 19, np.uint8))
+    files = sorted(tmp_path.iterdir())
+    for path in files[:-4]:
+        path.write_bytes(path.read_bytes()[:-30])
+    segment = open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+    assert segment.class_names == NAMES
+    assert segment(frame(49)).shape[2] == 6
+    with pytest.raises(DataError, match=r"000003.*damaged"):
+        segment(frame(3))
+    for path in files[-4:]:
+        path.write_bytes(b"")
+    with pytest.raises(DataError, match=r"000000.*damaged.*; nor can any of 17 label files be used"):
+        open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+
+
 def test_files_of_one_folder_agree_on_their_classes(tmp_path: Path) -> None:
     write_npz(tmp_path / "0.npz", some_probabilities())
     write_npz(tmp_path / "1.npz", some_probabilities(), NAMES[::-1])

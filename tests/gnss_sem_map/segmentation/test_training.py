@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
+from gnss_sem_map.ownership import write_list
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.training import (
     NETWORK,
@@ -286,7 +287,7 @@ def broken(folder: Path, what: str) -> LabelledFolder:
         ("size", r"found \(48, 95\) pixels"),
         ("ids", r"000000\.png: found unknown ids \[77\]"),
         ("image", r"000000\.png: damaged image"),
-        ("grey", r"000000\.png: found uint8 \(48, 96\)"),
+        ("grey", r"000000\.png: found uint8 \(48, 96, 1\)"),
         ("deep", "found uint16"),
         ("void", "found no pixel of any class"),
         ("empty", "found 0 images"),
@@ -310,7 +311,9 @@ def test_a_damaged_state_is_not_resumed(streets: Any, tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_named(streets: Any, tmp_path: Path, in_the_way: str) -> None:
     out = tmp_path / "out"
     if in_the_way:
-        (out / in_the_way).mkdir(parents=True)
+        out.mkdir()
+        write_list(out)  # ours, or it would be refused for another reason
+        (out / in_the_way).mkdir()
     else:
         out.write_text("a file where the folder should be")
     with pytest.raises(DataError, match=r"out: cannot be written"):

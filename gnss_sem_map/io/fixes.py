@@ -1,0 +1,75 @@
+"""Which rows of a receiver are fixes: a place on Earth, an accuracy, and no jump that no vehicle can make."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from factor_graphs.geodesy import FLATTENING, SEMI_MAJOR_AXIS
+from gnss_sem_map.sensor_log import Skip
+
+Array = NDArray[np.float64]
+
+LEAST_STDDEV_M, LARGEST_STDDEV_M = 1e-4, 1e5
+LARGEST_ALT_M = 1e5
+JUMP_M, FASTEST_M_S = 20_000.0, 150.0
+"""A fix this much farther from its neighbours than the fastest car can be is of somewhere else."""
+NEIGHBOURS = 21
+
+
+def usable_fixes(
+    stamps: Array, geodetic: Array, stddevs: Array, where: str
+) -> tuple[NDArray[np.bool_], list[Skip]]:
+    """Which rows are fixes (n,), and one skip for each kind of those that are not.
+
+    `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
+    """
+    lat, lon, alt = geodetic.T
+    is_place = np.isfinite(geodetic).all(axis=1) & ~(
+        (lat == 0) & (lon == 0)
+    )  # what receivers write without a fix
+    is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360) & (np.abs(alt) <= LARGEST_ALT_M)
+    has_accuracy = ((stddevs >= LEAST_STDDEV_M) & (stddevs <= LARGEST_STDDEV_M)).all(axis=1)
+    usable = is_place & has_accuracy
+    near = np.zeros(len(stamps), np.bool_)
+    with np.errstate(over="ignore", invalid="ignore"):  # of stamps that are left out later
+        near[usable] = _near(stamps[usable], geodetic[usable])
+    kinds = [
+        (~is_place, "no place on Earth, or 0, 0"),
+        (is_place & ~has_accuracy, "a standard deviation that is not above 0, or beyond all sense"),
+        (usable & ~near, "too far from the fixes around for any vehicle"),
+    ]
+    counted = [(int(rows.sum()), why) for rows, why in kinds if rows.any()]
+    return near, [Skip("fix", where, f"{count} rows: {why}", count) for count, why in counted]
+
+
+def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:
+    """Whether each fix is where its neighbours in time are; of places too far apart the one with most fixes stays."""
+    near = np.ones(len(stamps), np.bool_)
+    if len(stamps) < 3:
+        return near
+    order = np.argsort(stamps, kind="stable")
+    t, p = stamps[order], _cartesian(geodetic[order])
+    around = median_filter(p, size=(min(NEIGHBOURS, len(p)), 1), mode="reflect")
+    half = NEIGHBOURS // 2
+    places = np.arange(len(t))
+    span = t[np.minimum(places + half, len(t) - 1)] - t[np.maximum(places - half, 0)]
+    kept = np.linalg.norm(p - around, axis=1) <= JUMP_M + FASTEST_M_S * span
+    jumps = np.linalg.norm(np.diff(p[kept], axis=0), axis=1) > JUMP_M + FASTEST_M_S * np.diff(t[kept])
+    place = np.concatenate([[0], np.cumsum(jumps)])[: int(kept.sum())]
+    if len(place):
+        kept[kept] = place == np.bincount(place).argmax()
+    near[order] = kept
+    return near
+
+
+def _cartesian(geodetic: Array) -> Array:
+    """Degrees and m -> (n, 3) m from the centre of the Earth."""
+    lat, lon = np.radians(geodetic[:, :2].T)
+    e2 = FLATTENING * (2 - FLATTENING)
+    normal = SEMI_MAJOR_AXIS / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+    level = (normal + geodetic[:, 2]) * np.cos(lat)
+    return np.column_stack(
+        [level * np.cos(lon), level * np.sin(lon), (normal * (1 - e2) + geodetic[:, 2]) * np.sin(lat)]
+    )

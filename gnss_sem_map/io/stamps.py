@@ -1,0 +1,80 @@
+"""Stamps that can be of one drive: looked at before anything is sized by them."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import far_off
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.sensor_log import Skip
+
+LONGEST_SWEEP_S = 1.0
+FAR_FROM_SWEEP_S = 0.5
+"""A scan's stamp may lie this far outside its sweep."""
+LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_FRAME_STEP_S = 0.5, 100.0, 20.0
+"""Usual steps are far shorter, a thousandth of a second in place of a second makes them longer."""
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+
+
+class Stamped(Protocol):
+    """What happened at one moment."""
+
+    @property
+    def number(self) -> int:
+        """Frame number."""
+        ...
+
+    @property
+    def stamp(self) -> float:
+        """s."""
+        ...
+
+
+T = TypeVar("T", bound=Stamped)
+
+
+def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -> None:
+    """Raise DataError, with the likely unit, when the usual step between the stamps is longer than any sensor's."""
+    finite = np.sort(stamps[np.isfinite(stamps)])
+    with np.errstate(over="ignore"):
+        steps = np.diff(finite)
+    steps = steps[steps > 0]
+    if len(steps) < 2 or (step := float(np.median(steps))) <= longest_step_s:
+        return
+    fitting = [unit for unit, scale in UNITS.items() if step * scale <= longest_step_s]
+    raise DataError(
+        f"{where}: stamps go on by {step:.6g} at a time, expected seconds, at most {longest_step_s:g}"
+        + (f"; are these {fitting[0]}?" if fitting else "")
+    )
+
+
+def sweep_fault(stamp: float, start: float, end: float) -> str | None:
+    """Why these cannot be the stamp, start and end of one sweep, s; None where they can."""
+    if not start < end:
+        return "the sweep ends before it starts"
+    if end - start > LONGEST_SWEEP_S:
+        return f"the sweep takes {end - start:.6g} s, expected at most {LONGEST_SWEEP_S:g}"
+    if not start - FAR_FROM_SWEEP_S <= stamp <= end + FAR_FROM_SWEEP_S:
+        return f"its stamp is {stamp - start:.6g} s after the sweep began"
+    return None
+
+
+def in_order(what: str, items: list[T], skips: list[Skip]) -> tuple[T, ...]:
+    """Sorted by stamp; of two with the same stamp the first stays, and none that is far off in time: see `skips`."""
+    alone = far_off(np.array([item.stamp for item in items]))
+    for item, is_off in zip(items, alone, strict=True):
+        if is_off:
+            skips.append(
+                Skip(what, f"frame {item.number}", f"stamp {item.stamp:.6g} s is far off all others")
+            )
+    kept: list[T] = []
+    near = (item for item, is_off in zip(items, alone, strict=True) if not is_off)
+    for item in sorted(near, key=lambda item: (item.stamp, item.number)):
+        if kept and item.stamp == kept[-1].stamp:
+            skips.append(Skip(what, f"frame {item.number}", "repeated stamp"))
+        else:
+            kept.append(item)
+    return tuple(kept)

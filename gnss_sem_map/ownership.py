@@ -1,0 +1,161 @@
+"""What we wrote, and can prove it: every folder of results carries a list of its files, and only those are removed.
+
+The list holds the size of each file, and the content of small ones (those that people edit) as a checksum: what was
+changed since is somebody's work, and no longer ours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from gnss_sem_map.errors import DataError
+
+MARKER = ".gnss-sem-map.json"
+"""The list of files, in every folder that we wrote."""
+CONTENT_BYTES = 1 << 16
+"""Of files up to this size the content is compared as well."""
+
+Listed = Mapping[str, list[str]]
+"""Path within the folder -> what a file of ours may look like there; folders end in '/'."""
+
+
+def write_list(folder: Path) -> None:
+    """List everything that is in a folder as ours."""
+    _write_marker(folder, {name: [look(folder / name)] for name in _content(folder)})
+
+
+def read_list(folder: Path) -> Listed | None:
+    """What we wrote into a folder; None when it carries no list, or a damaged one."""
+    try:
+        files = json.loads((folder / MARKER).read_text("utf-8"))["files"]
+        return {str(name): [str(look) for look in looks] for name, looks in files.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -> str | None:
+    """Something in a folder that we did not write, or that was changed since; None when all of it is ours.
+
+    A folder without a list is ours when `by_name` accepts the path of everything in it.
+    """
+    listed = read_list(folder)
+    for name in _content(folder):
+        if is_partial(name) and not os.path.islink(folder / name):
+            continue
+        if listed is None:
+            ours = by_name(name) and not os.path.islink(folder / name)
+        else:
+            ours = name in listed and look(folder / name) in listed[name]
+        if not ours:
+            return name
+    return None
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether everything that we wrote into a folder is still there, as it was."""
+    listed = read_list(folder)
+    return listed is not None and all(look(folder / name) in looks for name, looks in listed.items())
+
+
+def remove(folder: Path) -> None:
+    """Remove what we wrote into a folder, its list last, and then the folder; raises OSError where that fails.
+
+    What is not ours stays, and so does the folder that holds it: then that is the error.
+    """
+    listed = read_list(folder) or {}
+    # the deepest first, so that folders are empty when their turn comes
+    for name in sorted(listed, key=lambda name: name.count("/") - name.endswith("/"), reverse=True):
+        path = folder / name
+        if look(path) in listed[name]:
+            path.rmdir() if name.endswith("/") else path.unlink()
+    remove_partials(folder)
+    left = next(_content(folder), None)
+    if left is None:
+        (folder / MARKER).unlink(missing_ok=True)
+    folder.rmdir()
+
+
+def remove_partials(folder: Path) -> None:
+    """Remove the beginnings of lists and pages that somebody was killed at writing; raises OSError."""
+    for path in folder.glob(".*.part") if folder.is_dir() else ():
+        if is_partial(path.name):
+            path.unlink()
+
+
+def amend(folder: Path, name: str, content: bytes) -> None:
+    """Write one more file into a folder, or write it anew; it is listed first, so that it is ours at every moment.
+
+    Raises DataError when a file lies there that we did not write, or the disk is full.
+    """
+    path, listed = folder / name, read_list(folder)
+    try:
+        if listed is not None:
+            if os.path.lexists(path) and look(path) not in listed.get(name, []):
+                raise DataError(f"{path}: was not written by us, or was changed since; move it away")
+            looks = [*listed.get(name, []), _look(content)]
+            _write_marker(folder, {**listed, name: list(dict.fromkeys(looks))[-3:]})
+        write_whole(path, content)
+    except OSError as error:
+        raise DataError(
+            f"{path}: cannot be written ({error.strerror}); free the disk or see to its rights"
+        ) from None
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all; raises OSError."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with beside.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def is_partial(name: str) -> bool:
+    """Whether a path in a folder is that of a list, or a page, that somebody was killed at writing."""
+    files = "|".join(map(re.escape, (MARKER, "report.html", "metrics.json", "check.html")))
+    return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
+
+
+def look(path: Path) -> str:
+    """What a file looks like: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
+    try:
+        if path.is_symlink():
+            return "other"
+        if path.is_dir():
+            return "folder"
+        if not path.is_file():
+            return "other"
+        size = path.stat().st_size
+        return _look(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
+    except OSError:
+        return "other"
+
+
+def _look(content: bytes) -> str:
+    size = len(content)
+    return str(size) if size > CONTENT_BYTES else f"{size} {hashlib.sha256(content).hexdigest()[:32]}"
+
+
+def _content(folder: Path) -> Iterator[str]:
+    """Everything in a folder but its list, as paths within it; folders end in '/', links to folders do not."""
+    for place, folders, files in os.walk(folder):
+        within = Path(place).relative_to(folder)
+        for name in sorted(folders):
+            yield (within / name).as_posix() + ("" if os.path.islink(Path(place, name)) else "/")
+        for name in sorted(files):
+            if (within / name).as_posix() != MARKER:
+                yield (within / name).as_posix()
+
+
+def _write_marker(folder: Path, files: Listed) -> None:
+    text = json.dumps({"written by": "gnss-sem-map", "files": files}, indent=0)
+    write_whole(folder / MARKER, text.encode())

@@ -1,0 +1,110 @@
+"""The way of the fixes against the way that the IMU went, window by window.
+
+In a window the fixes are a slope in time, a parabola (tilt, bias), and the twice integrated force turned by a first
+heading. The last one is compared, so neither attitude nor velocity need be known; and it is late where the clock is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import GnssFixes
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Long enough that a turn or a stop stands out from metres of noise, short enough that a consumer gyroscope holds.
+WINDOW_S = 20.0
+LEAST_FIXES = 7
+MOST_WINDOWS, MOST_FIXES = 30, 40
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Fixes by window: `stamps` (w, k) s, `places` (w, k) m, `basis` (w, k, 3) orthonormal in the fixes that count."""
+
+    stamps: Array
+    places: Complex
+    counts: Array
+    """(w, k) 1 for a fix, 0 for none."""
+    basis: Array
+
+
+def windows_of(fixes: GnssFixes, start: float, end: float) -> Windows | None:
+    """Overlapping windows between two stamps, s; None when none holds enough fixes."""
+    length = min(WINDOW_S, end - start)
+    number = min(MOST_WINDOWS, max(1, int(2 * (end - start) / length) - 1)) if length > 0 else 0
+    chosen = []
+    for first in np.linspace(start, end - length, number):
+        rows = np.flatnonzero((fixes.stamps >= first) & (fixes.stamps <= first + length))
+        if len(rows) >= LEAST_FIXES:
+            chosen.append(rows[np.unique(np.linspace(0, len(rows) - 1, MOST_FIXES).astype(int))])
+    if not chosen:
+        return None
+    width = max(map(len, chosen))
+    index = np.array([np.pad(rows, (0, width - len(rows)), mode="edge") for rows in chosen])
+    counts = np.array([np.arange(width) < len(rows) for rows in chosen]).astype(float)
+    stamps, positions = fixes.stamps[index], fixes.positions[index]
+    middle = stamps.mean(axis=1, keepdims=True)
+    u = (stamps - middle) / max(length / 2, 1e-6)
+    basis, _ = np.linalg.qr(np.stack([np.ones_like(u), u, u**2], axis=-1) * counts[..., None])
+    places = (positions[..., 0] + 1j * positions[..., 1]) * counts
+    return Windows(stamps, places, counts, basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """How well the two ways agree: sums of squares, m², before and after the IMU's way is taken off."""
+
+    total: float
+    rest: float
+    scales: Complex
+    """(w,) by how much, and by which heading, each window's way was turned."""
+    weights: Array
+    """(w,) m², how much way each had to compare."""
+    independent: float
+    """How many independent errors the windows hold."""
+
+    @property
+    def explained(self) -> float:
+        """Share of what the fixes do beside a parabola that the IMU's way explains."""
+        return 1.0 - self.rest / max(self.total, 1e-12)
+
+
+def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0) -> Agreement:
+    """The fixes, taken `lag_s` later than stamped, against a way (n,) m at its stamps."""
+    x, y = (
+        beside_parabola(windows, values)
+        for values in (complex_at(windows, stamps, way, lag_s), windows.places)
+    )
+    power = np.sum(np.abs(x) ** 2, axis=1)
+    scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, 1e-12)
+    errors = y - scales[:, None] * x
+    rest = float(np.sum(np.abs(errors) ** 2))
+    return Agreement(float(np.sum(np.abs(y) ** 2)), rest, scales, power, independent_errors(windows, errors))
+
+
+def independent_errors(windows: Windows, errors: Complex) -> float:
+    """How many independent errors (w, k) are, by how alike neighbours are; windows overlap by a half."""
+    rest = float(np.sum(np.abs(errors) ** 2))
+    alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, 1e-12)
+    alike = min(max(alike, 0.0), 0.99)
+    # a parabola, a scale and a heading were taken off each window
+    free = max(float(windows.counts.sum()) - 4.0 * len(errors), 1.0) * (1.0 - alike) / (1.0 + alike)
+    return free / (2.0 if len(errors) > 1 else 1.0)
+
+
+def complex_at(windows: Windows, stamps: Array, way: Complex, lag_s: float) -> Complex:
+    """A way (n,) at the stamps of the fixes, (w, k), zero where there is none."""
+    wanted = (windows.stamps + lag_s).ravel()
+    went = np.interp(wanted, stamps, way.real) + 1j * np.interp(wanted, stamps, way.imag)
+    return np.asarray(went.reshape(windows.stamps.shape) * windows.counts)
+
+
+def beside_parabola(windows: Windows, values: Complex) -> Complex:
+    """What is left of (w, k) values when each window's best parabola is taken off."""
+    parts = np.einsum("wkp,wk->wp", windows.basis, values)
+    return np.asarray(values - np.einsum("wkp,wp->wk", windows.basis, parts))

@@ -1,0 +1,320 @@
+"""Every reader of the package with a file that it takes: made in a folder, by name."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import street
+from faults import mutations
+from faults.fuzzing import Reader
+
+from gnss_sem_map import config, label_calibration, labels, tiles
+from gnss_sem_map.io import open_drive
+
+FRAMES = range(4)
+CLASSES = ("road", "sidewalk", "vehicle", "building", "vegetation")
+
+
+def small_street(folder: Path) -> street.Street:
+    """Four scans of few points."""
+    folder.mkdir(parents=True)
+    return street.write(folder, tuple(FRAMES), beams=4, azimuths=60)
+
+
+def _whole_drive(drive: Path) -> Callable[[], object]:
+    def read() -> object:
+        log = open_drive(drive)
+        return [item.read() for item in (*log.scans[:1], *log.images[:1])]
+
+    return read
+
+
+def kitti(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
+    """A file of a KITTI raw drive."""
+    drive = small_street(folder).drive
+    return Reader((drive / name).resolve(), _whole_drive(drive), mutate)
+
+
+def odometry(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
+    """A file of an odometry sequence."""
+    sequence = street.write_odometry(folder, small_street(folder / "street"))
+    return Reader(sequence / name, _whole_drive(sequence), mutate)
+
+
+def table(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
+    """A file of a table log."""
+    drive = street.write_table_log(folder, small_street(folder / "street"))
+    for file in ("imu.csv", "gnss.csv"):
+        lines = (drive / file).read_text().splitlines()
+        (drive / file).write_text("\n".join(lines[:40]) + "\n")
+    return Reader(drive / name, _whole_drive(drive), mutate)
+
+
+def scan(folder: Path) -> Reader:
+    """A scan with point times, and the map's idea of where its points are."""
+    from factor_graphs.errors import MeasurementError
+    from factor_graphs.trajectory import Trajectory
+    from gnss_sem_map.deskew import points_in_map
+
+    reader = table("lidar/0.bin", mutations.floats, folder)
+    log = open_drive(reader.file.parents[1])
+    still = Trajectory(np.array([-2.0, 5.0]), np.tile(np.eye(4), (2, 1, 1)))
+
+    def read() -> object:
+        points = log.scans[0].read()
+        try:
+            return points_in_map(points, log.scans[0].stamp, still, np.eye(4))
+        except MeasurementError:
+            return None
+
+    object.__setattr__(log.scans[0], "read", functools.partial(_read_now, reader.file, log.scans[0].stamp))
+    return Reader(reader.file, read, mutations.floats)
+
+
+def _read_now(path: Path, stamp: float) -> object:
+    from gnss_sem_map.io.table_log import _read_scan
+
+    return _read_scan(path, stamp, False, None)
+
+
+def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
+    """A camera image."""
+    import cv2
+
+    from gnss_sem_map.io.frames import read_image
+
+    folder.mkdir(parents=True)
+    file = folder / f"0{suffix}"
+    rng = np.random.default_rng(0)
+    cv2.imwrite(str(file), cv2.GaussianBlur(rng.integers(0, 255, (96, 300, 3), np.uint8), (9, 9), 3))
+    return Reader(file, lambda: read_image(file, None), mutate)
+
+
+def label_image(folder: Path) -> Reader:
+    """An image of class ids."""
+    import cv2
+
+    from gnss_sem_map.segmentation.cached import CachedLabels
+
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0.png"), np.random.default_rng(0).integers(0, 19, (96, 300), np.uint8))
+    return Reader(folder / "0.png", lambda: CachedLabels(folder, labels.label_set(), None), mutations.png)
+
+
+def probabilities(folder: Path) -> Reader:
+    """Class probabilities of an image."""
+    from gnss_sem_map.segmentation.cached import CachedLabels
+
+    made = small_street(folder)
+    for other in sorted(made.labels.glob("*.npz"))[1:]:
+        other.unlink()
+    file = next(made.labels.glob("*.npz"))
+    return Reader(file, lambda: CachedLabels(made.labels, labels.label_set(), None), mutations.npz)
+
+
+def point_labels(folder: Path) -> Reader:
+    """Labels of points, and the probabilities of them in a file of the same bytes."""
+    from gnss_sem_map.io.point_labels import read_confidence, read_labels
+
+    folder.mkdir(parents=True)
+    file = folder / "0.label"
+    np.zeros(500, "<u4").tofile(file)
+    return Reader(file, lambda: (read_labels(file), read_confidence(file)), mutations.binary)
+
+
+def tum(folder: Path) -> Reader:
+    """A trajectory in TUM format."""
+    from gnss_sem_map.io.scoring import read_tum
+
+    folder.mkdir(parents=True)
+    file = folder / "t.tum"
+    file.write_text("".join(f"{k * 0.1:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    return Reader(file, lambda: read_tum(file), mutations.text)
+
+
+def settings(folder: Path) -> Reader:
+    """The settings of a run."""
+    folder.mkdir(parents=True)
+    file = folder / "config.yaml"
+    file.write_text(config.Settings().to_yaml())
+    return Reader(file, lambda: config.load(file), mutations.text)
+
+
+def one_setting(folder: Path) -> Reader:
+    """A setting on the command line, which the file holds here."""
+    folder.mkdir(parents=True)
+    file = folder / "set"
+    file.write_text("mapping.voxel_size_m=0.2")
+
+    def read() -> object:
+        return config.load(None, [file.read_bytes().decode("utf-8", "surrogateescape")])
+
+    return Reader(file, read, mutations.text)
+
+
+def segmenter(folder: Path) -> Reader:
+    """How a segmenter is asked for, which the file holds here."""
+    from gnss_sem_map.segmentation import open_segmenter
+
+    folder.mkdir(parents=True)
+    file, there = folder / "spec", small_street(folder / "street").labels
+    file.write_text(f"labels:{there}")
+    other = [
+        b"python:json:loads?classes=road,sidewalk&x",
+        b"onnx:/etc?mean=1,2,3&std=0",
+        b"labels:/?ids=1&taxonomy=/",
+    ]
+
+    def mutate(seed: bytes, rng: np.random.Generator) -> bytes:
+        return mutations.text(seed if rng.random() < 0.5 else other[int(rng.integers(0, 3))], rng)
+
+    def read() -> object:
+        spec = file.read_bytes().decode("utf-8", "surrogateescape")
+        return open_segmenter(spec, labels.label_set(), "cpu", None)
+
+    return Reader(file, read, mutate)
+
+
+def shipped(name: str, opened: Callable[[Path], object], folder: Path) -> Reader:
+    """A class set or a taxonomy of the user's own."""
+    folder.mkdir(parents=True)
+    file = folder / "own.yaml"
+    shutil.copy(Path(labels.__file__).parent / "labels" / f"{name}.yaml", file)
+    return Reader(file, lambda: opened(file), mutations.text)
+
+
+def _taxonomy(file: Path) -> object:
+    found = labels.taxonomy(file)
+    return [found.lookup(labels.label_set(), kind) for kind in found.ids]
+
+
+def calibration(folder: Path) -> Reader:
+    """What a network's answers are worth."""
+    folder.mkdir(parents=True)
+    file, n = folder / "calibration.yaml", len(CLASSES)
+    one = label_calibration.Street(
+        "a", np.full((n, n + 1), 7, np.int64), np.full((n, *label_calibration.CELLS), 2, np.int64)
+    )
+    file.write_text(label_calibration.LabelCalibration("urban", CLASSES, (one,), 1.5).to_yaml())
+    label_set = labels.label_set()
+    return Reader(file, lambda: label_calibration.read(file, label_set).log_likelihoods, mutations.text)
+
+
+def run_json(folder: Path) -> Reader:
+    """What a run says of itself, as `calibrate` and the report read it."""
+    from gnss_sem_map.run_json import inputs_of, read_run
+
+    folder.mkdir(parents=True)
+    file = folder / "run.json"
+    about = {
+        "name": "a",
+        "inputs": {"drive": "/d", "segmenter": "none"},
+        "counts": {"scans": 1},
+        "epoch_ns": 0,
+    }
+    file.write_text(json.dumps(about, indent=1))
+    return Reader(file, lambda: (read_run(folder), inputs_of(folder)), mutations.text)
+
+
+def small_map(folder: Path) -> Path:
+    """The folder of a map of some voxels."""
+    from factor_graphs.geodesy import LocalFrame
+    from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack
+
+    rng = np.random.default_rng(0)
+    keys = np.unique(pack(rng.integers(-300, 300, (400, 3))))
+    evidence = -rng.integers(0, 5000, (len(keys), len(CLASSES))).astype(np.int32)
+    voxels = VoxelMap(0.2, labels.label_set(), keys, evidence, np.ones(len(keys), np.uint32))
+    folder.mkdir(parents=True)
+    tiles.write(SemanticMap.of(voxels), folder / "map", LocalFrame(49, 8, 100))
+    return folder / "map"
+
+
+def map_json(folder: Path) -> Reader:
+    """What says which tiles a map has."""
+    where = small_map(folder)
+    return Reader(where / "map.json", lambda: (tiles.read(where), tiles.read_frame(where)), mutations.text)
+
+
+def tile(folder: Path) -> Reader:
+    """A tile whose checksum is right, whatever it holds."""
+    where = small_map(folder)
+    file, about = min(where.glob("*.parquet")), json.loads((where / "map.json").read_text())
+
+    def read() -> object:
+        about["files"][file.name]["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
+        (where / "map.json").write_text(json.dumps(about))
+        return tiles.read(where)
+
+    return Reader(file, read, mutations.parquet)
+
+
+def trajectory(folder: Path) -> Reader:
+    """A saved trajectory with velocities and covariances."""
+    from factor_graphs.trajectory import Trajectory
+
+    folder.mkdir(parents=True)
+    file, k = folder / "trajectory.parquet", 20
+    T = np.tile(np.eye(4), (k, 1, 1))
+    Trajectory(np.arange(k) * 0.1, T, np.zeros((k, 3)), np.tile(np.eye(6), (k, 1, 1))).save(file)
+    return Reader(file, lambda: Trajectory.load(file).at([0.5]), mutations.parquet)
+
+
+def checkpoint(suffix: str, folder: Path) -> Reader:
+    """The weights of a network."""
+    import torch
+    from safetensors.torch import save_file
+
+    from gnss_sem_map.segmentation.checkpoints import read_checkpoint
+
+    folder.mkdir(parents=True)
+    file, tensors = folder / f"network{suffix}", {"a.weight": torch.ones(3, 4), "a.bias": torch.ones(4)}
+    if suffix == ".safetensors":
+        save_file(tensors, file, {"gnss_sem_map": json.dumps({"class_names": ["road"], "scale": 1.0})})
+    else:
+        torch.save(tensors, file)
+    return Reader(file, lambda: read_checkpoint(file), mutations.binary)
+
+
+READERS: dict[str, Callable[[Path], Reader]] = {
+    "oxts row": functools.partial(kitti, "oxts/data/0000000002.txt", mutations.text),
+    "oxts stamps": functools.partial(kitti, "oxts/timestamps.txt", mutations.text),
+    "sweep stamps": functools.partial(kitti, "velodyne_points/timestamps_end.txt", mutations.text),
+    "image stamps": functools.partial(kitti, "image_02/timestamps.txt", mutations.text),
+    "calib_imu_to_velo.txt": functools.partial(kitti, "../calib_imu_to_velo.txt", mutations.text),
+    "calib_velo_to_cam.txt": functools.partial(kitti, "../calib_velo_to_cam.txt", mutations.text),
+    "calib_cam_to_cam.txt": functools.partial(kitti, "../calib_cam_to_cam.txt", mutations.text),
+    "calib.txt": functools.partial(odometry, "calib.txt", mutations.text),
+    "poses.txt": functools.partial(odometry, "poses.txt", mutations.text),
+    "times.txt": functools.partial(odometry, "times.txt", mutations.text),
+    "imu.csv": functools.partial(table, "imu.csv", mutations.text),
+    "gnss.csv": functools.partial(table, "gnss.csv", mutations.text),
+    "log.yaml": functools.partial(table, "log.yaml", mutations.text),
+    "stamps.csv": functools.partial(table, "lidar/stamps.csv", mutations.text),
+    "scan of four columns": functools.partial(kitti, "velodyne_points/data/0000000000.bin", mutations.floats),
+    "scan of five columns": scan,
+    "PNG": functools.partial(picture, ".png", mutations.png),
+    "JPEG": functools.partial(picture, ".jpg", mutations.binary),
+    "label PNG": label_image,
+    "probabilities": probabilities,
+    "point labels": point_labels,
+    "TUM": tum,
+    "settings": settings,
+    "--set": one_setting,
+    "segmenter": segmenter,
+    "class set": functools.partial(shipped, "urban", labels.label_set),
+    "taxonomy": functools.partial(shipped, "cityscapes", _taxonomy),
+    "label calibration": calibration,
+    "run.json": run_json,
+    "map.json": map_json,
+    "tile": tile,
+    "trajectory": trajectory,
+    "safetensors": functools.partial(checkpoint, ".safetensors"),
+    "torch file": functools.partial(checkpoint, ".pt"),
+}

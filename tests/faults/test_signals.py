@@ -1,0 +1,53 @@
+"""Ctrl-C, kill and a closed terminal: one line that says how to go on, 128 and the signal, and nothing left."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+from faults.harness import gnss_sem_map
+from faults.killing import content
+from street import Street
+
+
+def stop(
+    street: Street, number: signal.Signals, after_s: float, folder: Path, *more: str
+) -> tuple[list[str], object]:
+    """Stop a run after some seconds; what is wrong with its end, and how it ended."""
+    labels = f"labels:{street.labels}"
+    words = ("run", street.drive, "--segmenter", labels, "--set", "mapping.scans_per_chunk=1", *more)
+    outcome = gnss_sem_map(*words, "-o", folder / "out", folder=folder / "trial", interrupt=(after_s, number))
+    faults = list(outcome.faults)
+    if outcome.code == 0:
+        return [*faults, *["no result"] * (not (folder / "out/run.json").is_file())], outcome
+    faults += [f"code {outcome.code}"] * (outcome.code != 128 + number)
+    faults += ["a result"] * (folder / "out").exists()
+    beside = {path.name for path in folder.iterdir()} - {"trial"}
+    kept = any(name.endswith("record.json") for name in content(folder / ".out.work"))
+    faults += [f"left {beside}"] * (beside != ({".out.work"} if kept else set()))
+    faults += ["does not name --resume"] * (kept and "--resume" not in outcome.err)
+    faults += ["names --resume, but nothing is kept"] * (not kept and "--resume" in outcome.err)
+    return faults, outcome
+
+
+@pytest.mark.parametrize(
+    ("number", "after_s"),
+    [(signal.SIGINT, 0.3), (signal.SIGTERM, 1.5), (signal.SIGHUP, 3.0), (signal.SIGINT, 4.0)],
+)
+def test_a_signal_is_one_line(small_drive: Street, number, after_s: float, trial, tmp_path: Path) -> None:
+    trial("signals", *stop(small_drive, number, after_s, tmp_path))
+
+
+def test_a_signal_to_all_workers_is_one_line(small_drive: Street, trial, tmp_path: Path) -> None:
+    trial("signals", *stop(small_drive, signal.SIGINT, 5.0, tmp_path, "--workers", "2"))
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_at_any_moment_is_one_line(small_drive: Street, number, trial, tmp_path: Path) -> None:
+    for step in range(12):
+        folder = tmp_path / f"{step}"
+        folder.mkdir()
+        workers = ("--workers", "2") if step % 3 == 2 else ()
+        trial("signals", *stop(small_drive, number, 0.2 + 0.5 * step, folder, *workers))

@@ -27,7 +27,7 @@ WAY_STDDEV_M, TURN_STDDEV_RAD, GROUND_STDDEV_RAD = 0.05, np.radians(0.15), np.ra
 """How well a match knows the way and the turn of a second; and how far roads and loaded vehicles tilt."""
 HEADING_STDDEV_RAD = np.radians(0.5)
 """Of given poses, which say nothing of themselves."""
-SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 4.0
+SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 3.5
 """Differences that are no reason to warn, about x, y and z: good drives reach 2 deg, roads tilt by 2 to 3."""
 SAME_SCALE, WRONG_SCALE = 0.1, 0.25
 SCALES = {

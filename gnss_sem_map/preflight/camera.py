@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from gnss_sem_map.preflight import camera_matrix, camera_pose, image_files, labels
-from gnss_sem_map.preflight.findings import Finding
+from gnss_sem_map.preflight.findings import Finding, Level
 from gnss_sem_map.preflight.sample import Sample
 
 
@@ -14,10 +14,10 @@ def check(sample: Sample) -> Iterator[Finding]:
     log = sample.log
     if not log.images or not log.calibration.has_camera:
         return
-    matrix = camera_matrix.check(log.calibration)
-    yield matrix
-    files = image_files.check(sample)
-    yield from files
-    if not any(finding.mistake for finding in files):
-        yield from camera_pose.check(sample)
+    size, files = image_files.check(sample)
+    matrix = camera_matrix.check(log.calibration, size)
+    yield from (matrix, *files)
+    if any(finding.level is Level.RED for finding in (matrix, *files)):
+        return  # what is wrong there is wrong all over the image
+    yield from camera_pose.check(sample)
     yield from labels.check(sample)

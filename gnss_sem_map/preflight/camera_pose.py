@@ -19,8 +19,9 @@ from gnss_sem_map.preflight.sample import Sample
 Array = NDArray[np.float64]
 NAME = "camera against LiDAR"
 LEAST_VIEWS = 4
-SURE = 4.0
-"""Standard errors of a gain, over the images: a hundred changes are tried, of which chance lifts one by three."""
+SURE, LEAST_BEST = 3.0, 1.25
+"""Standard errors of a gain, over the images, and how strong edges must then be: a hundred changes are tried, of which
+chance lifts one by three standard errors, but to no more than 1.1 (good drives: 1.4 to 1.9)."""
 LEAST_GAIN = 0.05
 """And by this part: gains of 1 to 2 % are of the calibration's last tenth of a degree."""
 LEAST_COMMON, COMMON_SURE = 0.03, 2.5
@@ -68,6 +69,8 @@ class Best:
     family: Family
     value: float
     gains: Array
+    agreement: float = 0.0
+    """Mean strength of the edges so, fine."""
 
     @property
     def gain(self) -> float:
@@ -105,7 +108,8 @@ def best_change(edges: Edges, families: tuple[Family, ...] = FAMILIES) -> Best:
     gains = fine[place] - np.where(
         np.isfinite(given_fine), given_fine, 1.0
     )  # 1: what points anywhere would have
-    return Best(family, float(values[place]), gains[np.isfinite(gains)])
+    reached = float(np.nanmean(fine[place])) if np.isfinite(fine[place]).any() else 0.0
+    return Best(family, float(values[place]), gains[np.isfinite(gains)], reached)
 
 
 def _means(tried: Array, given: Array) -> Array:
@@ -140,7 +144,11 @@ def _pose(sample: Sample, edges: Edges) -> Finding:
             f"T_camera_lidar is {elsewhere[0]}",
             "mend T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
         )
-    is_sure = best.sigmas > SURE and best.gain > LEAST_GAIN * (seen if np.isfinite(seen) else 1.0)
+    is_sure = (
+        best.sigmas > SURE
+        and best.agreement > LEAST_BEST
+        and best.gain > LEAST_GAIN * (seen if np.isfinite(seen) else 1.0)
+    )
     if is_sure and abs(best.value) > best.family.same:
         return _named(
             sample, best, f"{found}, {best.gain:.2f} more with the change (+- {best.gain / best.sigmas:.2f})"
@@ -178,10 +186,11 @@ def _elsewhere(edges: Edges) -> tuple[str, Best] | None:
         tried[f"turned by {quarter} deg about y: the camera looks elsewhere"] = turned
     found = []
     for name, camera in tried.items():
-        gains = edges.with_camera(camera).agreement(UNCHANGED, fine=True) - base
-        found.append((name, Best(TIME, 0.0, gains[np.isfinite(gains)])))
-    best = max(found, key=lambda item: item[1].gain if len(item[1].gains) >= LEAST_VIEWS else -1.0)
-    return best if len(best[1].gains) >= LEAST_VIEWS else None
+        reached = edges.with_camera(camera).agreement(UNCHANGED, fine=True)
+        seen = np.isfinite(reached)
+        if seen.sum() >= LEAST_VIEWS and reached[seen].mean() > LEAST_BEST:
+            found.append((name, Best(TIME, 0.0, (reached - base)[seen], float(reached[seen].mean()))))
+    return max(found, key=lambda item: item[1].gain, default=None)
 
 
 def _named(sample: Sample, best: Best, found: str) -> Finding:

@@ -189,7 +189,7 @@ def edge_strength(image: NDArray[np.uint8]) -> tuple[Strength, Strength]:
     grey = cv2.resize(image[:, :, 1], (width, height), interpolation=cv2.INTER_AREA)
     strength = np.sqrt(np.abs(cv2.Sobel(grey, cv2.CV_32F, 1, 0)))
     around = cv2.GaussianBlur(strength, (0, 0), SURROUNDINGS_PX)
-    return _blurred(strength / (around + 1.0))
+    return _blurred(np.asarray(strength / (around + 1.0), np.float32))
 
 
 def border_strength(classes: NDArray[np.int64], size: tuple[int, int]) -> tuple[Strength, Strength]:
@@ -199,7 +199,7 @@ def border_strength(classes: NDArray[np.int64], size: tuple[int, int]) -> tuple[
     border = np.zeros(classes.shape, np.float32)
     border[:, 1:] = classes[:, 1:] != classes[:, :-1]
     half = cv2.resize(border, (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA)
-    return _blurred(half)
+    return _blurred(np.asarray(half, np.float32))
 
 
 def _blurred(strength: Strength) -> tuple[Strength, Strength]:

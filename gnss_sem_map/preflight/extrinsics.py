@@ -27,7 +27,7 @@ WAY_STDDEV_M, TURN_STDDEV_RAD, GROUND_STDDEV_RAD = 0.05, np.radians(0.15), np.ra
 """How well a match knows the way and the turn of a second; and how far roads and loaded vehicles tilt."""
 HEADING_STDDEV_RAD = np.radians(0.5)
 """Of given poses, which say nothing of themselves."""
-SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 4.0
+SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 3.5
 """Differences that are no reason to warn, about x, y and z: good drives reach 2 deg, roads tilt by 2 to 3."""
 SAME_SCALE, WRONG_SCALE = 0.1, 0.25
 SCALES = {
@@ -157,15 +157,15 @@ def _rotation(
     variances: list[float] = []
     seen = []
     yaw_pitch = np.sqrt(motions.attitude_variances[:, 1:].max(axis=1))
-    for k in np.flatnonzero(moved):
-        way = np.linalg.norm(motions.ways_lidar[k])
+    for k in np.flatnonzero(moved).tolist():
+        way = float(np.linalg.norm(motions.ways_lidar[k]))
         a.append(motions.ways_lidar[k] / max(way, 1e-9))
         b.append(ways[k] / max(np.linalg.norm(ways[k]), 1e-9))
         variances.append((WAY_STDDEV_M / max(way, 1e-9)) ** 2)
     if moved.any():
         seen.append("the way driven")
     turning = np.linalg.norm(motions.turns_imu, axis=1)
-    for k in np.flatnonzero(turning > LEAST_TURN_RAD):
+    for k in np.flatnonzero(turning > LEAST_TURN_RAD).tolist():
         a.append(motions.turns_lidar[k] / max(np.linalg.norm(motions.turns_lidar[k]), 1e-9))
         b.append(motions.turns_imu[k] / turning[k])
         variances.append((TURN_STDDEV_RAD / turning[k]) ** 2)
@@ -255,7 +255,8 @@ def _rotation_finding(
         return green(NAME, "not observable: the vehicle stood, and no ground was seen")
     deg, angle = np.degrees(turn), float(np.linalg.norm(turn))
     found = (
-        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
+        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by"
+        f" {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
         f" about x, y, z (+- {', '.join(f'{v:.1f}' for v in np.degrees(spread))})"
     )
     if (np.abs(turn) <= np.maximum(SAME_RAD, SIGMAS * spread)).all():

@@ -13,12 +13,13 @@ SIZE, CLOCK = "image size", "image stamps"
 LOOKED_AT = 3
 
 
-def check(sample: Sample) -> tuple[Finding, ...]:
-    """A few files, all stamps."""
-    return _size(sample), _clock(sample)
+def check(sample: Sample) -> tuple[tuple[int, int], tuple[Finding, ...]]:
+    """A few files, all stamps; and the (width, height) that the images really have."""
+    size, found = _size(sample)
+    return size, (found, _clock(sample))
 
 
-def _size(sample: Sample) -> Finding:
+def _size(sample: Sample) -> tuple[tuple[int, int], Finding]:
     log = sample.log
     size = log.calibration.image_size
     assert size is not None
@@ -33,7 +34,7 @@ def _size(sample: Sample) -> Finding:
     if wrong is not None:
         width, height = wrong.found
         ratio = width / size[0]
-        return red(
+        return wrong.found, red(
             SIZE,
             f"images are {width} x {height}, the calibration is of {size[0]} x {size[1]} pixels",
             f"the calibration's image size (S_rect, image_size) is {1 / ratio:.3g} times that of the images:"
@@ -41,11 +42,11 @@ def _size(sample: Sample) -> Finding:
             f"set S_rect_02 or image_size to {width} {height}, or give the images that were calibrated",
         )
     if errors:
-        return (red if len(errors) == len(images) else amber)(
+        return size, (red if len(errors) == len(images) else amber)(
             SIZE, f"{len(errors)} of {len(images)} images cannot be read: {errors[0]}", "image files are damaged",
             "copy the images again",
         )  # fmt: skip
-    return green(SIZE, f"{size[0]} x {size[1]} pixels")
+    return size, green(SIZE, f"{size[0]} x {size[1]} pixels")
 
 
 def _clock(sample: Sample) -> Finding:
@@ -62,14 +63,15 @@ def _clock(sample: Sample) -> Finding:
     )
     share = float((nearest <= settings.image_within_s + abs(exposed[0] - log.images[0].stamp)).mean())
     found = (
-        f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s; images are of {exposed[0]:.1f} to"
-        f" {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"
+        f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s;"
+        f" images are of {exposed[0]:.1f} to {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"
     )
     overlap = min(exposed[-1], scans[-1]) - max(exposed[0], scans[0])
     shorter = min(np.ptp(exposed), np.ptp(scans))
     if share == 0.0 or overlap < 0.5 * shorter:
         return red(
-            CLOCK, found, f"image stamps are of another clock, about {exposed[0] - scans[0]:+.1f} s off, or of another drive",
+            CLOCK, found,
+            f"image stamps are of another clock, about {exposed[0] - scans[0]:+.1f} s off, or of another drive",
             "give all stamps on one clock",
         )  # fmt: skip
     inside = (scans >= exposed[0] - 0.1) & (scans <= exposed[-1] + 0.1)

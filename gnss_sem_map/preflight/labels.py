@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.preflight.camera_pose import LEAST_VIEWS, SURE, TURNS, best_change, in_errors
+from gnss_sem_map.preflight.camera_pose import LEAST_BEST, LEAST_VIEWS, SURE, TURNS, best_change, in_errors
 from gnss_sem_map.preflight.depth_edges import Edges, View, border_strength
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.sample import Sample
@@ -46,18 +46,14 @@ def check(sample: Sample) -> Iterator[Finding]:
         seen.append(classes)
         coarse, fine = border_strength(classes, size)
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
-    if not seen:
-        why = f": {errors[0]}" if errors else ""
-        yield (
-            (amber if errors else green)(
-                NAME,
-                f"none of {len(errors)} frames looked at has labels{why}",
-                "labels are of other frames",
-                "check the numbers in their names",
-            )
-            if errors
-            else green(NAME, "not observable: no frame was looked at")
+    if not seen and errors:
+        yield amber(
+            NAME,
+            f"none of {len(errors)} frames looked at has labels that can be read: {errors[0]}",
+            "labels are of other frames, or damaged",
+            "check the frame numbers in the names of the label files",
         )
+    if not seen:
         return
     content = _content(seen, segmenter.class_names)
     yield content
@@ -111,6 +107,7 @@ def _place(sample: Sample, edges: Edges) -> Finding:
     best = best_change(edges, TURNS[:2])
     if (
         best.sigmas > SURE
+        and best.agreement > LEAST_BEST
         and abs(best.value) > 2 * best.family.same
         and best.gain > 2 * max(common.mean(), 0.0)
     ):
@@ -120,8 +117,8 @@ def _place(sample: Sample, edges: Edges) -> Finding:
         return red(
             PLACE,
             found,
-            f"labels are shifted by about {pixels:.0f} pixels {'to the side' if best.family is TURNS[0] else 'up or down'}"
-            " against the images",
+            f"labels are shifted by about {pixels:.0f} pixels"
+            f" {'to the side' if best.family is TURNS[0] else 'up or down'} against the images",
             "make labels of the whole rectified images",
         )
     if common.mean() < LEAST_COMMON or in_errors(common) < 2.0:

@@ -197,9 +197,9 @@ def thinned(points: Points, stamp: float) -> Sweep | None:
     )
 
 
-def turns(p: Array) -> Array:
+def turns(p: NDArray[np.floating]) -> Array:
     """How far a clockwise scanner had turned at each point (n, 3): -0.5 and 0.5 at the rear, 0 in front."""
-    return -np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi)
+    return np.asarray(-np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi), np.float64)
 
 
 def _normals(p: Array) -> Array:

@@ -27,10 +27,10 @@ from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
 """Of a longer drive so much is smoothed, and looked at closely."""
-SCANS_PER_STRETCH, MOST_STRETCHES = 40, 6
+SCANS_PER_STRETCH, MOST_STRETCHES = 40, 5
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
-SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 6, 10
+SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12
 LEAST_WAY_M = 5.0
 """Images of places so far apart are different."""
 UNMATCHED = "its sweeps cannot be laid onto each other"
@@ -116,7 +116,7 @@ class Sample:
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
             return {}
-        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 2, MOST_STRETCHES))
+        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 3, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
         found: dict[float, Stretch | str] = {}
@@ -228,14 +228,14 @@ class Sample:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the vehicle is elsewhere at the first and the last scan that is looked at, by more than a few metres."""
+        """Whether the first and the last scan that are looked at see different places."""
         scans = self._moving_scans
         if self.trajectory is None or len(scans) < 2:
             return False
         return _way(*self.trajectory.at([scans[0].stamp, scans[-1].stamp], EXTRAPOLATE_S)) > LEAST_WAY_M
 
     def _starts(self, first: int) -> tuple[Array, ...]:
-        """Where the second sweep may be by the trajectory, T_first_second: straight ahead, and as the extrinsics say."""
+        """T_first_second of the second sweep by the trajectory: as the extrinsics say, and straight ahead."""
         track, stamps = self.trajectory, [scan.stamp for scan in self.log.scans[first : first + 2]]
         if track is None:
             return ()

@@ -1,4 +1,4 @@
-"""When sweeps began and ended: about as long as the time to the next, one after the other, their stamp in the middle."""
+"""When sweeps began and ended: one after the other, as long as the time to the next, their stamp in the middle."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def check(sample: Sample) -> Iterator[Finding]:
         yield red(
             NAME,
             f"{backwards} of {len(scans) + backwards} sweeps end before they start, and are left out",
-            "a lost line in timestamps_start.txt (or one too many in timestamps_end.txt): a sweep has the start of another",
+            "a lost line in timestamps_start.txt (or one too many in timestamps_end.txt)",
             "restore timestamps_start.txt of velodyne_points: line k belongs to frame k",
         )
         return
@@ -74,7 +74,8 @@ def _spans(stamps: Array, spans: Array, interval: float) -> Finding:
     if abs(shift) > 0.5:
         lines = max(1, round(abs(shift)))
         what = f"{lines} lost line{'s' if lines > 1 else ''}" if shift > 0 else "a line too many"
-        mistake = f"{what} in timestamps{name}.txt: each sweep has the stamp of one {'after' if shift > 0 else 'before'} it"
+        which = "after" if shift > 0 else "before"
+        mistake = f"{what} in timestamps{name}.txt: each sweep has the stamp of one {which} it"
         remedy = f"restore timestamps{name}.txt of velodyne_points: line k belongs to frame k"
     else:
         mistake = "start, middle and end of the sweeps do not belong together"

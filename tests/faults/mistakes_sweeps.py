@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 Inject = Callable[[Path], None]
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # files
 
 
@@ -36,7 +35,7 @@ def _change_rows(path: Path, change: Callable[[dict[str, Array]], dict[str, Arra
     """Change the numbers of a calibration file of KITTI."""
     rows = _rows(path)
     numbers = {name: np.array(row.split(), np.float64) for name, row in rows.items() if name != "calib_time"}
-    changed = change({k: v for k, v in numbers.items()})
+    changed = change(numbers)
     rows |= {name: " ".join(f"{v:.12e}" for v in np.ravel(row)) for name, row in changed.items()}
     path.write_text("".join(f"{name}: {row}\n" for name, row in rows.items()))
 
@@ -72,7 +71,6 @@ def _change_stamps(path: Path, by_s: float) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # mounting of the LiDAR
 
 
@@ -116,7 +114,6 @@ def scaled_lidar(factor: float) -> Inject:
     return inject
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # sweeps
 
 
@@ -202,7 +199,6 @@ def changed_Tr(change: Callable[[Array], Array]) -> Inject:
     return inject
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # camera
 
 
@@ -301,7 +297,6 @@ def late_images(by_s: float) -> Inject:
     return inject
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # labels: `inject` changes a folder of labels
 
 
@@ -428,9 +423,10 @@ def _camera() -> list[Mistake]:
 
 
 MISTAKES = [*_lidar(), *_camera()]
+OFF = ("shifted", "another drive", "other frames")
 LABEL_MISTAKES = [
     Mistake("all-zero labels", "labels", zero_labels, ("zero", "one class", "no class")),
     Mistake("labels ten frames on", "labels", other_frames(10), ("other frames", "another drive")),
-    Mistake("labels shifted by 20 pixels", "labels", shifted_labels(20), ("shifted", "another drive", "other frames")),
-    Mistake("labels shifted by -40 pixels", "labels", shifted_labels(-40), ("shifted", "another drive", "other frames")),
+    Mistake("labels shifted by 20 pixels", "labels", shifted_labels(20), OFF),
+    Mistake("labels shifted by -40 pixels", "labels", shifted_labels(-40), OFF),
 ]  # fmt: skip

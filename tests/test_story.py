@@ -198,7 +198,7 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
         (("run", "DRIVE", "-o", "out", "--segmenter", "lables:x"), 1, "did you mean 'labels'?"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "labels:nowhere"), 1, "nowhere"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "none", "--frames", "100:200"), 1, "none of 0 scans can be used"),
-        (("run", "DRIVE", "-o", "DRIVE"), 1, "exists and is no run folder"),
+        (("run", "DRIVE", "-o", "DRIVE"), 1, "which is read; choose another -o"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_answered_in_one_line(

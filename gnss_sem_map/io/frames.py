@@ -82,7 +82,7 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
             )
         if size > 4 * columns * MOST_POINTS:
             raise DataError(
-                f"{shown(path)}: found {size} bytes, expected at most {MOST_POINTS} points; is it a scan?"
+                f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
             )
         try:
             rows = np.empty((size // (4 * columns), columns), "<f4")

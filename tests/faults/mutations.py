@@ -18,7 +18,8 @@ NUMBERS = [
 ]  # fmt: skip
 PIECES = [
     "", "\n", "\n\n", " ", "\t", ",", ":", "- ", "[", "]", "{", "}", "{" * 200, "[" * 2000, "&a ", "*a ", "<<: *a",
-    "!!", "!!python/object:os.system ", "!!binary ", "!!set ", "!!timestamp 1", "? ", "| ", "%YAML 9", "---\n", "...\n", "#",
+    "!!",
+    "!!python/object:os.system ", "!!binary ", "!!set ", "!!timestamp 1", "? ", "| ", "%YAML 9", "---\n", "...\n", "#",
     "\x00", "\x07", "\ufeff", "\u2028", "é", "\ud7ff", "x" * 300_000, "1," * 20_000, "\\", "\r\n", "@", "`", "=", "é:",
     "../", "/dev/zero", "python:os:system", "a: &a [*a]\n", "NaN", "Infinity", '"\\ud800"', "-",
 ]  # fmt: skip

@@ -104,8 +104,8 @@ def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
     share = float(out.any(axis=1).mean())
     if share > NO_POINTS:
         raise DataError(
-            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within {NEAREST_M:g} m of"
-            " zero, expected metres; are these other bytes, another count of columns, or mm?"
+            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
+            f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
         )
 
 

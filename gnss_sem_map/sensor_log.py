@@ -137,7 +137,8 @@ def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], (0, 0, 0, 1)):
         return False
     R = T[:3, :3]
-    return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
+    with np.errstate(all="ignore"):  # of numbers that are no rotation's
+        return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
 
 
 @dataclass(frozen=True)

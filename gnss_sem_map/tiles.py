@@ -186,7 +186,7 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
 def _column(table: Any, name: str) -> NDArray[Any]:
     """A column as numbers without gaps; raises ValueError for anything else."""
     values: NDArray[Any] = table[name].to_numpy()
-    if table[name].null_count or values.dtype.kind not in "iuf":
+    if table[name].null_count or values.dtype.kind not in ("f" if name == "confidence" else "iu"):
         raise ValueError(f"column {name} is {values.dtype} with {table[name].null_count} gaps")
     return values
 

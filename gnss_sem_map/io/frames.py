@@ -82,7 +82,7 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
             )
         if size > 4 * columns * MOST_POINTS:
             raise DataError(
-                f"{shown(path)}: found {size} bytes, expected at most {MOST_POINTS} points; is it a scan?"
+                f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
             )
         try:
             rows = np.empty((size // (4 * columns), columns), "<f4")
@@ -104,8 +104,8 @@ def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
     share = float(out.any(axis=1).mean())
     if share > NO_POINTS:
         raise DataError(
-            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within {NEAREST_M:g} m of"
-            " zero, expected metres; are these other bytes, another count of columns, or mm?"
+            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
+            f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
         )
 
 

@@ -54,7 +54,7 @@ def transform(R: Array, t: Array, where: str) -> Array:
 
 def rotation_fault(R: Array) -> str:
     """What is wrong with a matrix (3, 3) that is no rotation, in a few words."""
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(R))
         scale = float(np.cbrt(determinant))
         if determinant < 0 and np.allclose(R @ R.T, np.eye(3), atol=1e-3):

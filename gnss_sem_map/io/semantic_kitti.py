@@ -110,7 +110,7 @@ def _poses(path: Path) -> Array:
     """Poses (k, 3, 4); raises DataError, with the line, for one that is no rigid transform."""
     poses = _table(path, 12).reshape(-1, 3, 4)
     R = poses[:, :, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
         wrong = ~(off <= SIX_DIGITS) | ~(np.linalg.det(R) > 0)
     if wrong.any():

@@ -251,7 +251,8 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.Sta
         rows = frames.read_points(path, 4, state)
         return Points(rows[:, :3], rows[:, 3], None)
     rows = frames.read_points(path, 5, state)
-    after = rows[:, 4].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of NaN that signal
+        after = rows[:, 4].astype(np.float64)
     _leave_out_of_sweep(rows, after, shown(path))
     return Points(rows[:, :3], rows[:, 3], stamp + after)
 

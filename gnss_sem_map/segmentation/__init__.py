@@ -50,6 +50,7 @@ SCHEMES = {
 }
 """How a segmenter is asked for, by the word before the colon."""
 
+LONGEST_SPEC = 1000
 
 DEMO_NETWORK = Path(__file__).parent / "demo_network" / "network.safetensors"
 """Trained on simulated streets; its README says how, and how well."""
@@ -129,6 +130,10 @@ def open_segmenter(
 
 
 def _parse(spec: str) -> tuple[str, str, dict[str, str]]:
+    if len(spec) > LONGEST_SPEC:
+        raise ConfigError(
+            f"segmenter {spec[:100]!r}: found {len(spec)} characters, expected at most {LONGEST_SPEC}"
+        )
     scheme, colon, rest = spec.partition(":")
     place, mark, query = rest.partition("?")
     options = dict(parse_qsl(query, keep_blank_values=True))

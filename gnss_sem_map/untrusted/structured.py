@@ -17,9 +17,9 @@ import yaml
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.untrusted.files import read_text, shown
 
-MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 50_000
+MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 20_000
 MOST_JSON_BYTES = 64 << 20
-MOST_NODES = 500_000
+MOST_NODES = 200_000
 DEEPEST = 30
 MOST_DIGITS = 40
 

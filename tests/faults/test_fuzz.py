@@ -13,10 +13,8 @@ QUICK, WHOLE = 40, 2000
 
 def _check(name: str, first: int, count: int, trial, folder: Path) -> None:
     report = fuzz(READERS[name], name, first, count, folder)
-    # a line of a table, where pytest shows output (-s)
-    print(
-        f"\n| {name} | {report.inputs} | {report.refused} | {report.slowest_s:.2f} s | {report.peak_mb:.0f} MB |"
-    )
+    figures = f"{report.inputs} | {report.refused} | {report.slowest_s:.2f} s | {report.peak_mb:.0f} MB"
+    print(f"\n| {name} | {figures} |")  # noqa: T201 (a table, where pytest shows output: -s)
     trial("fuzzing", report.faults[:10])
 
 

@@ -204,7 +204,7 @@ def test_a_drive_without_any_fix_says_so(copies, trial) -> None:
         cells = path.read_text().split()
         cells[23] = "-1"
         path.write_text(" ".join(cells))
-    with pytest.raises(SemMapError, match="not one of .* rows is a fix; found .* standard deviation"):
+    with pytest.raises(SemMapError, match=r"not one of .* rows is a fix; found .* standard deviation"):
         open_drive(copies["kitti"])
     trial("GNSS")
 

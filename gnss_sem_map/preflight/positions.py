@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes
+from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.preflight import poses
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
@@ -51,7 +52,11 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield _accuracy(log, log.gnss)
     if sample.diagnosis is not None:
         yield _clock(sample.diagnosis)
-    yield from check_lever_arm(log.calibration.p_imu_antenna, sample.diagnosis, found.usable)
+    smoother: SmootherSettings = sample.settings.trajectory
+    if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
+        smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
+    lever = log.calibration.p_imu_antenna
+    yield from check_lever_arm(lever, sample.diagnosis, found.usable, log.frame, smoother)
 
 
 def _place(fixes: GnssFixes, frame: LocalFrame, found: Fixes) -> Iterator[Finding]:

@@ -71,7 +71,8 @@ def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j)
         at_best = int(np.argmin(rests * turns))
         return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
 
-    coarse: Array = np.arange(-round(farthest / COARSE_S), round(farthest / COARSE_S) + 1) * COARSE_S
+    count = round(farthest / COARSE_S)
+    coarse = np.linspace(-count, count, 2 * count + 1) * COARSE_S
     scores = likelihoods(coarse)
     best = float(coarse[int(np.argmax(scores))])
     fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)

@@ -55,39 +55,25 @@ def windows_of(fixes: GnssFixes, start: float, end: float) -> Windows | None:
     return Windows(stamps, places, counts, basis)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Agreement:
-    """How well the two ways agree: sums of squares, m², before and after the IMU's way is taken off."""
+    """What the IMU's way leaves unexplained: a sum of squares, m², of so many independent errors."""
 
-    total: float
     rest: float
-    scales: Complex
-    """(w,) by how much, and by which heading, each window's way was turned."""
-    weights: Array
-    """(w,) m², how much way each had to compare."""
     independent: float
-    """How many independent errors the windows hold."""
-
-    @property
-    def explained(self) -> float:
-        """Share of what the fixes do beside a parabola that the IMU's way explains."""
-        return 1.0 - self.rest / max(self.total, 1e-12)
 
 
 def agreement(windows: Windows, stamps: Array, way: Complex, lag_s: float = 0.0) -> Agreement:
-    """The fixes, taken `lag_s` later than stamped, against a way (n,) m at its stamps."""
-    x, y = (
-        beside_parabola(windows, values)
-        for values in (complex_at(windows, stamps, way, lag_s), windows.places)
-    )
+    """The fixes, taken `lag_s` later than stamped, against a way (n,) m at its stamps, turned and scaled to fit."""
+    x = _beside_parabola(windows, _at(windows, stamps, way, lag_s))
+    y = _beside_parabola(windows, windows.places)
     power = np.sum(np.abs(x) ** 2, axis=1)
     scales = np.sum(np.conj(x) * y, axis=1) / np.maximum(power, 1e-12)
     errors = y - scales[:, None] * x
-    rest = float(np.sum(np.abs(errors) ** 2))
-    return Agreement(float(np.sum(np.abs(y) ** 2)), rest, scales, power, independent_errors(windows, errors))
+    return Agreement(float(np.sum(np.abs(errors) ** 2)), _independent_errors(windows, errors))
 
 
-def independent_errors(windows: Windows, errors: Complex) -> float:
+def _independent_errors(windows: Windows, errors: Complex) -> float:
     """How many independent errors (w, k) are, by how alike neighbours are; windows overlap by a half."""
     rest = float(np.sum(np.abs(errors) ** 2))
     alike = float(np.sum(errors[:, 1:] * np.conj(errors[:, :-1])).real) / max(rest, 1e-12)
@@ -97,14 +83,14 @@ def independent_errors(windows: Windows, errors: Complex) -> float:
     return free / (2.0 if len(errors) > 1 else 1.0)
 
 
-def complex_at(windows: Windows, stamps: Array, way: Complex, lag_s: float) -> Complex:
+def _at(windows: Windows, stamps: Array, way: Complex, lag_s: float) -> Complex:
     """A way (n,) at the stamps of the fixes, (w, k), zero where there is none."""
     wanted = (windows.stamps + lag_s).ravel()
     went = np.interp(wanted, stamps, way.real) + 1j * np.interp(wanted, stamps, way.imag)
     return np.asarray(went.reshape(windows.stamps.shape) * windows.counts)
 
 
-def beside_parabola(windows: Windows, values: Complex) -> Complex:
+def _beside_parabola(windows: Windows, values: Complex) -> Complex:
     """What is left of (w, k) values when each window's best parabola is taken off."""
     parts = np.einsum("wkp,wk->wp", windows.basis, values)
     return np.asarray(values - np.einsum("wkp,wp->wk", windows.basis, parts))

@@ -71,6 +71,7 @@ def _spikes(fixes: GnssFixes) -> Mask:
     limit = HARD_BRAKING * pause**2 + SPIKE * float(np.median(off))
     padded = np.pad(off, 1)
     out[1:-1] = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
+    out[[0, -1]] = out[[1, -2]]  # at an end it may be either of two
     return out
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes
+from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.preflight import poses
 from gnss_sem_map.preflight.diagnosis import Diagnosis
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
@@ -32,6 +33,8 @@ SCATTER_RATIO, SCATTER_M = 5.0, 0.1
 THIRD_DIFFERENCE, MAD = np.sqrt(20.0), 1.4826
 # A lag is told of from the first, s, and makes a wrong map when it moves the vehicle by the second, m.
 NOTABLE_LAG_S, WRONG_LAG_M = 0.25, 2.0
+# What stops a run is surer than what is told: twice the logarithm of the likelihood.
+FIVE_SIGMA = 25.0
 # At a constant speed an antenna ahead is a clock that is early: up to here, m, it may be either.
 LEVER_ARM_M = 5.0
 
@@ -51,7 +54,11 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield _accuracy(log, log.gnss)
     if sample.diagnosis is not None:
         yield _clock(sample.diagnosis)
-    yield from check_lever_arm(log.calibration.p_imu_antenna, sample.diagnosis, found.usable)
+    smoother: SmootherSettings = sample.settings.trajectory
+    if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
+        smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
+    lever = log.calibration.p_imu_antenna
+    yield from check_lever_arm(lever, sample.diagnosis, found.usable, log.frame, smoother)
 
 
 def _place(fixes: GnssFixes, frame: LocalFrame, found: Fixes) -> Iterator[Finding]:
@@ -165,7 +172,7 @@ def _clock(diagnosis: Diagnosis) -> Finding:
         return green("GNSS clock", seen or "not observable: too little speeding up and turning")
     fast = float(np.quantile(track.speeds, 0.9)) if track is not None and len(track.speeds) else 0.0
     late = "late" if lag.seconds < 0 else "early"
-    level = red if fast * abs(lag.seconds) > WRONG_LAG_M else amber
+    level = red if fast * abs(lag.seconds) > WRONG_LAG_M and lag.gain > FIVE_SIGMA else amber
     usual = (
         float(np.median(track.speeds[track.is_moving]))
         if track is not None and track.is_moving.any()

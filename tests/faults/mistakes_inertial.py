@@ -76,7 +76,7 @@ def _in_millimetres(places: Array) -> Array:
 PLACES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "latitude and longitude swapped": (_swapped, ("swapped",)),
     "latitude and longitude in radians": (_in_radians, RADIANS),
-    "altitude in mm": (_in_millimetres, ("altitude",)),
+    "altitude in mm": (_in_millimetres, ("altitude", "no place on earth", "metres of wgs 84")),
 }
 
 LATE_S = (0.5, 1.0, 2.0, -0.5, -1.0)
@@ -104,7 +104,10 @@ def _mistakes() -> Iterator[Mistake]:
         name, says = f"GNSS frozen for {seconds:g} s", ("frozen",)
         yield Mistake(name, "kitti-raw", partial(_frozen_oxts, seconds), says)
         yield Mistake(name, "table", partial(_gnss_table, partial(_frozen_table, seconds)), says)
-    for factor, says in ((0.01, ("standard deviations",)), (-1.0, ("accuracy", "negative"))):
+    for factor, says in (
+        (0.01, ("standard deviations",)),
+        (-1.0, ("accuracy", "negative", "standard deviat")),
+    ):
         name = f"standard deviations times {factor:g}"
         yield Mistake(name, "kitti-raw", partial(_oxts, change=partial(_accuracy_column, factor)), says)
         yield Mistake(name, "table", partial(_gnss_table, partial(_stddevs_of_table, factor)), says)

@@ -125,9 +125,8 @@ def test_a_compensated_scan_stays_so(log: SensorLog) -> None:
 
 
 def test_log_yaml_says_the_same_in_flat_keys(tmp_path: Path) -> None:
-    (tmp_path / "imu.csv").write_text(
-        "stamp_s,ax,ay,az,wx,wy,wz\n0,0,0,-1,1,2,3\n1,0,0,-1,1,2,3\n2,0,0,-1,1,2,3\n"
-    )
+    rows = "".join(f"{0.1 * k:.1f},0,0,-1,1,2,3\n" for k in range(3))
+    (tmp_path / "imu.csv").write_text("stamp_s,ax,ay,az,wx,wy,wz\n" + rows)
     rows = "".join(f"{k},49,8.{k},100,1,1,1\n" for k in range(3))
     (tmp_path / "gnss.csv").write_text("stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m\n" + rows)
     (tmp_path / "log.yaml").write_text("imu_axes: frd\nforce_unit: g\nrate_unit: deg/s\n")

@@ -18,10 +18,13 @@ from gnss_sem_map.preflight.sample import Sample
 
 Array = NDArray[np.float64]
 NAME = "camera against LiDAR"
-LEAST_VIEWS = 4
+LEAST_VIEWS, LEAST_EDGES = 4, 150
+"""Depth edges of a sweep, all around: with fewer an image shows a handful (town: 400 to 800)."""
 SURE, LEAST_BEST = 3.0, 1.25
 """Standard errors of a gain, over the images, and how strong edges must then be: a hundred changes are tried, of which
 chance lifts one by three standard errors, but to no more than 1.1 (good drives: 1.4 to 1.9)."""
+FAR_DEG, FINE_NOISE = 3.5, 1.5
+"""Turned so far, edges agree by chance only; and by how much more finer edges scatter than coarse ones."""
 LEAST_GAIN = 0.05
 """And by this part: gains of 1 to 2 % are of the calibration's last tenth of a degree."""
 LEAST_COMMON, COMMON_SURE = 0.03, 2.5
@@ -71,6 +74,8 @@ class Best:
     gains: Array
     agreement: float = 0.0
     """Mean strength of the edges so, fine."""
+    noise: float = np.inf
+    """Standard deviation of a gain in one image by chance, from changes that are far off."""
 
     @property
     def gain(self) -> float:
@@ -79,8 +84,13 @@ class Best:
 
     @property
     def sigmas(self) -> float:
-        """The gain in standard errors; 0 where too few images tell."""
-        return in_errors(self.gains)
+        """The gain in standard errors, of its scatter or of chance; 0 where too few images tell.
+
+        A wrong time moves the edges of near things in fast images most: such gains scatter, and are sure all the same.
+        """
+        if len(self.gains) < LEAST_VIEWS:
+            return 0.0
+        return max(in_errors(self.gains), self.gain / self.noise * float(np.sqrt(len(self.gains))))
 
 
 def in_errors(gains: Array) -> float:
@@ -94,9 +104,11 @@ def in_errors(gains: Array) -> float:
 def best_change(edges: Edges, families: tuple[Family, ...] = FAMILIES) -> Best:
     """The change of all families that makes edges agree best: coarse over the whole reach, then fine around it."""
     given = edges.agreement()
-    found = []
+    found, noise = [], np.inf
     for family in families:
         tried = np.array([edges.agreement(family.of(value)) for value in family.reach])
+        if family is TURNS[0]:
+            noise = _noise(tried[np.abs(family.reach) > FAR_DEG])
         means = _means(tried, given)
         found.append((float(means.max()), family, family.reach[int(means.argmax())]))
     _, family, value = max(found, key=lambda item: item[0])
@@ -109,7 +121,13 @@ def best_change(edges: Edges, families: tuple[Family, ...] = FAMILIES) -> Best:
         np.isfinite(given_fine), given_fine, 1.0
     )  # 1: what points anywhere would have
     reached = float(np.nanmean(fine[place])) if np.isfinite(fine[place]).any() else 0.0
-    return Best(family, float(values[place]), gains[np.isfinite(gains)], reached)
+    return Best(family, float(values[place]), gains[np.isfinite(gains)], reached, noise)
+
+
+def _noise(tried: Array) -> float:
+    """Of the difference of two agreements of one image: those of changes that are far off (n, k), less their mean."""
+    seen = tried[np.isfinite(tried)]
+    return FINE_NOISE * float(np.sqrt(2.0) * seen.std()) if len(seen) > LEAST_VIEWS else float("inf")
 
 
 def _means(tried: Array, given: Array) -> Array:
@@ -125,6 +143,9 @@ def check(sample: Sample) -> Iterator[Finding]:
     edges = sample.edges
     if edges is None or len(edges.views) < LEAST_VIEWS:
         yield green(NAME, "not observable: too few scans with an image and depth edges (points ring by ring)")
+        return
+    if np.median([len(view.p_map) for view in edges.views]) < LEAST_EDGES:
+        yield green(NAME, "not observable: too few depth edges (points ring by ring)")
         return
     yield _pose(sample, edges)
 

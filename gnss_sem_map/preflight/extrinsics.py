@@ -72,7 +72,7 @@ def check(sample: Sample) -> Iterator[Finding]:
         return
     trajectory = sample.trajectory
     if trajectory is None or not sample.stretches:
-        why = "no trajectory of the sample" if trajectory is None else "no scans in a row could be matched"
+        why = "no trajectory of the sample" if trajectory is None else "no scans in a row tell their motion"
         yield green(NAME, f"not observable: {why}")
         return
     motions = _motions(sample, sample.stretches)

@@ -36,6 +36,8 @@ FIRST_M, NEXT_M, AGAIN_M = (3.0, 2.0, 1.0, 0.5), (2.0, 1.0, 0.5, 0.3), (0.5, 0.3
 SOFT_M = 0.05
 """Residuals beyond this count less (Huber)."""
 LOST_M = 0.3
+LEAST_HELD = 0.01
+"""A motion is known along a direction that so much of the points' weight holds."""
 LEAST_SHARE = 0.35
 """A match is believed when so many of its points lie on a surface of the other sweep (good ones: 0.5 to 0.9)."""
 EVERY = 4
@@ -79,6 +81,8 @@ class Stretch:
 
     sweeps: tuple[Sweep, ...]
     T: Array
+    is_held: bool
+    """Whether the scene tells the motion in all directions."""
 
     @property
     def stamps(self) -> Array:
@@ -117,6 +121,8 @@ class Match:
     share: float
     off: float
     """Mean squared distance of all points from the surfaces, m², none counted farther than `LOST_M`."""
+    held: float
+    """Part of the points' weight that holds the least held direction: 0 in a street of smooth walls."""
 
 
 class Target:
@@ -127,7 +133,7 @@ class Target:
 
     def match(self, p: Array, guess: Array, steps_m: tuple[float, ...]) -> Match | None:
         """The points (m, 3) of another sweep laid onto this one; None where too few find a surface."""
-        T, share, off = guess, 0.0, 0.0
+        T, share, off, held = guess, 0.0, 0.0, 0.0
         for within_m in steps_m:
             moved = p @ T[:3, :3].T + T[:3, 3]
             places, squares = (np.asarray(a) for a in self._tree.batch_nearest_neighbor_search(moved))
@@ -142,7 +148,10 @@ class Target:
             weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(residuals), 1e-9))[:, None]
             # a little weight on the guess: along an open street nothing holds, and nothing may run away
             T = _exp(-np.linalg.solve(J.T @ weighted + 0.1 * np.eye(6), weighted.T @ residuals)) @ T
-        return Match(T, share, off)
+            H = J.T @ weighted
+            along = H[3:, 3:] - H[3:, :3] @ np.linalg.lstsq(H[:3, :3], H[:3, 3:], rcond=None)[0]
+            held = float(np.linalg.eigvalsh(along)[0] / len(use))
+        return Match(T, share, off, held)
 
 
 def stretch(scans: tuple[Scan, ...], first: int, starts: tuple[Array, ...] = ()) -> Stretch | None:
@@ -158,6 +167,7 @@ def stretch(scans: tuple[Scan, ...], first: int, starts: tuple[Array, ...] = ())
         if sweep is None:
             return None
         sweeps.append(sweep)
+    holds: list[float] = []
     target, T, rates = Target(sweeps[0].p_lidar, sweeps[0].normals), [np.eye(4)], None
     for k in range(1, len(sweeps)):
         step_s = sweeps[k].stamp - sweeps[k - 1].stamp
@@ -170,7 +180,8 @@ def stretch(scans: tuple[Scan, ...], first: int, starts: tuple[Array, ...] = ())
             return None
         rates = _rates(inverse(T[-1]) @ found.T, step_s)
         T.append(found.T)
-    return Stretch(tuple(sweeps), np.array(T))
+        holds.append(found.held)
+    return Stretch(tuple(sweeps), np.array(T), min(holds) > LEAST_HELD)
 
 
 def thinned(points: Points, stamp: float) -> Sweep | None:

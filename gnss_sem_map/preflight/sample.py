@@ -107,7 +107,7 @@ class Sample:
     @property
     def stretches(self) -> tuple[Stretch, ...]:
         """A few seconds of the drive, as the LiDAR saw its own motion, where the vehicle moves most."""
-        return tuple(seen for seen in self.tried.values() if isinstance(seen, Stretch))
+        return tuple(seen for seen in self.tried.values() if isinstance(seen, Stretch) and seen.is_held)
 
     @cached_property
     def tried(self) -> dict[float, Stretch | str]:

@@ -28,10 +28,9 @@ def _scans(sample: Sample) -> Iterator[Finding]:
         yield green(SCANS, "not observable: no ten scans in a row")
         return
     unreadable = [why for why in tried.values() if isinstance(why, str) and why != UNMATCHED]
+    fit = sum(not isinstance(seen, str) for seen in tried.values())
     unmatched = [why for why in tried.values() if why == UNMATCHED]
-    found = (
-        f"{len(sample.stretches)} of {len(tried)} stretches of a second have scans that fit onto each other"
-    )
+    found = f"{fit} of {len(tried)} stretches of a second have scans that fit onto each other"
     if unreadable:
         yield (red if len(unreadable) > len(tried) / 2 else amber)(
             SCANS,

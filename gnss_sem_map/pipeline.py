@@ -26,7 +26,6 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels, preflight
 from gnss_sem_map.account import Account, Progress, silent
-from gnss_sem_map.camera_check import check_projection, check_stamps
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import answers_fingerprint, build_maps
@@ -91,7 +90,9 @@ def run(
     """
     log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
-    _refuse_early(log, segmenter, settings)
+    label_calibration.opened(
+        settings.calibration, labels.label_set(settings.classes)
+    )  # of other classes: refused now
     page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
@@ -133,19 +134,11 @@ def check_drive(
 ) -> Preflight:
     """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
     with account.stage("preflight"):
-        page = preflight.check(log, settings, segmenter)
+        page = preflight.check(log, settings, segmenter, with_camera=segmenter is not None)
     if page.level is Level.RED and not force:
         raise PreflightError(log.name, page)
     account.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
     return page
-
-
-def _refuse_early(log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
-    """Say before hours are spent what cannot end well: calibrated for other classes, a camera or a clock elsewhere."""
-    label_calibration.opened(settings.calibration, labels.label_set(settings.classes))
-    if segmenter is not None and log.images and log.calibration.has_camera:
-        check_projection(log)
-        check_stamps(log, settings.labelling.image_within_s)
 
 
 @contextmanager

@@ -29,14 +29,17 @@ def usable_fixes(
     is_place = np.isfinite(geodetic).all(axis=1) & ~(
         (lat == 0) & (lon == 0)
     )  # what receivers write without a fix
-    is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360) & (np.abs(alt) <= LARGEST_ALT_M)
+    is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360)
+    is_high = is_place & ~(np.abs(alt) <= LARGEST_ALT_M)
+    is_place &= ~is_high
     has_accuracy = ((stddevs >= LEAST_STDDEV_M) & (stddevs <= LARGEST_STDDEV_M)).all(axis=1)
     usable = is_place & has_accuracy
     near = np.zeros(len(stamps), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):  # of stamps that are left out later
         near[usable] = _near(stamps[usable], geodetic[usable])
     kinds = [
-        (~is_place, "no place on Earth, or 0, 0"),
+        (is_high, "no height on Earth; is the altitude in mm?"),
+        (~is_place & ~is_high, "no place on Earth, or 0, 0"),
         (is_place & ~has_accuracy, "a standard deviation that is not above 0, or beyond all sense"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]

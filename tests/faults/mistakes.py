@@ -13,7 +13,7 @@ class Mistake:
 
     name: str
     layout: str
-    """ "kitti-raw", "table" or "odometry": what the drive that is changed must be."""
+    """What is changed: a drive in "kitti-raw", "table" or "odometry" layout, or a folder of "labels"."""
     inject: Callable[[Path], None]
     """Changes a copy of a drive in place."""
     says: tuple[str, ...]

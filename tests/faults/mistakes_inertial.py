@@ -76,7 +76,7 @@ def _in_millimetres(places: Array) -> Array:
 PLACES: dict[str, tuple[Change, tuple[str, ...]]] = {
     "latitude and longitude swapped": (_swapped, ("swapped",)),
     "latitude and longitude in radians": (_in_radians, RADIANS),
-    "altitude in mm": (_in_millimetres, ("altitude", "no place on earth", "metres of wgs 84")),
+    "altitude in mm": (_in_millimetres, ("altitude",)),
 }
 
 LATE_S = (0.5, 1.0, 2.0, -0.5, -1.0)

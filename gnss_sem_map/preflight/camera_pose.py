@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.preflight.depth_edges import UNCHANGED, Change, Edges
+from gnss_sem_map.labelling import NEAREST_DEPTH_M
+from gnss_sem_map.preflight.depth_edges import Change, Edges
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.sample import Sample
 
@@ -27,6 +29,8 @@ FAR_DEG, FINE_NOISE = 3.5, 1.5
 """Turned so far, edges agree by chance only; and by how much more finer edges scatter than coarse ones."""
 LEAST_GAIN = 0.05
 """And by this part: gains of 1 to 2 % are of the calibration's last tenth of a degree."""
+NEARBY_DEG = np.arange(-1.6, 1.7, 0.4)
+"""Turns that are tried about a camera that looks elsewhere."""
 LEAST_COMMON, COMMON_SURE = 0.03, 2.5
 """What an image and its own depth edges must have in common beyond other images of the drive (good drives: 0.15 up)."""
 
@@ -140,6 +144,14 @@ def _means(tried: Array, given: Array) -> Array:
 
 def check(sample: Sample) -> Iterator[Finding]:
     """Turned, late, inverted, of another lens: or fine."""
+    if _all_behind(sample):
+        yield red(
+            NAME,
+            "all points of a scan lie behind the camera",
+            "T_camera_lidar is inverted, or of another camera",
+            "check T_camera_lidar: it takes points from the LiDAR to the camera, x right, y down, z forward",
+        )
+        return
     edges = sample.edges
     if edges is None or len(edges.views) < LEAST_VIEWS:
         yield green(NAME, "not observable: too few scans with an image and depth edges (points ring by ring)")
@@ -150,34 +162,48 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield _pose(sample, edges)
 
 
+def _all_behind(sample: Sample) -> bool:
+    """Whether the first scan that can be read has nothing in front of the camera."""
+    T_camera_lidar = sample.log.calibration.T_camera_lidar
+    if sample.first_points is None or T_camera_lidar is None:
+        return False
+    xyz = sample.first_points[0].xyz
+    xyz = xyz[np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)]
+    return len(xyz) > 0 and bool(
+        (xyz @ T_camera_lidar[2, :3] + T_camera_lidar[2, 3] <= NEAREST_DEPTH_M).all()
+    )
+
+
 def _pose(sample: Sample, edges: Edges) -> Finding:
     given, fine = edges.agreement(), edges.agreement(fine=True)
-    common = (given - edges.others())[np.isfinite(given)]
-    images = len(edges.views)
-    elsewhere = _elsewhere(edges)
-    best = best_change(edges)
     seen = float(np.nanmean(fine)) if np.isfinite(fine).any() else float("nan")
-    found = f"depth edges of {images} scans: images are {seen:.2f} times as strong there as elsewhere"
-    if elsewhere is not None and elsewhere[1].gain > best.gain and elsewhere[1].sigmas > SURE:
-        return red(
-            NAME,
-            f"{found}; {1 + elsewhere[1].gain:.2f} times if so",
-            f"T_camera_lidar is {elsewhere[0]}",
-            "mend T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
-        )
+    found = (
+        f"depth edges of {len(edges.views)} scans: images are {seen:.2f} times as strong there as elsewhere"
+    )
+    best = best_change(edges)
     is_sure = (
         best.sigmas > SURE
         and best.agreement > LEAST_BEST
         and best.gain > LEAST_GAIN * (seen if np.isfinite(seen) else 1.0)
     )
+    if not seen > LEAST_BEST:
+        elsewhere = _elsewhere(edges)
+        if elsewhere is not None and elsewhere[1].gain > best.gain and elsewhere[1].sigmas > SURE:
+            return red(
+                NAME,
+                f"{found}; {elsewhere[1].agreement:.2f} times if so",
+                f"T_camera_lidar is {elsewhere[0]}",
+                "mend T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
+            )
     if is_sure and abs(best.value) > best.family.same:
         return _named(
             sample, best, f"{found}, {best.gain:.2f} more with the change (+- {best.gain / best.sigmas:.2f})"
         )
+    common = (given - edges.others())[np.isfinite(given)]
     if len(common) < LEAST_VIEWS:
         return red(
             NAME,
-            f"{found}; {len(common)} of {images} images show enough depth edges",
+            f"{found}; {len(common)} of {len(edges.views)} images show enough depth edges",
             "hardly any point lies in the images: T_camera_lidar is inverted, turned, or of another camera",
             "check T_camera_lidar: it takes points from the LiDAR to the camera, x right, y down, z forward",
         )
@@ -200,18 +226,34 @@ def _elsewhere(edges: Edges) -> tuple[str, Best] | None:
     given = edges.agreement(fine=True)
     base = np.where(np.isfinite(given), given, 1.0)
     tried = {"inverted: T_lidar_camera was given": np.asarray(np.linalg.inv(T))}
-    for quarter in (90, 180, 270):
-        turned = T.copy()
-        c, s = np.round(np.cos(np.radians(quarter))), np.round(np.sin(np.radians(quarter)))
-        turned[:3] = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ T[:3]
-        tried[f"turned by {quarter} deg about y: the camera looks elsewhere"] = turned
+    for axis, name in enumerate("xyz"):
+        for quarter in (90, 180, 270):
+            turned = T.copy()
+            turned[:3] = _turn(axis, quarter) @ T[:3]
+            tried[f"turned by {quarter} deg about {name}: the camera looks elsewhere"] = turned
     found = []
     for name, camera in tried.items():
-        reached = edges.with_camera(camera).agreement(UNCHANGED, fine=True)
+        reached = _reached(edges.with_camera(camera))
         seen = np.isfinite(reached)
         if seen.sum() >= LEAST_VIEWS and reached[seen].mean() > LEAST_BEST:
             found.append((name, Best(TIME, 0.0, (reached - base)[seen], float(reached[seen].mean()))))
     return max(found, key=lambda item: item[1].gain, default=None)
+
+
+def _turn(axis: int, angle_deg: float) -> Array:
+    return np.asarray(Rotation.from_rotvec(angle_deg * np.eye(3)[axis], degrees=True).as_matrix())
+
+
+def _reached(edges: Edges) -> Array:
+    """Agreement (k,), fine, of a camera that is about right: a rectification turned the wrong way is some degrees."""
+    turn = np.zeros(3)
+    for axis in (1, 0, 2, 1):
+        tried = turn + NEARBY_DEG[:, None] * np.eye(3)[axis]
+        changes = [Change(rotation_deg=(float(x), float(y), float(z))) for x, y, z in tried]
+        means = _means(np.array([edges.agreement(change) for change in changes]), np.ones(len(edges.views)))
+        turn = tried[int(means.argmax())]
+    x, y, z = turn.tolist()
+    return edges.agreement(Change(rotation_deg=(x, y, z)), fine=True)
 
 
 def _named(sample: Sample, best: Best, found: str) -> Finding:

@@ -33,7 +33,6 @@ LONGEST_STRETCH_S = 3.0
 SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12
 LEAST_WAY_M = 5.0
 """Images of places so far apart are different."""
-UNMATCHED = "its sweeps cannot be laid onto each other"
 
 # So much of a long drive, s, shows any mistake in the axes and clocks; it begins where the fixes begin to move.
 STRETCH_S = 600.0
@@ -110,8 +109,8 @@ class Sample:
         return tuple(seen for seen in self.tried.values() if isinstance(seen, Stretch) and seen.is_held)
 
     @cached_property
-    def tried(self) -> dict[float, Stretch | str]:
-        """The stretches looked at by the stamp of their first scan, in order, or why they tell nothing."""
+    def tried(self) -> dict[float, Stretch | DataError | None]:
+        """The stretches looked at by the stamp of their first scan, in order; None: sweeps that do not fit."""
         scans = self.log.scans
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
@@ -119,7 +118,7 @@ class Sample:
         wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 3, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
-        found: dict[float, Stretch | str] = {}
+        found: dict[float, Stretch | DataError | None] = {}
         taken: list[int] = []
         for place in np.argsort(-motion, kind="stable"):
             first = int(firsts[place])
@@ -129,10 +128,9 @@ class Sample:
                 continue
             taken.append(first)
             try:
-                seen = stretch(scans, first, self._starts(first))
-                found[scans[first].stamp] = UNMATCHED if seen is None else seen
+                found[scans[first].stamp] = stretch(scans, first, self._starts(first))
             except DataError as error:
-                found[scans[first].stamp] = str(error)
+                found[scans[first].stamp] = error
         return dict(sorted(found.items()))
 
     @cached_property

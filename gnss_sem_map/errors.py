@@ -23,3 +23,11 @@ class ImageSizeError(DataError):
     def __init__(self, message: str, found: tuple[int, int]) -> None:
         super().__init__(message)
         self.found = found
+
+
+class PointTimesError(DataError):
+    """The times of a scan's points are not of a sweep; `mistake` says what they probably are."""
+
+    def __init__(self, message: str, mistake: str) -> None:
+        super().__init__(message)
+        self.mistake = mistake

@@ -23,7 +23,7 @@ from pydantic import ConfigDict, Field, ValidationError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu, far_off
 from gnss_sem_map.conventions import SensorConventions
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, PointTimesError
 from gnss_sem_map.io import frames
 from gnss_sem_map.io.fixes import usable_fixes
 from gnss_sem_map.io.stamps import (
@@ -43,6 +43,9 @@ MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
 MOST_OUTSIDE = 0.1
 """Share of a sweep's points that may have no time of it."""
+UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
+SWEEPS_S = (0.01, 0.6)
+"""What most of a sweep takes: scanners turn 2 to 50 times a second."""
 Matrix4 = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
@@ -264,9 +267,11 @@ def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> 
     if count > MOST_OUTSIDE * len(rows):
         with np.errstate(invalid="ignore", over="ignore"):
             largest = float(np.nanmax(np.abs(after), initial=0.0))
-        raise DataError(
+        mistake = _mistake_of(after)
+        raise PointTimesError(
             f"{where}: {count} of {len(rows)} point times are none, or up to {largest:.4g} s off the scan's stamp;"
-            f" expected seconds, at most {LONGEST_SWEEP_S:g}; are these milliseconds?"
+            f" expected seconds, at most {LONGEST_SWEEP_S:g}; {mistake}",
+            mistake,
         )
     if count:
         rows[outside, :3], after[outside] = np.nan, 0.0
@@ -274,6 +279,21 @@ def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> 
         raise DataError(
             f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}"
         )
+
+
+def _mistake_of(after: Array) -> str:
+    """What times of a sweep probably are that are no seconds after its stamp; none is sorted out by a few odd ones."""
+    known = after[np.isfinite(after)]
+    if not len(known):
+        return "point times are not numbers"
+    low, middle, high = np.percentile(known, [5, 50, 95])
+    unit = next(
+        (unit for size, unit in UNITS.items() if SWEEPS_S[0] <= (high - low) / size <= SWEEPS_S[1]), None
+    )
+    # a float32 holds the time of day, or of the epoch, too coarsely to tell the points of a sweep apart
+    if abs(middle) > LONGEST_SWEEP_S and high - low <= max(LONGEST_SWEEP_S, 1e-5 * abs(middle)):
+        return "point times are absolute, or of another clock than the scan stamps"
+    return f"point times are in {unit}" if unit else "point times are no seconds of one sweep"
 
 
 def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:

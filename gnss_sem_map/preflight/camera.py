@@ -19,5 +19,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield from (matrix, *files)
     if any(finding.level is Level.RED for finding in (matrix, *files)):
         return  # what is wrong there is wrong all over the image
-    yield from camera_pose.check(sample)
-    yield from labels.check(sample)
+    pose = tuple(camera_pose.check(sample))
+    yield from pose
+    # where the camera is wrong, right labels do not fit the scans either
+    yield from labels.check(sample, against_lidar=all(finding.level is Level.GREEN for finding in pose))

@@ -88,10 +88,10 @@ class Edges:
         enough = np.bincount(of, minlength=count) >= LEAST_SEEN
         return np.where(enough, sums / np.maximum(totals, 1e-9), np.nan)
 
-    def others(self, fine: bool = False) -> Array:
+    def others(self, change: Change = UNCHANGED, fine: bool = False) -> Array:
         """The same with the images of all other views (k,): what depth edges and images have in common by chance."""
         count = len(self.views)
-        found = np.array([self.agreement(UNCHANGED, fine, shift) for shift in range(1, count)])
+        found = np.array([self.agreement(change, fine, shift) for shift in range(1, count)])
         return np.asarray(found.mean(axis=0)) if count > 1 else np.full(count, np.nan)
 
     def with_camera(self, T_camera_lidar: Array) -> Edges:

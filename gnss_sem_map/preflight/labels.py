@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.preflight.camera_pose import LEAST_BEST, LEAST_VIEWS, SURE, TURNS, best_change, in_errors
-from gnss_sem_map.preflight.depth_edges import Edges, View, border_strength
+from gnss_sem_map.preflight.depth_edges import UNCHANGED, Change, Edges, View, border_strength
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.segmentation.cached import CachedLabels
@@ -27,8 +27,8 @@ LEAST_COMMON = 0.1
 UNKNOWN = -1
 
 
-def check(sample: Sample) -> Iterator[Finding]:
-    """Only labels from files."""
+def check(sample: Sample, against_lidar: bool) -> Iterator[Finding]:
+    """Only labels from files: what they hold, and whether it fits the scans."""
     segmenter, edges = sample.segmenter, sample.edges
     if not isinstance(segmenter, CachedLabels) or edges is None:
         return
@@ -57,7 +57,7 @@ def check(sample: Sample) -> Iterator[Finding]:
         return
     content = _content(seen, segmenter.class_names)
     yield content
-    if not content.mistake:
+    if against_lidar and not content.mistake:
         yield _place(sample, Edges(tuple(views), edges.trajectory, edges.calibration))
 
 
@@ -110,6 +110,7 @@ def _place(sample: Sample, edges: Edges) -> Finding:
         and best.agreement > LEAST_BEST
         and abs(best.value) > 2 * best.family.same
         and best.gain > 2 * max(common.mean(), 0.0)
+        and _belong_together(edges, best.family.of(best.value))
     ):
         K = edges.calibration.K
         assert K is not None
@@ -121,7 +122,7 @@ def _place(sample: Sample, edges: Edges) -> Finding:
             f" {'to the side' if best.family is TURNS[0] else 'up or down'} against the images",
             "make labels of the whole rectified images",
         )
-    if common.mean() < LEAST_COMMON or in_errors(common) < 2.0:
+    if not _belong_together(edges, UNCHANGED):
         return amber(
             PLACE,
             found,
@@ -129,3 +130,10 @@ def _place(sample: Sample, edges: Edges) -> Finding:
             "check that <frame number> of each label file is that of its image",
         )
     return green(PLACE, found)
+
+
+def _belong_together(edges: Edges, change: Change) -> bool:
+    """Whether depth edges meet the labels of their own frame better than those of others."""
+    own = edges.agreement(change)
+    common = (own - edges.others(change))[np.isfinite(own)]
+    return len(common) > 1 and float(common.mean()) >= LEAST_COMMON and in_errors(common) >= 2.0

@@ -33,7 +33,6 @@ LONGEST_STRETCH_S = 3.0
 SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12
 LEAST_WAY_M = 5.0
 """Images of places so far apart are different."""
-UNMATCHED = "its sweeps cannot be laid onto each other"
 
 # So much of a long drive, s, shows any mistake in the axes and clocks; it begins where the fixes begin to move.
 STRETCH_S = 600.0
@@ -110,8 +109,8 @@ class Sample:
         return tuple(seen for seen in self.tried.values() if isinstance(seen, Stretch) and seen.is_held)
 
     @cached_property
-    def tried(self) -> dict[float, Stretch | str]:
-        """The stretches looked at by the stamp of their first scan, in order, or why they tell nothing."""
+    def tried(self) -> dict[float, Stretch | DataError | None]:
+        """The stretches looked at by the stamp of their first scan, in order; None: sweeps that do not fit."""
         scans = self.log.scans
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
@@ -119,7 +118,7 @@ class Sample:
         wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 3, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
-        found: dict[float, Stretch | str] = {}
+        found: dict[float, Stretch | DataError | None] = {}
         taken: list[int] = []
         for place in np.argsort(-motion, kind="stable"):
             first = int(firsts[place])
@@ -129,10 +128,9 @@ class Sample:
                 continue
             taken.append(first)
             try:
-                seen = stretch(scans, first, self._starts(first))
-                found[scans[first].stamp] = UNMATCHED if seen is None else seen
+                found[scans[first].stamp] = stretch(scans, first, self._starts(first))
             except DataError as error:
-                found[scans[first].stamp] = str(error)
+                found[scans[first].stamp] = error
         return dict(sorted(found.items()))
 
     @cached_property
@@ -186,11 +184,20 @@ class Sample:
 
     @cached_property
     def _edges(self) -> tuple[Edges, tuple[Image, ...]] | None:
+        return self._edges_of(self._moving_scans[0])
+
+    @cached_property
+    def other_edges(self) -> Edges | None:
+        """The same of other scans, twice as many: read only where the first ones leave doubt."""
+        found = self._edges_of(self._moving_scans[1])
+        return found[0] if found is not None else None
+
+    def _edges_of(self, scans: list[Scan]) -> tuple[Edges, tuple[Image, ...]] | None:
         log = self.log
-        if not log.images or not log.calibration.has_camera or not log.scans:
+        if not log.images or not log.calibration.has_camera:
             return None
         views, images = [], []
-        for scan in self._moving_scans:
+        for scan in scans:
             image = log.image_at(scan.stamp, self.settings.labelling.image_within_s)
             if image is None:
                 continue
@@ -207,15 +214,18 @@ class Sample:
             return None
         return Edges(tuple(views), self.trajectory, log.calibration), tuple(images)
 
-    @property
-    def _moving_scans(self) -> list[Scan]:
-        """Scans spread over the drive, where the vehicle moves: only there a moment differs from another."""
+    @cached_property
+    def _moving_scans(self) -> tuple[list[Scan], list[Scan]]:
+        """Scans spread over the drive: those that move most, for a moment differs from another there, and the rest."""
         scans = self.log.scans
+        if not scans:
+            return [], []
         wanted = int(np.clip(len(scans) // SCANS_PER_IMAGE + 1, LEAST_IMAGES, MOST_IMAGES))
         places = np.unique(np.linspace(0, len(scans) - 1, 3 * wanted).astype(int))
         motion = np.array([self._speed(scans[place].stamp) for place in places])
-        chosen = np.sort(np.argsort(-motion, kind="stable")[:wanted])
-        return [scans[places[k]] for k in chosen if motion[k] >= 0]
+        order = [k for k in np.argsort(-motion, kind="stable") if motion[k] >= 0]
+        first, rest = ([scans[places[k]] for k in sorted(some)] for some in (order[:wanted], order[wanted:]))
+        return first, rest
 
     def _speed(self, stamp: float) -> float:
         """Way in a tenth of a second, a turn counted as at 10 m; -1 beyond the trajectory."""
@@ -229,7 +239,7 @@ class Sample:
     @property
     def is_moving(self) -> bool:
         """Whether the first and the last scan that are looked at see different places."""
-        scans = self._moving_scans
+        scans = self._moving_scans[0]
         if self.trajectory is None or len(scans) < 2:
             return False
         return _way(*self.trajectory.at([scans[0].stamp, scans[-1].stamp], EXTRAPOLATE_S)) > LEAST_WAY_M

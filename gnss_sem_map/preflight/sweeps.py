@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from gnss_sem_map.errors import DataError, PointTimesError
 from gnss_sem_map.preflight import extrinsics, point_times, sweep_stamps
 from gnss_sem_map.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.preflight.sample import UNMATCHED, Sample
+from gnss_sem_map.preflight.lidar_motion import Stretch
+from gnss_sem_map.preflight.sample import Sample
 
 SCANS = "scans"
 
@@ -27,18 +29,13 @@ def _scans(sample: Sample) -> Iterator[Finding]:
     if not tried:
         yield green(SCANS, "not observable: no ten scans in a row")
         return
-    unreadable = [why for why in tried.values() if isinstance(why, str) and why != UNMATCHED]
-    fit = sum(not isinstance(seen, str) for seen in tried.values())
-    unmatched = [why for why in tried.values() if why == UNMATCHED]
+    unreadable = [why for why in tried.values() if isinstance(why, DataError)]
+    fit = sum(isinstance(seen, Stretch) for seen in tried.values())
     found = f"{fit} of {len(tried)} stretches of a second have scans that fit onto each other"
     if unreadable:
-        yield (red if len(unreadable) > len(tried) / 2 else amber)(
-            SCANS,
-            f"{found}; {unreadable[0]}",
-            "scans are damaged, cut short, or other bytes than points",
-            "copy the scans again: little-endian float32 x y z intensity, m",
-        )
-    elif len(unmatched) > len(tried) / 2:
+        level = red if len(unreadable) > len(tried) / 2 else amber
+        yield level(SCANS, f"{found}; {unreadable[0]}", *_why_unreadable(unreadable[0]))
+    elif len(tried) - fit > len(tried) / 2:
         yield amber(
             SCANS,
             found,
@@ -47,3 +44,13 @@ def _scans(sample: Sample) -> Iterator[Finding]:
         )
     else:
         yield green(SCANS, found)
+
+
+def _why_unreadable(error: DataError) -> tuple[str, str]:
+    """The probable mistake, and its remedy."""
+    if isinstance(error, PointTimesError):
+        return error.mistake, "give each point's time minus the scan's stamp, s"
+    return (
+        "scans are damaged, cut short, or other bytes than points",
+        "copy the scans again: little-endian float32 x y z intensity, m",
+    )

@@ -148,10 +148,19 @@ def test_a_point_without_a_time_is_left_out_and_no_other(value, copies, trial) -
     trial("stamps")
 
 
-@pytest.mark.parametrize("scale", [1e3, 1e6, 1e9])
-def test_sweeps_in_another_unit_are_refused(scale, copies, trial) -> None:
-    _point_times(copies["table"], lambda rows: rows.__setitem__((slice(None), 4), rows[:, 4] * scale))
-    with pytest.raises(SemMapError, match="are these milliseconds"):
+@pytest.mark.parametrize(
+    ("scale", "later", "says"),
+    [
+        (1e3, 0.0, "in ms"),
+        (1e6, 0.0, "in µs"),
+        (1e9, 0.0, "in ns"),
+        (1.0, 1e3, "absolute"),
+        (1.0, 1.7e9, "absolute"),
+    ],
+)
+def test_sweeps_in_another_unit_are_refused_with_its_name(scale, later, says, copies, trial) -> None:
+    _point_times(copies["table"], lambda rows: rows.__setitem__((slice(None), 4), rows[:, 4] * scale + later))
+    with pytest.raises(SemMapError, match=f"point times are {says}"):
         open_drive(copies["table"]).scans[1].read()
     trial("stamps")
 

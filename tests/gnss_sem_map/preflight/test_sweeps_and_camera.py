@@ -215,3 +215,20 @@ def test_labels_that_hold_nothing_are_named(tmp_path: Path, one_class: bool) -> 
         np.savez_compressed(path, probabilities=probabilities, class_names=names)
     found = not_green(open_drive(written.drive), written.labels)
     assert any("all zero" in finding.mistake for finding in found)
+
+
+@pytest.mark.parametrize("by", [(0.0, 0.0, 0.0), (0.8, -0.8, 1.0)])
+def test_an_inverse_is_named_though_a_rectification_turns_it_a_little(
+    town: SensorLog, by: tuple[float, float, float]
+) -> None:
+    """KITTI's rectification is not inverted with the mounting of the camera."""
+    T = turned(np.linalg.inv(turned(town.calibration.T_camera_lidar, (0, 0, 0))), by)
+    assert "T_camera_lidar is inverted" in mistakes(calibrated(town, T_camera_lidar=T))
+
+
+def test_a_camera_that_has_all_points_behind_it_is_red_though_edges_are_few(tmp_path: Path) -> None:
+    log = open_drive(street.write(tmp_path).drive)
+    T = turned(log.calibration.T_camera_lidar, (0, 0, 0))
+    T[:3, 3] -= (0, 0, 1000.0)
+    (finding,) = [f for f in not_green(calibrated(log, T_camera_lidar=T)) if f.level is Level.RED]
+    assert "of another camera" in finding.mistake

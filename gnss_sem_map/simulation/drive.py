@@ -151,10 +151,10 @@ def simulate(
     for path in (drive, _twin(drive)):
         if path.exists():
             raise DataError(f"{path}: is already there; remove it or simulate into another folder")
+    simulation = prepare(seconds, seed, lidar, camera)
     with _for_us_alone(drive) as partial:
         write_calibration(partial / "calibration", camera or Camera())
         _refuse_other_calibration(partial / "calibration", drive.parent)
-        simulation = prepare(seconds, seed, lidar, camera)
         _write_still(simulation, partial)
         frames = len(simulation.sweeps)
         seen: list[npt.NDArray[np.uint16]] = []

@@ -406,7 +406,7 @@ def _camera() -> list[Mistake]:
         Mistake("K doubled", "kitti-raw", scaled_K(2.0), ("k is of", "principal point")),
         Mistake("focal length halved", "kitti-raw", scaled_K(0.5, centre=False), ("focal length",)),
         Mistake("focal length 1.2 times", "kitti-raw", scaled_K(1.2, centre=False), ("focal length",)),
-        Mistake("K transposed", "kitti-raw", changed_K(np.transpose), ("camera matrix",)),
+        Mistake("K transposed", "kitti-raw", changed_K(np.transpose), ("camera matrix", "rectified camera")),
         Mistake(
             "K with skew", "table", changed_K(lambda K: K + np.eye(3, k=1) * 100.0), ("camera matrix", "skew")
         ),

@@ -37,7 +37,10 @@ SCALES = {
     1 / 57.2958: "in radians taken for degrees",
 }
 SHIFTS_S = np.arange(-20, 21) * 0.1
-LATE_S = 0.25
+LATE_S, SURE_LATE = 0.25, 5.0
+"""Less is the smoother's at 10 Hz; five standard deviations stop a run, as for a late clock of the fixes."""
+LEAST_STEPS, MOST_MISFIT = 5, 4.0
+"""Motions that must be compared; and their mean squared error where clocks agree, two standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +105,10 @@ def _motions(sample: Sample, stretches: tuple[Stretch, ...]) -> _Motions:
 
 
 def _compare(sample: Sample, motions: _Motions, p: Array) -> Iterator[Finding]:
+    shift, surer = _time_shift(sample, p)
+    if abs(shift) > LATE_S and surer > SURE_LATE:
+        yield _late(sample, shift, surer)
+        return
     R = sample.log.calibration.T_imu_lidar[:3, :3]
     ways = motions.ways_imu + _lever(motions.turns_imu) @ p
     lengths = np.linalg.norm(motions.ways_lidar, axis=1), np.linalg.norm(ways, axis=1)
@@ -127,9 +134,6 @@ def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
     what = _track(sample)
     if abs(ratio) <= SAME_SCALE or (abs(ratio) <= WRONG_SCALE and len(ratios) < 2):
         return green(SCALE, found)
-    shift = _time_shift(sample)
-    if shift is not None and abs(shift) > LATE_S:
-        return _late(sample, shift, found)
     for factor, unit in SCALES.items():
         if abs(ratio - np.log(factor)) < SAME_SCALE + spread:
             return red(
@@ -325,40 +329,56 @@ def _position(sample: Sample, motions: _Motions, rotation: Array, p: Array) -> I
 
 def _lever(turns: Array) -> Array:
     """(n, 3, 3) with R_imu - 1 of each turn: what it does to a lever arm."""
-    return np.asarray(Rotation.from_rotvec(turns).as_matrix() - np.eye(3))
+    return _lever_of(Rotation.from_rotvec(turns).as_matrix())
 
 
-def _time_shift(sample: Sample) -> float | None:
-    """By how much later the trajectory moves as the scans see, s; None where no shift explains it."""
+def _lever_of(R: Array) -> Array:
+    return np.asarray(R - np.eye(3))
+
+
+def _time_shift(sample: Sample, p: Array) -> tuple[float, float]:
+    """By how much later the trajectory moves as the scans see, s, and by how many standard deviations that is surer.
+
+    Ways and angles of turn are compared, from sweep to sweep: wrong axes do not change them.
+    """
     trajectory = sample.trajectory
     assert trajectory is not None
-    ends = np.array([s.stamps[[0, -1]] for s in sample.stretches])
-    ways = np.array([np.linalg.norm(sample.deskewed(s)[0][-1][:3, 3]) for s in sample.stretches])
-    turns = np.array(
-        [Rotation.from_matrix(sample.deskewed(s)[0][-1][:3, :3]).magnitude() for s in sample.stretches]
-    )
-    costs = np.full(len(SHIFTS_S), np.inf)
-    for k, shift in enumerate(SHIFTS_S):
-        moved = ends + shift
-        inside = (moved[:, 0] >= trajectory.start) & (moved[:, 1] <= trajectory.end)
-        if inside.mean() < 0.6:
-            continue
-        T = np.linalg.inv(trajectory.at(moved[inside, 0])) @ trajectory.at(moved[inside, 1])
-        way = np.linalg.norm(T[:, :3, 3], axis=1) - ways[inside]
-        turn = Rotation.from_matrix(T[:, :3, :3]).magnitude() - turns[inside]
-        costs[k] = np.mean(way**2 + (10.0 * turn) ** 2)
-    zero = len(SHIFTS_S) // 2
-    best = int(np.argmin(costs))
-    if len(ways) < 2 or not costs[best] < 0.1 * costs[zero]:
-        return None
-    return float(SHIFTS_S[best])
+    stamps, T = [], []
+    for seen in sample.stretches:
+        matched = sample.deskewed(seen)[0]  # of all but the second sweep
+        at = np.delete(seen.stamps, 1)
+        stamps.append(np.column_stack([at[:-1], at[1:]]))
+        T.append(np.linalg.inv(matched[:-1]) @ matched[1:])
+    ends = np.concatenate(stamps)
+    ways, turns = _magnitudes(np.concatenate(T))
+    moved = SHIFTS_S[:, None, None] + ends
+    inside = (moved[:, :, 0] >= trajectory.start) & (moved[:, :, 1] <= trajectory.end)
+    within = np.clip(moved, trajectory.start, trajectory.end)
+    of_imu = np.linalg.inv(trajectory.at(within[:, :, 0].ravel())) @ trajectory.at(within[:, :, 1].ravel())
+    of_imu[:, :3, 3] += _lever_of(of_imu[:, :3, :3]) @ p
+    w, t = (values.reshape(inside.shape) for values in _magnitudes(of_imu))
+    squares = ((w - ways) / np.hypot(WAY_STDDEV_M, 0.02 * ways)) ** 2 + ((t - turns) / TURN_STDDEV_RAD) ** 2
+    counts = inside.sum(axis=1)
+    means = np.where(inside, squares, 0.0).sum(axis=1) / np.maximum(counts, 1)
+    means[counts < max(LEAST_STEPS, 0.6 * len(ends))] = np.inf
+    zero, best = len(SHIFTS_S) // 2, int(np.argmin(means))
+    if not means[best] < MOST_MISFIT or not np.isfinite(means[zero]):
+        return 0.0, 0.0
+    surer = counts[best] * (means[zero] - means[best]) / max(float(means[best]), 1.0)
+    return float(SHIFTS_S[best]), float(np.sqrt(max(surer, 0.0)))
 
 
-def _late(sample: Sample, shift: float, found: str) -> Finding:
+def _magnitudes(T: Array) -> tuple[Array, Array]:
+    """Ways (n,) m and angles (n,) rad of motions."""
+    return np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(Rotation.from_matrix(T[:, :3, :3]).magnitude())
+
+
+def _late(sample: Sample, shift: float, surer: float) -> Finding:
     word = "early" if shift > 0 else "late"
     return red(
         FIT,
-        f"{found}; {abs(shift):.1f} s {'later' if shift > 0 else 'earlier'} it fits",
+        f"the trajectory moves as the scans see {abs(shift):.1f} s {'later' if shift > 0 else 'earlier'}"
+        f" ({surer:.0f} standard deviations better)",
         f"scan stamps are {abs(shift):.1f} s {word} against {_track(sample)}: another clock",
         "correct the stamps of the scans, or set the time offset of the LiDAR",
     )

@@ -34,6 +34,16 @@ def check(sample: Sample) -> Iterator[Finding]:
         return
     if len(scans) < 2:
         return
+    moving = _span_of_motion(sample)
+    if moving is not None and (scans[-1].stamp < moving[0] or scans[0].stamp > moving[1]):
+        yield red(
+            NAME,
+            f"scans are of {scans[0].stamp:.1f} to {scans[-1].stamp:.1f} s,"
+            f" what tells the motion is of {moving[0]:.1f} to {moving[1]:.1f} s",
+            "scan stamps are of another clock, or of another drive",
+            "give all stamps on one clock",
+        )
+        return
     stamps = np.array([scan.stamp for scan in scans])
     steps = np.diff(stamps)
     interval = float(np.median(steps))
@@ -50,6 +60,14 @@ def check(sample: Sample) -> Iterator[Finding]:
         yield green(NAME, f"{len(scans)} scans, {interval:.3f} s apart")
         return
     yield _spans(stamps, spans, interval)
+
+
+def _span_of_motion(sample: Sample) -> tuple[float, float] | None:
+    """When the drive's motion is known from and to, s."""
+    given, imu = sample.log.given, sample.log.imu
+    if given is not None:
+        return given.start, given.end
+    return (float(imu.stamps[0]), float(imu.stamps[-1])) if imu is not None and len(imu) else None
 
 
 def _spans(stamps: Array, spans: Array, interval: float) -> Finding:

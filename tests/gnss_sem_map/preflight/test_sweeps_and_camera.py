@@ -21,7 +21,7 @@ from gnss_sem_map.preflight import camera, sweeps
 from gnss_sem_map.preflight.findings import Finding, Level
 from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.sensor_log import SensorLog, Skip
+from gnss_sem_map.sensor_log import Points, SensorLog, Skip
 from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 Array = NDArray[np.float64]
@@ -232,3 +232,32 @@ def test_a_camera_that_has_all_points_behind_it_is_red_though_edges_are_few(tmp_
     T[:3, 3] -= (0, 0, 1000.0)
     (finding,) = [f for f in not_green(calibrated(log, T_camera_lidar=T)) if f.level is Level.RED]
     assert "of another camera" in finding.mistake
+
+
+def with_scans_later(log: SensorLog, by_s: float) -> SensorLog:
+    """The same drive, its scans by another clock."""
+
+    def later(k: int) -> Points:
+        points = log.scans[k].read()
+        return replace(points, stamps=None if points.stamps is None else points.stamps + by_s)
+
+    scans = [
+        replace(scan, stamp=scan.stamp + by_s, sweep=None, read=lambda k=k: later(k))
+        for k, scan in enumerate(log.scans)
+    ]
+    return replace(log, scans=tuple(scans))
+
+
+def test_scans_of_a_late_clock_are_named(tmp_path: Path) -> None:
+    """Some of the scans: the rest of the drive is what they are compared with."""
+    lidar = Lidar(np.radians(np.linspace(2.0, -18.0, 32)), columns=600, range_stddev_m=0.01)
+    log = open_drive(
+        simulate(tmp_path, 6.0, 101, lidar=lidar, camera=Camera(64, 32, 40.0, 32.0, 16.0), workers=2)
+    )
+    for by_s, word in ((0.0, ""), (0.5, "late"), (-0.5, "early")):
+        some = with_scans_later(replace(log, scans=log.scans[8:52], images=()), by_s)
+        assert (f"scan stamps are 0.5 s {word}" in mistakes(some)) == bool(word)
+
+
+def test_scans_of_another_drive_are_named(town: SensorLog) -> None:
+    assert "scan stamps are of another clock" in mistakes(with_scans_later(town, 3600.0))

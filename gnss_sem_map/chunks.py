@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from gnss_sem_map import work_folder
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import LabelSet
-from gnss_sem_map.ownership import write_whole
+from gnss_sem_map.output import work_folder
+from gnss_sem_map.output.ownership import write_whole
 from gnss_sem_map.tiles import Tile, by_tile
 from gnss_sem_map.voxel_map import VoxelMap
 

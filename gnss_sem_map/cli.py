@@ -84,7 +84,7 @@ def run(
     """Trajectory, semantic map, refined map and all exports of one drive."""
     from gnss_sem_map import labels, pipeline
     from gnss_sem_map.export import run_folder
-    from gnss_sem_map.output import refuse_inputs
+    from gnss_sem_map.output.place import refuse_inputs
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
     settings = _settings(config, set_)
@@ -270,7 +270,7 @@ def evaluate(
     from gnss_sem_map.errors import DataError
     from gnss_sem_map.export.report import write_report
     from gnss_sem_map.io.scoring import score_run
-    from gnss_sem_map.output import locked, real_path
+    from gnss_sem_map.output.place import locked, real_path
     from gnss_sem_map.run_json import read_run
     from gnss_sem_map.untrusted.files import shown
 

@@ -15,7 +15,7 @@ from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.run_folder import claimed_run, write_run
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.io.scoring import score_run
-from gnss_sem_map.output import claimed, new_folder, real_path
+from gnss_sem_map.output.place import claimed, new_folder, real_path
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map import work_folder
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labelling import class_image
 from gnss_sem_map.labels import OTHER, LabelSet
-from gnss_sem_map.ownership import write_whole
+from gnss_sem_map.output import work_folder
+from gnss_sem_map.output.ownership import write_whole
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image
 

@@ -16,7 +16,7 @@ from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.run_folder import claimed_run
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.merging import Laid, merge_runs
-from gnss_sem_map.output import new_folder
+from gnss_sem_map.output.place import new_folder
 from gnss_sem_map.refinement import refine
 from gnss_sem_map.run_json import read_run
 from gnss_sem_map.voxel_map import SemanticMap

@@ -26,7 +26,7 @@ from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.output import Claim, claimed, new_folder
+from gnss_sem_map.output.place import Claim, claimed, new_folder
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.point_labels import label_points
 from gnss_sem_map.preflight.findings import Preflight
@@ -51,7 +51,7 @@ def is_run_file(name: str) -> bool:
 
 
 def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> AbstractContextManager[Claim]:
-    """A place for a run that is ours until the claim ends; see `output.claimed`."""
+    """A place for a run that is ours until the claim ends; see `output.place.claimed`."""
     return claimed(out, inputs, is_run_file)
 
 

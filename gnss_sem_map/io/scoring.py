@@ -16,7 +16,7 @@ from gnss_sem_map import config, evaluation, labels
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.io.point_labels import label_files, read_confidence, read_labels, truth_folder
 from gnss_sem_map.labels import LabelSet
-from gnss_sem_map.ownership import amend
+from gnss_sem_map.output.ownership import amend
 from gnss_sem_map.run_json import read_run
 from gnss_sem_map.untrusted.files import is_file, is_folder, read_lines, shown
 from gnss_sem_map.untrusted.structured import read_json

@@ -19,8 +19,8 @@ from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.ahead import ahead
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import OTHER, LabelSet
-from gnss_sem_map.output import locked, real_path
-from gnss_sem_map.ownership import write_whole
+from gnss_sem_map.output.ownership import write_whole
+from gnss_sem_map.output.place import locked, real_path
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
 from gnss_sem_map.untrusted.structured import read_json

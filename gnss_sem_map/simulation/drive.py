@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.output import locked
-from gnss_sem_map.ownership import MARKER, read_list, write_list
+from gnss_sem_map.output.ownership import MARKER, read_list, write_list
+from gnss_sem_map.output.place import locked
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan

@@ -67,7 +67,7 @@ def content(folder: Path) -> dict[str, str]:
 
 def write_result(out: Path, files: Mapping[str, str]) -> None:
     """A result of ours, as every command writes one."""
-    from gnss_sem_map.output import new_folder
+    from gnss_sem_map.output.place import new_folder
 
     with new_folder(out) as folder:
         for name, text in files.items():

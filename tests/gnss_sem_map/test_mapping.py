@@ -26,7 +26,7 @@ from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.io import open_drive
 from gnss_sem_map.labelling import class_image
 from gnss_sem_map.mapping import STATIC, Drive, Maps, build_maps, fingerprint, map_chunks
-from gnss_sem_map.ownership import MARKER
+from gnss_sem_map.output.ownership import MARKER
 from gnss_sem_map.remembering import RememberedSegmenter
 from gnss_sem_map.seen_scans import seen_scans
 from gnss_sem_map.segmentation import Segmenter, open_segmenter

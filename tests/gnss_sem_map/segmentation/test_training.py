@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import label_set
-from gnss_sem_map.ownership import write_list
+from gnss_sem_map.output.ownership import write_list
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.training import (
     NETWORK,

@@ -14,8 +14,8 @@ import re
 import shutil
 from pathlib import Path
 
-from gnss_sem_map import ownership
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.output import ownership
 
 CHUNKS, ANSWERS, PART, OLD = "chunks.json", "answers", "part", "old"
 OF_CHUNKS = re.compile(

@@ -19,8 +19,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import TextIO
 
-from gnss_sem_map import ownership, work_folder
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.output import ownership, work_folder
 
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems that know no locks: there we go on without."""

@@ -74,7 +74,7 @@ def split_projection(P: Array, where: str) -> tuple[Array, Array]:
     below = np.array([K[1, 0], K[2, 0], K[2, 1]])
     if min(K[0, 0], K[1, 1]) < 1e-3 or np.abs(below).max() > 1e-6 or abs(K[2, 2] - 1) > 1e-6:
         raise DataError(
-            f"{where}: found {np.array2string(K, precision=4).replace(chr(10), '')}, expected the projection of a"
+            f"{where}: found {np.array2string(K, precision=4).replace(chr(10), '')}, expected the camera matrix of a"
             " rectified camera: focal lengths above 0, and 0 0 1 in the last row"
         )
     T[:3, 3] = np.linalg.solve(K, P[:, 3])

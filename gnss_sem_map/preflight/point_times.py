@@ -122,15 +122,18 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
         return green(THICKNESS, "not observable: the vehicle hardly moved where scans were looked at")
     sweep = stretches[0].sweeps[0]
     has_times = sweep.after_s is not None and float(np.ptp(sweep.after_s)) > AT_ONCE_S
-    others = (NONE, REVERSED) if has_times else (CLOCKWISE, ANTICLOCKWISE)
     as_given = GIVEN if has_times else NONE
-    surfaces = [
-        {times.name: _surfaces(s, times, interval, sample) for times in (as_given, *others)}
-        for s in stretches
-    ]
-    gains = {other.name: _gain(surfaces, as_given.name, other.name) for other in others}
-    best = max(others, key=lambda other: sum(gains[other.name]))
-    extents, thicknesses = gains[best.name]
+    given = [_surfaces(s, as_given, interval, sample) for s in stretches]
+
+    def gain(times: _Times) -> tuple[float, float]:
+        return _gain(given, [_surfaces(s, times, interval, sample) for s in stretches])
+
+    first, second = (NONE, REVERSED) if has_times else (CLOCKWISE, ANTICLOCKWISE)
+    gains = {first: gain(first)}
+    if not has_times or sum(gains[NONE]) > -RAW_SURE:
+        gains[second] = gain(second)  # no times lie between right ones and reversed ones
+    best = max(gains, key=lambda other: sum(gains[other]))
+    extents, thicknesses = gains[best]
     found = (
         f"surfaces of {len(stretches)} stretches of a second: {best.name} against {as_given.name} make them"
         f" thinner by {thicknesses:.1f} standard errors (spread {extents:.1f})"
@@ -157,11 +160,10 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
         "compensated scans are called raw: they are deskewed twice",
         "set lidar_is_compensated: true, with scans of four columns",
     )
-    first, second = (reverse, twice) if best is REVERSED else (twice, reverse)
-    others_gain = min(sum(gain) for gain in gains.values())
-    if extents + thicknesses - others_gain > CLEAR:
-        return amber(THICKNESS, found, *first)
-    return amber(THICKNESS, found, f"{first[0]}; or {second[0]}", f"{first[1]}; or {second[1]}")
+    likely, other = (reverse, twice) if best is REVERSED else (twice, reverse)
+    if extents + thicknesses - min(sum(both) for both in gains.values()) > CLEAR:
+        return amber(THICKNESS, found, *likely)
+    return amber(THICKNESS, found, f"{likely[0]}; or {other[0]}", f"{likely[1]}; or {other[1]}")
 
 
 def _surfaces(stretch: Stretch, times: _Times, interval: float, sample: Sample) -> Surfaces:
@@ -170,9 +172,9 @@ def _surfaces(stretch: Stretch, times: _Times, interval: float, sample: Sample) 
     return stretch.deskewed(tuple(times.of(sweep, interval) for sweep in stretch.sweeps))[1]
 
 
-def _gain(surfaces: list[dict[str, Surfaces]], given: str, other: str) -> tuple[float, float]:
+def _gain(given: list[Surfaces], other: list[Surfaces]) -> tuple[float, float]:
     """By how many standard errors points spread less, and surfaces are thinner, with other times than the given."""
-    pairs = [_paired(of[given], of[other]) for of in surfaces]
+    pairs = [_paired(a, b) for a, b in zip(given, other, strict=True)]
     extents, thicknesses = (_in_errors([pair[k] for pair in pairs]) for k in (0, 1))
     return extents, thicknesses
 

@@ -177,6 +177,8 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
         columns = {name: _column(table, name) for name in names}
         if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
             raise ValueError("it has labels of no class")
+        if not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
+            raise ValueError("it has confidences beyond 0..1")
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import street
+from faults.readers import small_street
 
 TRIALS: Counter[str] = Counter()
 
@@ -19,6 +22,18 @@ def trial() -> Callable[..., None]:
         assert not faults, f"{kind}: {'; '.join(faults or [])}\n{about}"
 
     return count
+
+
+@pytest.fixture(scope="session")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same small street in three layouts."""
+    folder = tmp_path_factory.mktemp("drives")
+    made = small_street(folder / "kitti")
+    return {
+        "kitti": made.drive,
+        "odometry": street.write_odometry(folder / "odometry", made),
+        "table": street.write_table_log(folder / "table", made),
+    }
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import street
 from faults.harness import gnss_sem_map
-from faults.readers import small_street
 
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.io import open_drive
@@ -91,18 +90,6 @@ INSTEAD = {
         _as_a_terabyte,
     )
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same small street in three layouts."""
-    folder = tmp_path_factory.mktemp("drives")
-    made = small_street(folder / "kitti")
-    return {
-        "kitti": made.drive,
-        "odometry": street.write_odometry(folder / "odometry", made),
-        "table": street.write_table_log(folder / "table", made),
-    }
 
 
 def _copy(drive: Path, folder: Path) -> Path:

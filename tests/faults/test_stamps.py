@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import street
 from faults.harness import gnss_sem_map
-from faults.readers import small_street
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import split
@@ -24,18 +22,6 @@ ABSURD_DATES = [
     "1999-01-01 00:00:00.0",
     "2011-09-27 23:00:00.0",
 ]
-
-
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The same small street in three layouts."""
-    folder = tmp_path_factory.mktemp("drives")
-    made = small_street(folder / "kitti")
-    return {
-        "kitti": made.drive,
-        "odometry": street.write_odometry(folder / "odometry", made),
-        "table": street.write_table_log(folder / "table", made),
-    }
 
 
 @pytest.fixture

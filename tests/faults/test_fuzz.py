@@ -8,7 +8,7 @@ import pytest
 from faults.fuzzing import fuzz
 from faults.readers import READERS
 
-QUICK, WHOLE = 40, 2000
+QUICK, WHOLE = 20, 2000
 
 
 def _check(name: str, first: int, count: int, trial, folder: Path) -> None:

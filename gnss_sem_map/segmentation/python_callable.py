@@ -43,7 +43,7 @@ class PythonSegmenter:
         where = f"{self._where} on image {image.number}"
         try:
             answer = np.asarray(self._function(pixels))
-        except Exception as error:
+        except Exception as error:  # the user's own function may fail in any way
             raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
         seen = checked_probabilities(answer, len(self.class_names), where)
         check_size(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
@@ -60,7 +60,7 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
         raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
-    except Exception as error:
+    except Exception as error:  # so may the import of their module
         raise ConfigError(
             f"python:{place}: cannot be imported, {type(error).__name__} {str(error)[:200]}"
         ) from error

@@ -22,12 +22,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.smoothing import Solution, smooth
+from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import label_calibration, labels, preflight
 from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import answers_fingerprint, build_maps
 from gnss_sem_map.motion import find_moving
 from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
@@ -35,14 +34,16 @@ from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.refinement.moving_objects import MovingObjects
 from gnss_sem_map.remembering import RememberedSegmenter, answers_folder
-from gnss_sem_map.scan_matching import match_scans
 from gnss_sem_map.seen_scans import Drive
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.sharpness import Sharpness, of_drive
 from gnss_sem_map.surface_heights import surface_heights
+from gnss_sem_map.trajectory import estimate_trajectory, final, solve
 from gnss_sem_map.voxel_map import SemanticMap, State
+
+__all__ = ["Result", "check_drive", "estimate_trajectory", "run", "solve"]
 
 MATCHED_SHARE = 0.95
 """With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
@@ -96,8 +97,8 @@ def run(
     page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
-        solutions = solve(log, settings, account, progress)
-        trajectory, solution = _final(log, solutions)
+        solutions = solve(log, settings, account, progress, page.solution)
+        trajectory, solution = final(log, solutions)
         progress("trajectory", 1, 1)
     with account.stage("sharpness"):
         figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
@@ -171,42 +172,3 @@ def _without_moving(
 
 def _is_matched(log: SensorLog, account: Account) -> bool:
     return account.counts["scans matched"] >= MATCHED_SHARE * max(len(log.scans), 1)
-
-
-def estimate_trajectory(
-    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
-) -> tuple[Trajectory, Solution | None]:
-    """The poses that came with the drive, or GNSS and IMU smoothed, bound by LiDAR odometry where there are scans."""
-    return _final(log, solve(log, settings, account, progress))
-
-
-def _final(log: SensorLog, solutions: tuple[Solution, ...]) -> tuple[Trajectory, Solution | None]:
-    if log.given is not None:
-        return log.given, None
-    return solutions[-1].trajectory, solutions[-1]
-
-
-def solve(
-    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
-) -> tuple[Solution, ...]:
-    """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given."""
-    if log.given is not None:
-        return ()
-    log = log.in_our_conventions(settings.sensors)
-    imu, gnss, frame = log.imu, log.gnss, log.frame
-    if imu is None or gnss is None or frame is None:
-        raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")
-    smoother = settings.trajectory
-    if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
-        smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
-    lever, attitude = log.calibration.p_imu_antenna, log.initial_attitude
-    solutions = [smooth(imu, gnss, frame, smoother, lever, attitude)]
-    if smoother.lidar_odometry and log.scans:
-        matches = match_scans(log, solutions[0].trajectory, smoother.scan_matching, progress)
-        account.counts.update(matches.counts)
-        # a scan that cannot be used at all is reported when the map is built
-        account.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
-        if len(matches.relative_poses):
-            solutions.append(smooth(imu, gnss, frame, smoother, lever, attitude, matches.relative_poses))
-    account.warnings.extend(solutions[-1].notes)
-    return tuple(solutions)

@@ -10,7 +10,7 @@ import time
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.preflight import camera, inertial, positions, sweeps
-from gnss_sem_map.preflight.findings import Preflight, page_of
+from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
@@ -26,5 +26,5 @@ def check(
     start = time.perf_counter()
     sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
     rooms = (inertial, positions, sweeps, *((camera,) if with_camera else ()))
-    findings = [finding for room in rooms for finding in room.check(sample)]
-    return page_of(findings, time.perf_counter() - start)
+    findings = tuple(finding for room in rooms for finding in room.check(sample))
+    return Preflight(findings, time.perf_counter() - start, sample.whole_solution)

@@ -39,12 +39,27 @@ class Diagnosis:
     """What is probably wrong with the IMU, and the IMU as it probably is, for the checks that come after."""
 
     findings: tuple[Finding, ...]
+    force: Array
+    """(3, 3), takes the specific force to our axes and units, by the probable mistake."""
+    rate: Array
+    """(3, 3), the same of the angular rate."""
     imu: ImuSamples
-    """In our axes and units, by the probable mistake."""
+    """What was looked at, mended."""
     track: Track | None
     lag: Lag
     mirrored: bool
     """The track is."""
+
+    @property
+    def is_right(self) -> bool:
+        """Whether axes and units are as they should be."""
+        return bool((self.force == np.eye(3)).all() and (self.rate == np.eye(3)).all())
+
+    def mended(self, imu: ImuSamples) -> ImuSamples:
+        """Samples of the same IMU in our axes and units; the very same where it is right."""
+        if self.is_right:
+            return imu
+        return ImuSamples(imu.stamps, imu.specific_force @ self.force.T, imu.angular_rate @ self.rate.T)
 
 
 def diagnose(
@@ -73,7 +88,8 @@ def diagnose(
     axes_findings, mistake = _axes(seen, gain)
     findings += axes_findings
     probable = ImuSamples(imu.stamps, force @ mistake.force.T, rate @ mistake.rate.T)
-    return Diagnosis(tuple(findings), probable, track, lag, mistake.mirrored)
+    to_force, to_rate = mistake.force * FORCE_UNITS[unit], mistake.rate * scale
+    return Diagnosis(tuple(findings), to_force, to_rate, probable, track, lag, mistake.mirrored)
 
 
 def _sampling(imu: ImuSamples) -> Finding:

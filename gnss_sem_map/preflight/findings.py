@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
+from factor_graphs.smoothing import Solution
 from gnss_sem_map.errors import DataError
 
 
@@ -43,6 +43,8 @@ class Preflight:
 
     findings: tuple[Finding, ...]
     seconds: float
+    solution: Solution | None = None
+    """The drive as a run smooths it first, where the checks needed the same; None: not known."""
 
     @property
     def level(self) -> Level:
@@ -86,8 +88,3 @@ def amber(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
 def red(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
     """A check that says that the map would be wrong."""
     return Finding(check, Level.RED, evidence, mistake, remedy)
-
-
-def page_of(findings: Iterable[Finding], seconds: float) -> Preflight:
-    """The findings as one page."""
-    return Preflight(tuple(findings), seconds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.measurements import ImuSamples
-from factor_graphs.smoothing import smooth
+from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
@@ -23,11 +23,12 @@ from gnss_sem_map.preflight.lidar_motion import STEPS, Stretch, Surfaces, stretc
 from gnss_sem_map.registration import inverse
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog
+from gnss_sem_map.trajectory import smooth_log
 
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
 """Of a longer drive so much is smoothed, and looked at closely."""
-SCANS_PER_STRETCH, MOST_STRETCHES = 40, 5
+SCANS_PER_STRETCH, LEAST_STRETCHES, MOST_STRETCHES = 40, 2, 5
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
 SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12
@@ -70,38 +71,36 @@ class Sample:
         within = (fixes.usable.stamps >= start) & (fixes.usable.stamps <= start + STRETCH_S)
         return diagnose(imu, fixes.usable[within], log.frame, log.reference, lever)
 
-    @cached_property
+    @property
     def trajectory(self) -> Trajectory | None:
         """The poses that came with the drive, or IMU and fixes of one stretch smoothed; None where that fails."""
+        if self.log.given is not None or self._solution is None:
+            return self.log.given
+        return self._solution.trajectory
+
+    @property
+    def whole_solution(self) -> Solution | None:
+        """The drive smoothed as a run smooths it first; None where only a stretch was, or what was mended."""
+        is_as_logged = self.diagnosis is None or self.diagnosis.is_right
+        return self._solution if is_as_logged and self._is_short else None
+
+    @cached_property
+    def _solution(self) -> Solution | None:
         log = self.log
-        if log.given is not None or log.imu is None or log.gnss is None or log.frame is None:
-            return log.given
-        start = self._start
-        inside = (log.imu.stamps >= start) & (log.imu.stamps <= start + LONGEST_S)
-        fixes = (log.gnss.stamps >= start) & (log.gnss.stamps <= start + LONGEST_S)
-        imu = ImuSamples(*(a[inside] for a in (log.imu.stamps, log.imu.specific_force, log.imu.angular_rate)))
-        smoother = self.settings.trajectory
-        if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
-            smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
-        attitude = log.initial_attitude if inside[0] else None
-        lever = log.calibration.p_imu_antenna
+        if log.given is not None or log.imu is None or log.gnss is None:
+            return None
+        if self.diagnosis is not None:
+            log = replace(log, imu=self.diagnosis.mended(log.imu))
         try:
-            return smooth(imu, log.gnss[fixes], log.frame, smoother, lever, attitude).trajectory
+            return smooth_log(log if self._is_short else _stretch_of(log), self.settings.trajectory)
         except FactorGraphError:
             return None
 
     @property
-    def _start(self) -> float:
-        """Where the smoothed stretch begins: at the start, or where most way lies ahead."""
-        assert self.log.imu is not None
-        assert self.log.gnss is not None
-        imu, gnss = self.log.imu.stamps, self.log.gnss
-        if imu[-1] - imu[0] <= LONGEST_S:
-            return float(imu[0])
-        starts = np.arange(imu[0], imu[-1] - LONGEST_S, LONGEST_S / 2)
-        at = np.column_stack([np.interp(starts, gnss.stamps, p) for p in gnss.positions.T])
-        later = np.column_stack([np.interp(starts + LONGEST_S, gnss.stamps, p) for p in gnss.positions.T])
-        return float(starts[np.argmax(np.linalg.norm(later - at, axis=1))])
+    def _is_short(self) -> bool:
+        """Whether the stretch that is smoothed is the whole drive."""
+        imu = self.log.imu
+        return imu is not None and float(imu.stamps[-1] - imu.stamps[0]) <= LONGEST_S
 
     @property
     def stretches(self) -> tuple[Stretch, ...]:
@@ -115,7 +114,7 @@ class Sample:
         last = len(scans) - 1 - STEPS[-1]
         if last < 0:
             return {}
-        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, 3, MOST_STRETCHES))
+        wanted = int(np.clip(len(scans) // SCANS_PER_STRETCH + 1, LEAST_STRETCHES, MOST_STRETCHES))
         firsts = np.unique(np.linspace(0, last, 3 * wanted).astype(int))
         motion = np.array([self._motion(first) for first in firsts])
         found: dict[float, Stretch | DataError | None] = {}
@@ -275,6 +274,23 @@ def _way(a: Array, b: Array) -> float:
     """Between two poses, m, a turn counted as at 10 m."""
     turn = np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1))
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3]) + 10.0 * turn)
+
+
+def _stretch_of(log: SensorLog) -> SensorLog:
+    """IMU and fixes of the stretch in which most way lies ahead."""
+    assert log.imu is not None
+    assert log.gnss is not None
+    stamps, gnss = log.imu.stamps, log.gnss
+    starts = np.arange(stamps[0], stamps[-1] - LONGEST_S, LONGEST_S / 2)
+    at = np.column_stack([np.interp(starts, gnss.stamps, p) for p in gnss.positions.T])
+    later = np.column_stack([np.interp(starts + LONGEST_S, gnss.stamps, p) for p in gnss.positions.T])
+    start = float(starts[np.argmax(np.linalg.norm(later - at, axis=1))])
+    return replace(
+        log,
+        imu=between(log.imu, start, start + LONGEST_S),
+        gnss=gnss[(gnss.stamps >= start) & (gnss.stamps <= start + LONGEST_S)],
+        initial_attitude=log.initial_attitude if start == stamps[0] else None,
+    )
 
 
 def between(imu: ImuSamples, start: float, end: float) -> ImuSamples:

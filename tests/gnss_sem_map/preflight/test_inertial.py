@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sensor_drives import FRAME, drive, findings, wrong
+from sensor_drives import FRAME, SETTINGS, drive, findings, wrong
 
 from factor_graphs.measurements import ImuNoise, ImuSamples
 from factor_graphs.simulation import follow, simulate_gnss, simulate_imu
 from gnss_sem_map.conventions import SensorConventions, matrix_of
 from gnss_sem_map.preflight.findings import Level
+from gnss_sem_map.preflight.sample import Sample
 from gnss_sem_map.sensor_log import Calibration, SensorLog
+from gnss_sem_map.trajectory import smooth_log
 
 Array = NDArray[np.float64]
 
@@ -111,3 +113,21 @@ def test_ten_samples_a_second_are_told_of_and_no_fault(right: SensorLog) -> None
     found = findings(replace(right, imu=imu))
     assert any("10 Hz: noise is read off the samples" in f.evidence for f in found)
     assert wrong(found) == []
+
+
+@pytest.mark.parametrize("seconds", [20.0, 120.0])
+def test_other_checks_see_the_trajectory_of_the_mended_unit(seconds: float) -> None:
+    right, frd = drive(3, seconds, ImuNoise()), matrix_of("frd")
+    good, bad = (Sample(log, SETTINGS, None) for log in (right, reporting(right, frd, frd)))
+    assert good.trajectory is not None
+    assert bad.trajectory is not None
+    np.testing.assert_array_equal(bad.trajectory.T_map_imu, good.trajectory.T_map_imu)
+    assert bad.whole_solution is None
+
+
+def test_a_run_takes_over_the_trajectory_of_a_short_drive_that_is_right() -> None:
+    short, long = (Sample(drive(3, seconds, ImuNoise()), SETTINGS, None) for seconds in (20.0, 120.0))
+    assert short.whole_solution is not None
+    assert long.whole_solution is None
+    alone = smooth_log(short.log, SETTINGS.trajectory).trajectory
+    np.testing.assert_array_equal(short.whole_solution.trajectory.T_map_imu, alone.T_map_imu)

@@ -14,7 +14,7 @@ from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.check_page import write_check_page
 from gnss_sem_map.pipeline import run
-from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError, amber, green, page_of, red
+from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError, amber, green, red
 
 RED = red("IMU axes", "mean specific force -9.8 m/s² along z", "z points down: FRD?", "set imu_axes: frd")
 AMBER = amber("GNSS", "5 % of the fixes stand still", "frozen receiver", "leave them out")
@@ -33,9 +33,9 @@ def upside_down(street: Street, folder: Path) -> Path:
 
 
 def test_a_page_is_as_bad_as_its_worst_finding() -> None:
-    assert page_of((), 0.1).level is Level.GREEN
-    assert page_of((green("a", "b"), AMBER), 0.1).level is Level.AMBER
-    page = page_of((AMBER, RED, green("a", "b")), 0.1)
+    assert Preflight((), 0.1).level is Level.GREEN
+    assert Preflight((green("a", "b"), AMBER), 0.1).level is Level.AMBER
+    page = Preflight((AMBER, RED, green("a", "b")), 0.1)
     assert page.level is Level.RED
     assert page.of(Level.RED) == (RED,)
     said = str(PreflightError("drive 5", page))

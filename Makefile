@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# As many processes as there are cores; the tests of one file share what they made.
+PYTEST := $(BIN)/pytest -n auto --dist loadfile
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 
@@ -20,19 +22,19 @@ $(TOOLS): $(PACKAGE)
 	touch $@
 
 test: $(TOOLS)
-	$(BIN)/pytest -m 'not slow and not faults'
+	$(PYTEST) -m 'not slow and not faults'
 
 notebooks: $(TOOLS)
-	$(BIN)/pytest --nbmake --nbmake-timeout=600 examples
+	$(PYTEST) --nbmake --nbmake-timeout=600 examples
 
 demo: $(PACKAGE)
 	$(BIN)/gnss-sem-map demo
 
 test-slow: $(TOOLS)
-	$(BIN)/pytest -m slow
+	$(PYTEST) -m slow
 
 test-faults: $(TOOLS)
-	$(BIN)/pytest tests/faults
+	$(PYTEST) tests/faults
 
 check: $(TOOLS)
 	$(BIN)/ruff format --check .

@@ -7,6 +7,7 @@ one of them amber or red, and the finding names the probable mistake and the lin
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.preflight import camera, inertial, positions, sweeps
@@ -26,5 +27,8 @@ def check(
     start = time.perf_counter()
     sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
     rooms = (inertial, positions, sweeps, *((camera,) if with_camera else ()))
-    findings = tuple(finding for room in rooms for finding in room.check(sample))
+    _ = sample.trajectory  # most checks need it: known before they run side by side
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda room: tuple(room.check(sample)), rooms))
+    findings = tuple(finding for some in found for finding in some)
     return Preflight(findings, time.perf_counter() - start, sample.whole_solution)

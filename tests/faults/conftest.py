@@ -14,11 +14,11 @@ TRIALS: Counter[str] = Counter()
 
 
 @pytest.fixture
-def trial() -> Callable[..., None]:
+def trial(request: pytest.FixtureRequest) -> Callable[..., None]:
     """Count one trial of a kind, and fail with all its faults when it has some: `trial("rights", faults, outcome)`."""
 
     def count(kind: str, faults: list[str] | None = None, about: object = "") -> None:
-        TRIALS[kind] += 1
+        request.node.user_properties.append(("trial", kind))
         assert not faults, f"{kind}: {'; '.join(faults or [])}\n{about}"
 
     return count
@@ -34,6 +34,12 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "odometry": street.write_odometry(folder / "odometry", made),
         "table": street.write_table_log(folder / "table", made),
     }
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    # reports come from every process that runs tests: a counter in each of them would not
+    if report.when == "call":
+        TRIALS.update(str(kind) for what, kind in report.user_properties if what == "trial")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

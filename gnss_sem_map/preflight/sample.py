@@ -28,7 +28,7 @@ from gnss_sem_map.trajectory import smooth_log
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
 """Of a longer drive so much is smoothed, and looked at closely."""
-SCANS_PER_STRETCH, LEAST_STRETCHES, MOST_STRETCHES = 40, 2, 5
+SCANS_PER_STRETCH, LEAST_STRETCHES, MOST_STRETCHES = 40, 3, 5
 """One stretch in so many scans: what is looked at grows with the drive, and so does the run."""
 LONGEST_STRETCH_S = 3.0
 SCANS_PER_IMAGE, LEAST_IMAGES, MOST_IMAGES = 30, 10, 12

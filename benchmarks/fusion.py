@@ -23,20 +23,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map import evaluation, labels, pipeline
+from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.evaluation import Tables
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.io.calibrating import fit_temperature, measure
-from gnss_sem_map.io.point_labels import label_files, read_labels
-from gnss_sem_map.label_calibration import LabelCalibration
-from gnss_sem_map.point_labels import label_points
-from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.label_files import label_files, read_labels
+from gnss_sem_map.evaluation import metrics
+from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
+from gnss_sem_map.evaluation.metrics import Tables
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.labels.sensor_model import LabelCalibration
+from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate
 
-URBAN = labels.label_set("urban")
+URBAN = open_label_set("urban")
 TABLES = Tables.of(URBAN)
 IDS = np.append(URBAN.semantic_kitti_ids, 0).astype(np.uint32)
 """Raw id of every class; -1, unlabelled, is the last."""
@@ -74,13 +76,13 @@ class Score:
 
     def figures(self) -> dict[str, Any]:
         """Strict accuracy and IoU, per class and on average, and the calibration error."""
-        found = evaluation.semantics(self.confusion, URBAN)
+        found = metrics.semantics(self.confusion, URBAN)
         hits, true = np.diag(self.confusion), self.confusion.sum(axis=1)
         union = np.maximum(true + self.confusion[:, :-1].sum(axis=0) - hits, 1)
         return found["strict"] | {
             "coverage": found["coverage"],
             "iou": {name: float(hits[i] / union[i]) for i, name in enumerate(URBAN.names) if true[i]},
-            "ece": evaluation.calibration(self.calibration)["ece"],
+            "ece": metrics.calibration(self.calibration)["ece"],
         }
 
 
@@ -100,14 +102,14 @@ def single_frame(excerpt: Excerpt, drive: Drive) -> Labels:
 
 def score(predicted: Labels, confidence: dict[str, NDArray[np.float32]], truth: Path, only: Labels) -> Score:
     """Counts over all scans, of the points that their own image labels."""
-    total = Score(np.zeros((5, 6), np.int64), np.zeros((evaluation.CALIBRATION_BINS, 3)))
+    total = Score(np.zeros((5, 6), np.int64), np.zeros((metrics.CALIBRATION_BINS, 3)))
     for name, path in label_files(truth).items():
         if name not in predicted:
             continue
         true = np.where(only[name] & 0xFFFF != 0, read_labels(path), 0).astype(np.uint32)
         total += Score(
-            evaluation.confusion(predicted[name], true, TABLES, name),
-            evaluation.calibration_counts(confidence[name], predicted[name], true, TABLES),
+            metrics.confusion(predicted[name], true, TABLES, name),
+            metrics.calibration_counts(confidence[name], predicted[name], true, TABLES),
         )
     return total
 

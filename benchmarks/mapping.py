@@ -33,22 +33,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import labels, seen_scans, tiles
-from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.labelling import ClassImage, class_image
-from gnss_sem_map.mapping import STATIC, Drive, fuse_scans, map_chunks
-from gnss_sem_map.seen_scans import SeenScan
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.labels.probabilities import KeepsLabels
+from gnss_sem_map.mapping import labelled_scans
+from gnss_sem_map.mapping.fusion import STATIC, Drive, fuse_scans, map_chunks
+from gnss_sem_map.mapping.labelled_scans import SeenScan
+from gnss_sem_map.run_stats import Account
+from gnss_sem_map.scans.projection import ClassImage, class_image
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.segmentation.probabilities import KeepsLabels
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
-from gnss_sem_map.voxel_kernels import _prefetch
-from gnss_sem_map.voxel_map import SemanticMap, VoxelTable
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.kernels import _prefetch
+from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelTable
 
 SETTINGS = Settings()
 SIZE = SETTINGS.mapping.voxel_size_m
-URBAN = labels.label_set()
+URBAN = open_label_set()
 Figures = dict[str, Any]
 
 
@@ -101,11 +103,11 @@ def whole_chain(job: Drive) -> Figures:
     """Read, deskew, project, occlusion, fuse: compiled against numpy, with decoded labels and with decoding them."""
     race, log = Race(), job.log
     table, plain = VoxelTable(SIZE, URBAN), numpy_chain.NumpyMap(SIZE, URBAN)
-    views = seen_scans.Views(job, Account())
+    views = labelled_scans.Views(job, Account())
     points = 0
 
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
-        seen = seen_scans._see(job, scan, scan.read(), (image, classes), views, Account())
+        seen = labelled_scans._see(job, scan, scan.read(), (image, classes), views, Account())
         assert seen is not None
         table.add(seen.keys, seen.pixels, seen.classes)
 
@@ -146,7 +148,7 @@ def real_time(job: Drive) -> Figures:
 
 def seen_of(job: Drive) -> list[SeenScan]:
     """The scans, placed and looked at once, for those who only fuse."""
-    return list(seen_scans.seen_scans(job))
+    return list(labelled_scans.seen_scans(job))
 
 
 def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]:
@@ -178,7 +180,9 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
 
 
 def _keys(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.int64]:
-    placed = seen_scans._see(job, seen.scan, points, None, seen_scans.Views(job, Account()), Account())
+    placed = labelled_scans._see(
+        job, seen.scan, points, None, labelled_scans.Views(job, Account()), Account()
+    )
     assert placed is not None
     return placed.keys
 

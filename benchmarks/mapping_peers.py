@@ -15,8 +15,8 @@ import numpy as np
 import numpy_chain
 from numpy.typing import NDArray
 
-from gnss_sem_map.mapping import Drive
-from gnss_sem_map.seen_scans import SeenScan
+from gnss_sem_map.mapping.fusion import Drive
+from gnss_sem_map.mapping.labelled_scans import SeenScan
 from gnss_sem_map.sensor_log import Points
 
 

@@ -28,24 +28,24 @@ import numpy as np
 import tracklets
 from numpy.typing import NDArray
 
-from gnss_sem_map import labels
-from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.evaluation import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.mapping import build_maps
-from gnss_sem_map.motion import find_moving
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.dynamics.moving_objects import MovingObjects
+from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.fusion import build_maps
+from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.pipeline import solve
 from gnss_sem_map.refinement import RefinementSettings, refine
 from gnss_sem_map.refinement.count_grid import count_grid
-from gnss_sem_map.refinement.dbscan import dbscan
-from gnss_sem_map.refinement.moving_objects import MovingObjects
-from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK
-from gnss_sem_map.voxel_map import SemanticMap, State, keys_of, pack
+from gnss_sem_map.voxels.dbscan import dbscan
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of, pack
 
-URBAN = labels.label_set()
+URBAN = open_label_set()
 TABLES = Tables.of(URBAN)
 RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
 RESULTS = Path(__file__).parent / "results" / "refinement.json"

@@ -34,13 +34,13 @@ from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import simulate_gnss, simulate_imu
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import sharpness
-from gnss_sem_map.deskew import points_in_map
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.io.kitti_raw import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
-from gnss_sem_map.scan_matching import ScanMatches, match_scans
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.kitti_raw import ATTITUDE_STDDEVS_RAD, OXTS_NOISE
+from gnss_sem_map.evaluation import map_sharpness
+from gnss_sem_map.evaluation.map_sharpness import Sharpness, SharpnessSettings
+from gnss_sem_map.scans.deskew import points_in_map
+from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_scans
 from gnss_sem_map.sensor_log import Calibration, Points, Scan, SensorLog
-from gnss_sem_map.sharpness import Sharpness, SharpnessSettings
 from gnss_sem_map.simulation import Simulation, prepare
 from gnss_sem_map.simulation.rig import T_IMU_LIDAR
 
@@ -171,7 +171,7 @@ def static_sharpness(log: SensorLog, trajectory: Trajectory, boxes: list[Any]) -
     stamps = np.array([scan.stamp for scan in log.scans])
     positions = trajectory.at(stamps, 0.15)[::10, :3, 3]
     length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-    return sharpness.of_clouds(static_clouds(log, trajectory, boxes, settings), length, settings)
+    return map_sharpness.of_clouds(static_clouds(log, trajectory, boxes, settings), length, settings)
 
 
 def static_clouds(
@@ -282,7 +282,7 @@ def simulated(seconds: float) -> dict[str, Any]:
     _, alone, matches, bound, cost = estimate(log)
     truth = true_trajectory(seconds)
     found = {"GNSS + IMU": alone.trajectory, "GNSS + IMU + LiDAR": bound.trajectory}
-    figures = dict(zip(found, sharpness.of_drive(log, list(found.values())), strict=True))
+    figures = dict(zip(found, map_sharpness.of_drive(log, list(found.values())), strict=True))
     show(f"simulated drive, {seconds:g} s", figures)
     accuracy = {name: per_100_m(t, truth) for name, t in found.items()}
     for name, a in accuracy.items():

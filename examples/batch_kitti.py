@@ -13,10 +13,11 @@ import sys
 from pathlib import Path
 
 from factor_graphs.errors import FactorGraphError
-from gnss_sem_map import config, labels, pipeline
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.export.run_folder import write_run
-from gnss_sem_map.io import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 
 
@@ -26,7 +27,7 @@ def map_drive(drive: Path, probabilities: Path, out: Path) -> str:
     log = open_drive(drive)
     size = log.calibration.image_size
     segmenter = open_segmenter(
-        f"labels:{probabilities}", labels.label_set(settings.classes), expected_size=size
+        f"labels:{probabilities}", open_label_set(settings.classes), expected_size=size
     )
     result = pipeline.run(log, segmenter, settings)
     about = write_run(out, drive, log, result, settings, write_labels=False)

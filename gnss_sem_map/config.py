@@ -12,12 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.labelling import LabellingSettings
+from gnss_sem_map.files.structured import not_finite, parse_yaml, read_yaml
+from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.refinement import RefinementSettings
-from gnss_sem_map.scan_matching import TrajectorySettings
-from gnss_sem_map.untrusted.files import shown
-from gnss_sem_map.untrusted.structured import not_finite, parse_yaml, read_yaml
-from gnss_sem_map.voxel_map import MappingSettings
+from gnss_sem_map.scans.lidar_odometry import TrajectorySettings
+from gnss_sem_map.scans.projection import LabellingSettings
+from gnss_sem_map.voxels.voxel_map import MappingSettings
 
 Model = TypeVar("Model", bound=BaseModel)
 

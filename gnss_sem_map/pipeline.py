@@ -24,24 +24,26 @@ from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import label_calibration, labels, preflight
-from gnss_sem_map.account import Account, Progress, silent
 from gnss_sem_map.config import Settings
-from gnss_sem_map.mapping import answers_fingerprint, build_maps
-from gnss_sem_map.motion import find_moving
-from gnss_sem_map.preflight.findings import Level, Preflight, PreflightError
+from gnss_sem_map.dynamics.moving_objects import MovingObjects
+from gnss_sem_map.evaluation import preflight
+from gnss_sem_map.evaluation.map_sharpness import Sharpness, of_drive
+from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.fusion import answers_fingerprint, build_maps
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.moving_points import find_moving
+from gnss_sem_map.mapping.surface_heights import surface_heights
+from gnss_sem_map.mapping.trajectory import estimate_trajectory, final, solve
 from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
-from gnss_sem_map.refinement.moving_objects import MovingObjects
-from gnss_sem_map.remembering import RememberedSegmenter, answers_folder
-from gnss_sem_map.seen_scans import Drive
+from gnss_sem_map.run_stats import Account, Progress, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
+from gnss_sem_map.segmentation.remembered import RememberedSegmenter, answers_folder
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.sharpness import Sharpness, of_drive
-from gnss_sem_map.surface_heights import surface_heights
-from gnss_sem_map.trajectory import estimate_trajectory, final, solve
-from gnss_sem_map.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State
 
 __all__ = ["Result", "check_drive", "estimate_trajectory", "run", "solve"]
 
@@ -91,8 +93,8 @@ def run(
     """
     log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
-    label_calibration.opened(
-        settings.calibration, labels.label_set(settings.classes)
+    sensor_model.opened(
+        settings.calibration, open_label_set(settings.classes)
     )  # of other classes: refused now
     page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
@@ -112,7 +114,7 @@ def run(
             )
     with account.stage("refinement"):
         progress("refinement", 0, 1)
-        calibration = label_calibration.opened(settings.calibration, maps.static.label_set)
+        calibration = sensor_model.opened(settings.calibration, maps.static.label_set)
         witnesses = found.witnesses if drive.matched else None
         refined, refinement = refine(
             maps.static, settings.refinement, maps.removed, found.objects, calibration, witnesses
@@ -161,7 +163,7 @@ def _without_moving(
         return drive, MovingObjects({}, ())
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
-        label_set = labels.label_set(settings.classes)
+        label_set = open_label_set(settings.classes)
         remembered = RememberedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
         drive = replace(drive, segmenter=remembered)
     with account.stage("motion"):

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.deskew import EXTRAPOLATE_S, KNOTS_PER_S
-from gnss_sem_map.labelling import NEAREST_DEPTH_M, ClassImage, LabellingSettings, exposure_stamp
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, KNOTS_PER_S
+from gnss_sem_map.scans.projection import NEAREST_DEPTH_M, ClassImage, LabellingSettings, exposure_stamp
 from gnss_sem_map.sensor_log import Calibration, Image, Points
-from gnss_sem_map.voxel_map import MappingSettings, VoxelMap, log_table, pack
+from gnss_sem_map.voxels.voxel_map import MappingSettings, VoxelMap, log_table, pack
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 from street import Street
 
-from gnss_sem_map import config, labels, pipeline
-from gnss_sem_map.io import open_drive
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 
 PAPER = Path(__file__).parents[1] / "examples" / "paper.yaml"
@@ -16,7 +17,7 @@ def test_the_paper_s_settings_do_what_the_paper_does_and_no_more(small_drive: St
     settings = config.load(PAPER)
     log = open_drive(small_drive.drive)
     segmenter = open_segmenter(
-        f"labels:{small_drive.labels}", labels.label_set(), expected_size=log.calibration.image_size
+        f"labels:{small_drive.labels}", open_label_set(), expected_size=log.calibration.image_size
     )
     result = pipeline.run(log, segmenter, settings)
     assert "scans matched" not in result.account.counts

@@ -16,9 +16,9 @@ from evo.tools import file_interface
 from plyfile import PlyData
 from street import Street
 
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 
-URBAN = label_set()
+URBAN = open_label_set()
 RAW_IDS = np.array([40, 48, 10, 50, 70, 0])
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map import labels
-from gnss_sem_map.deskew import EXTRAPOLATE_S
-from gnss_sem_map.evaluation import Tables, dynamic, dynamic_counts
-from gnss_sem_map.seen_scans import Drive, seen_scans
+from gnss_sem_map.evaluation.metrics import Tables, dynamic, dynamic_counts
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.sensor_log import Calibration
 
 VEHICLES = {"Car", "Van", "Truck", "Tram"}
@@ -113,7 +113,7 @@ def in_image(p_lidar: NDArray[np.float64], calibration: Calibration) -> NDArray[
 
 def removal(drive: Drive, moving: Mapping[int, NDArray[np.int64]], folder: Path) -> dict[str, float | None]:
     """How much of what moved was removed and of what stands kept; `moving` as `MovingObjects.points`."""
-    tables, boxes = Tables.of(labels.label_set(drive.settings.classes)), read(folder)
+    tables, boxes = Tables.of(open_label_set(drive.settings.classes)), read(folder)
     calibration = drive.log.calibration
     stamps = np.array([scan.stamp for scan in drive.log.scans])
     poses = drive.trajectory.at(stamps, EXTRAPOLATE_S) @ calibration.T_imu_lidar

@@ -6,9 +6,9 @@ from html import escape
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.export.report import findings_table, page_of
-from gnss_sem_map.preflight.findings import Level, Preflight
+from gnss_sem_map.files.atomic import replacing
 
 VERDICTS = {
     Level.GREEN: "Nothing speaks against this drive.",

@@ -8,18 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import config, label_calibration, labels, tiles
+from gnss_sem_map import config
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.run_folder import claimed_run
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.merging import Laid, merge_runs
-from gnss_sem_map.output.place import new_folder
+from gnss_sem_map.files.output_folder import new_folder
+from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.merging import Laid, merge_runs
 from gnss_sem_map.refinement import refine
-from gnss_sem_map.run_json import read_run
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 
 def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:
@@ -40,9 +43,9 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
 
 def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     settings = config.load(first / "config.yaml")
-    label_set = labels.label_set(settings.classes)
+    label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
-    calibration = label_calibration.opened(settings.calibration, label_set)
+    calibration = sensor_model.opened(settings.calibration, label_set)
     refined, _ = refine(merged.stands, settings.refinement, merged.removed, calibration=calibration)
     raw, frame = SemanticMap.of(merged.stands + merged.removed), merged.frame
     driven = Trajectory.load(first / "trajectory.parquet")

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.atomic import replacing
 from gnss_sem_map.export.point_cloud import drawable, visible
 from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
 from gnss_sem_map.export.render import FACE_LIGHT, Camera, draw_cubes, hollows
-from gnss_sem_map.labels import UNLABELLED, LabelSet
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.export.atomic import replacing
 from gnss_sem_map.export.utm import to_utm
-from gnss_sem_map.labels import LabelSet
-from gnss_sem_map.voxel_map import SemanticMap, State, unpack
+from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, unpack
 
 if TYPE_CHECKING:
     import laspy

@@ -11,7 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from gnss_sem_map.output.ownership import amend
+from gnss_sem_map.files.ownership import amend
 
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",

@@ -16,9 +16,9 @@ import numpy as np
 
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import tiles
-from gnss_sem_map.account import Account
 from gnss_sem_map.config import Settings
+from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS
+from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
@@ -26,13 +26,13 @@ from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.output.place import Claim, claimed, new_folder
+from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
+from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.pipeline import Result
-from gnss_sem_map.point_labels import label_points
-from gnss_sem_map.preflight.findings import Preflight
 from gnss_sem_map.refinement import RefinementReport
-from gnss_sem_map.refinement.verdicts import LEAST_TRACKED_POINTS
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels import tiles
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.files.atomic import replacing
 
 DEGREE_DIGITS = 9  # 0.1 mm of latitude
 

@@ -13,24 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gnss_sem_map.label_calibration import LabelCalibration
-from gnss_sem_map.labels import UNLABELLED, LabelSet
+from gnss_sem_map.dynamics.motion_state import MotionSettings, TrackedObject
+from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement import count_grid, vehicles
-from gnss_sem_map.refinement.clearing import ClearingSettings, seen_through
 from gnss_sem_map.refinement.count_grid import CountGridSettings
-from gnss_sem_map.refinement.flatness import flatness
-from gnss_sem_map.refinement.geometry import GeometrySettings, against
-from gnss_sem_map.refinement.ground import height_over_ground
+from gnss_sem_map.refinement.free_space import ClearingSettings, seen_through
+from gnss_sem_map.refinement.geometric_prior import GeometrySettings, against
+from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerbs import Kerbs, find_kerbs
 from gnss_sem_map.refinement.levels import StepSettings, tell_levels
-from gnss_sem_map.refinement.recapture import doubted, systematic_errors
-from gnss_sem_map.refinement.smoothing import SmoothingSettings, infer, mean_field
-from gnss_sem_map.refinement.testimony import Witnesses
+from gnss_sem_map.refinement.normals import flatness
+from gnss_sem_map.refinement.potts_mrf import SmoothingSettings, infer, mean_field
+from gnss_sem_map.refinement.road_sidewalk import on_ways
+from gnss_sem_map.refinement.systematic_error import doubted, systematic_errors
 from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
-from gnss_sem_map.refinement.verdicts import MotionSettings, TrackedObject
-from gnss_sem_map.refinement.ways import on_ways
-from gnss_sem_map.voxel_kernels import UNITS_PER_NAT
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, entropy_of, softmax
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, entropy_of, softmax
 
 __all__ = [
     "RefinementReport",

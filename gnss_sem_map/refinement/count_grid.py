@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import gammaln
 
-from gnss_sem_map.ahead import ahead
-from gnss_sem_map.voxel_kernels import AXIS_BITS, AXIS_MASK
+from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
 """Layer height, in voxels, that holds every column in one layer."""

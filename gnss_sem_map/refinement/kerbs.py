@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from gnss_sem_map.labels import UNLABELLED
+from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.levels import StepSettings
-from gnss_sem_map.refinement.ways import ROAD, around, meeting, on_ways, ways
-from gnss_sem_map.voxel_map import SemanticMap
+from gnss_sem_map.refinement.road_sidewalk import ROAD, around, meeting, on_ways, ways
+from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 REACH = 3
 """Levels of road and sidewalk are those within so many voxels to each side of a kerb."""

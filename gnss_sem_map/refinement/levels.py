@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import entr, expit, logit
 
-from gnss_sem_map.labels import UNLABELLED
-from gnss_sem_map.refinement.ways import ROAD, SIDEWALK, around, meeting, on_ways, ways
-from gnss_sem_map.voxel_map import SemanticMap, State, keys_of
+from gnss_sem_map.labels.label_set import UNLABELLED
+from gnss_sem_map.refinement.road_sidewalk import ROAD, SIDEWALK, around, meeting, on_ways, ways
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of
 
 CELL_M = 2.0
 REACH = (3, 3, 1)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
-from gnss_sem_map.refinement.dbscan import NOISE, TIE, dbscan
-from gnss_sem_map.voxel_map import pack, unpack
+from gnss_sem_map.dynamics.motion_state import Motion
+from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
+from gnss_sem_map.voxels.voxel_map import pack, unpack
 
 COLUMN = np.array([1, 1, 0], np.int32)
 """Times a voxel, its column."""
@@ -47,17 +47,6 @@ class VehicleSettings(BaseModel):
     longest_parked_m: float = Field(
         default=6.0, gt=0, description="Mode `paper`: a group this long moved, m (eta_L of eq. 13)."
     )
-
-
-class Motion(StrEnum):
-    """What became of an object."""
-
-    PARKED = "parked"
-    MOVING = "moving"
-    STOPPED_AND_LEFT = "stopped and left"
-    UNKNOWN = "unknown"
-    UNSUPPORTED = "unsupported"
-    """No vehicle at all: its voxels fall back to their second-best class."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.sensor_log import Image
 
 

@@ -15,15 +15,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.account import Progress, silent
-from gnss_sem_map.ahead import ahead
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import OTHER, LabelSet
-from gnss_sem_map.output.ownership import write_whole
-from gnss_sem_map.output.place import locked, real_path
+from gnss_sem_map.files.output_folder import locked, real_path
+from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.labels.label_set import OTHER, LabelSet
+from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.prefetch import ahead
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
-from gnss_sem_map.untrusted.structured import read_json
 
 ABOUT = "about.json"
 """Says who wrote a cache; frames of two segmenters are not mixed."""

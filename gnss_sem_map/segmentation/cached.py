@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
+from gnss_sem_map.files.archives import open_archive
+from gnss_sem_map.files.pictures import read_ids
+from gnss_sem_map.files.untrusted import inside, is_folder, shown
+from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
+from gnss_sem_map.labels.probabilities import LabelImage, check_shape, check_size, checked_probabilities
 from gnss_sem_map.segmentation import MissingLabels
-from gnss_sem_map.segmentation.probabilities import LabelImage, check_shape, check_size, checked_probabilities
 from gnss_sem_map.sensor_log import Image
-from gnss_sem_map.untrusted.archives import open_archive
-from gnss_sem_map.untrusted.files import inside, is_folder, shown
-from gnss_sem_map.untrusted.pictures import read_ids
 
 HARD_LABEL_PROBABILITY = 0.9
 """What a label image's class gets; the rest is spread evenly over the other classes, for no network is always right."""

@@ -16,13 +16,13 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
 from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import NetworkSegmenter, find_device, for_inference, from_logits
 from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
-from gnss_sem_map.untrusted.files import is_file, shown
 
 METADATA = "gnss_sem_map"
 """The entry of a safetensors file that holds what we know beyond the tensors, as JSON."""

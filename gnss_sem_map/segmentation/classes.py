@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.labels import LabelSet, taxonomy
+from gnss_sem_map.labels.label_set import LabelSet, taxonomy
 
 VOID = "void"
 """A channel of this name is dropped before the softmax: it was never trained to mean anything."""

@@ -25,7 +25,7 @@ from transformers.image_processing_base import ImageProcessingMixin
 from transformers.utils import logging
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import NetworkSegmenter, Probabilities, find_device, from_logits
 from gnss_sem_map.segmentation.pixels import scale_and_shrink

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from onnxruntime.capi import onnxruntime_pybind11_state as state
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.files.untrusted import is_file, open_file, shown
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.probabilities import resized_softmax
 from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels, scale_and_shrink, scaled
-from gnss_sem_map.segmentation.probabilities import resized_softmax
 from gnss_sem_map.sensor_log import Image
-from gnss_sem_map.untrusted.files import is_file, open_file, shown
 
 IMAGENET_MEAN = "0.485,0.456,0.406"
 IMAGENET_STD = "0.229,0.224,0.225"

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import LabelSet
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.probabilities import check_size, checked_probabilities
 from gnss_sem_map.segmentation.classes import named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels
-from gnss_sem_map.segmentation.probabilities import check_size, checked_probabilities
 from gnss_sem_map.sensor_log import Image
 
 

@@ -23,10 +23,10 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, interpolate
 
-from gnss_sem_map.account import Progress, silent
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import LabelSet
-from gnss_sem_map.output.ownership import MARKER, write_list
+from gnss_sem_map.files.ownership import MARKER, write_list
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import OTHER, UNLABELLED, LabelSet, taxonomy
+from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
 from gnss_sem_map.segmentation.cached import read_class_ids
-from gnss_sem_map.untrusted.pictures import read_picture
 
 IGNORE = 255
 """Truth of a pixel that nothing is learnt from."""

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.output.ownership import MARKER, read_list, write_list
-from gnss_sem_map.output.place import locked
+from gnss_sem_map.files.output_folder import locked
+from gnss_sem_map.files.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
@@ -26,12 +26,7 @@ from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_imu, camera_in_li
 from gnss_sem_map.simulation.town import build_town
 from gnss_sem_map.simulation.tracklets import write_tracklets
 from gnss_sem_map.simulation.traffic import EARLY_S, LATE_S, drive_through
-from gnss_sem_map.simulation.truth import (
-    seen_alone,
-    seen_boxes,
-    write_trajectory,
-    write_vehicles,
-)
+from gnss_sem_map.simulation.truth import seen_alone, seen_boxes, write_trajectory, write_vehicles
 from gnss_sem_map.simulation.world import World
 
 DATE = "2026_04_18"

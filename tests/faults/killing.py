@@ -67,7 +67,7 @@ def content(folder: Path) -> dict[str, str]:
 
 def write_result(out: Path, files: Mapping[str, str]) -> None:
     """A result of ours, as every command writes one."""
-    from gnss_sem_map.output.place import new_folder
+    from gnss_sem_map.files.output_folder import new_folder
 
     with new_folder(out) as folder:
         for name, text in files.items():
@@ -93,23 +93,23 @@ def write_run_like(out: Path, files: Mapping[str, str]) -> None:
 
 def map_street(drive: Path, probabilities: Path, work: Path) -> None:
     """Map a drive in chunks of four scans into a work folder, going on with what is there."""
-    from gnss_sem_map.account import Account
-    from gnss_sem_map.mapping import map_chunks
+    from gnss_sem_map.mapping.fusion import map_chunks
+    from gnss_sem_map.run_stats import Account
 
     map_chunks(street_drive(drive, probabilities), work, Account(), resume=True)
 
 
 def street_drive(drive: Path, probabilities: Path) -> Any:
     """A drive with the poses of its own navigation unit, in chunks of four scans."""
-    from gnss_sem_map import labels
     from gnss_sem_map.config import Settings
-    from gnss_sem_map.io import open_drive
-    from gnss_sem_map.seen_scans import Drive
+    from gnss_sem_map.datasets import open_drive
+    from gnss_sem_map.labels.label_set import open_label_set
+    from gnss_sem_map.mapping.labelled_scans import Drive
     from gnss_sem_map.segmentation import open_segmenter
 
     log = open_drive(drive)
     spec, size = f"labels:{probabilities}", log.calibration.image_size
-    segmenter = open_segmenter(spec, labels.label_set(), expected_size=size)
+    segmenter = open_segmenter(spec, open_label_set(), expected_size=size)
     assert log.reference is not None
     settings = Settings.model_validate({"mapping": {"scans_per_chunk": 4}})
     return Drive(log, log.reference, segmenter, settings)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.deskew import usable_points_at_stamp
-from gnss_sem_map.io import open_drive
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.scans.deskew import usable_points_at_stamp
 from gnss_sem_map.sensor_log import SensorLog
 
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.config import Settings
-from gnss_sem_map.deskew import usable_points_at_stamp
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.preflight.sample import Sample
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.scans.deskew import usable_points_at_stamp
 
 Array = NDArray[np.float64]
 Inject = Callable[[Path], None]

@@ -14,8 +14,10 @@ import street
 from faults import mutations
 from faults.fuzzing import Reader
 
-from gnss_sem_map import config, label_calibration, labels, tiles
-from gnss_sem_map.io import open_drive
+from gnss_sem_map import config
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels import label_set, sensor_model
+from gnss_sem_map.voxels import tiles
 
 FRAMES = range(4)
 CLASSES = ("road", "sidewalk", "vehicle", "building", "vegetation")
@@ -60,7 +62,7 @@ def scan(folder: Path) -> Reader:
     """A scan with point times, and the map's idea of where its points are."""
     from factor_graphs.errors import MeasurementError
     from factor_graphs.trajectory import Trajectory
-    from gnss_sem_map.deskew import points_in_map
+    from gnss_sem_map.scans.deskew import points_in_map
 
     reader = table("lidar/0.bin", mutations.floats, folder)
     log = open_drive(reader.file.parents[1])
@@ -78,7 +80,7 @@ def scan(folder: Path) -> Reader:
 
 
 def _read_now(path: Path, stamp: float) -> object:
-    from gnss_sem_map.io.table_log import _read_scan
+    from gnss_sem_map.datasets.csv_log import _read_scan
 
     return _read_scan(path, stamp, False, None)
 
@@ -87,7 +89,7 @@ def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     """A camera image."""
     import cv2
 
-    from gnss_sem_map.io.frames import read_image
+    from gnss_sem_map.datasets.frames import read_image
 
     folder.mkdir(parents=True)
     file = folder / f"0{suffix}"
@@ -104,7 +106,9 @@ def label_image(folder: Path) -> Reader:
 
     folder.mkdir(parents=True)
     cv2.imwrite(str(folder / "0.png"), np.random.default_rng(0).integers(0, 19, (96, 300), np.uint8))
-    return Reader(folder / "0.png", lambda: CachedLabels(folder, labels.label_set(), None), mutations.png)
+    return Reader(
+        folder / "0.png", lambda: CachedLabels(folder, label_set.open_label_set(), None), mutations.png
+    )
 
 
 def probabilities(folder: Path) -> Reader:
@@ -115,12 +119,12 @@ def probabilities(folder: Path) -> Reader:
     for other in sorted(made.labels.glob("*.npz"))[1:]:
         other.unlink()
     file = next(made.labels.glob("*.npz"))
-    return Reader(file, lambda: CachedLabels(made.labels, labels.label_set(), None), mutations.npz)
+    return Reader(file, lambda: CachedLabels(made.labels, label_set.open_label_set(), None), mutations.npz)
 
 
 def point_labels(folder: Path) -> Reader:
     """Labels of points, and the probabilities of them in a file of the same bytes."""
-    from gnss_sem_map.io.point_labels import read_confidence, read_labels
+    from gnss_sem_map.datasets.label_files import read_confidence, read_labels
 
     folder.mkdir(parents=True)
     file = folder / "0.label"
@@ -130,7 +134,7 @@ def point_labels(folder: Path) -> Reader:
 
 def tum(folder: Path) -> Reader:
     """A trajectory in TUM format."""
-    from gnss_sem_map.io.scoring import read_tum
+    from gnss_sem_map.evaluation.score_run import read_tum
 
     folder.mkdir(parents=True)
     file = folder / "t.tum"
@@ -176,7 +180,7 @@ def segmenter(folder: Path) -> Reader:
 
     def read() -> object:
         spec = file.read_bytes().decode("utf-8", "surrogateescape")
-        return open_segmenter(spec, labels.label_set(), "cpu", None)
+        return open_segmenter(spec, label_set.open_label_set(), "cpu", None)
 
     return Reader(file, read, mutate)
 
@@ -185,30 +189,30 @@ def shipped(name: str, opened: Callable[[Path], object], folder: Path) -> Reader
     """A class set or a taxonomy of the user's own."""
     folder.mkdir(parents=True)
     file = folder / "own.yaml"
-    shutil.copy(Path(labels.__file__).parent / "labels" / f"{name}.yaml", file)
+    shutil.copy(Path(label_set.__file__).parent / f"{name}.yaml", file)
     return Reader(file, lambda: opened(file), mutations.text)
 
 
 def _taxonomy(file: Path) -> object:
-    found = labels.taxonomy(file)
-    return [found.lookup(labels.label_set(), kind) for kind in found.ids]
+    found = label_set.taxonomy(file)
+    return [found.lookup(label_set.open_label_set(), kind) for kind in found.ids]
 
 
 def calibration(folder: Path) -> Reader:
     """What a network's answers are worth."""
     folder.mkdir(parents=True)
     file, n = folder / "calibration.yaml", len(CLASSES)
-    one = label_calibration.Street(
-        "a", np.full((n, n + 1), 7, np.int64), np.full((n, *label_calibration.CELLS), 2, np.int64)
+    one = sensor_model.Street(
+        "a", np.full((n, n + 1), 7, np.int64), np.full((n, *sensor_model.CELLS), 2, np.int64)
     )
-    file.write_text(label_calibration.LabelCalibration("urban", CLASSES, (one,), 1.5).to_yaml())
-    label_set = labels.label_set()
-    return Reader(file, lambda: label_calibration.read(file, label_set).log_likelihoods, mutations.text)
+    file.write_text(sensor_model.LabelCalibration("urban", CLASSES, (one,), 1.5).to_yaml())
+    urban = label_set.open_label_set()
+    return Reader(file, lambda: sensor_model.read(file, urban).log_likelihoods, mutations.text)
 
 
 def run_json(folder: Path) -> Reader:
     """What a run says of itself, as `calibrate` and the report read it."""
-    from gnss_sem_map.run_json import inputs_of, read_run
+    from gnss_sem_map.files.run_json import inputs_of, read_run
 
     folder.mkdir(parents=True)
     file = folder / "run.json"
@@ -225,12 +229,12 @@ def run_json(folder: Path) -> Reader:
 def small_map(folder: Path) -> Path:
     """The folder of a map of some voxels."""
     from factor_graphs.geodesy import LocalFrame
-    from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack
+    from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
 
     rng = np.random.default_rng(0)
     keys = np.unique(pack(rng.integers(-300, 300, (400, 3))))
     evidence = -rng.integers(0, 5000, (len(keys), len(CLASSES))).astype(np.int32)
-    voxels = VoxelMap(0.2, labels.label_set(), keys, evidence, np.ones(len(keys), np.uint32))
+    voxels = VoxelMap(0.2, label_set.open_label_set(), keys, evidence, np.ones(len(keys), np.uint32))
     folder.mkdir(parents=True)
     tiles.write(SemanticMap.of(voxels), folder / "map", LocalFrame(49, 8, 100))
     return folder / "map"
@@ -308,7 +312,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "settings": settings,
     "--set": one_setting,
     "segmenter": segmenter,
-    "class set": functools.partial(shipped, "urban", labels.label_set),
+    "class set": functools.partial(shipped, "urban", label_set.open_label_set),
     "taxonomy": functools.partial(shipped, "cityscapes", _taxonomy),
     "label calibration": calibration,
     "run.json": run_json,

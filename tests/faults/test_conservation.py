@@ -22,15 +22,16 @@ import street
 from faults.harness import gnss_sem_map
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import pipeline, tiles
-from gnss_sem_map.account import Account
+from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.export.run_folder import about_run, write_point_labels
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.labels import label_set
-from gnss_sem_map.seen_scans import Drive, SeenScan, seen_scans
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive, SeenScan, seen_scans
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels import tiles
 
 SETTINGS = Settings()
 SWEEPS = 12
@@ -86,7 +87,9 @@ class Place:
     def segmenter(self, log: SensorLog) -> Segmenter | None:
         if self.labels is None:
             return None
-        return open_segmenter(f"labels:{self.labels}", label_set(), expected_size=log.calibration.image_size)
+        return open_segmenter(
+            f"labels:{self.labels}", open_label_set(), expected_size=log.calibration.image_size
+        )
 
 
 @dataclass

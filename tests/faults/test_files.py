@@ -14,8 +14,8 @@ import pytest
 import street
 from faults.harness import gnss_sem_map
 
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.io import open_drive
 
 KITTI = [
     "../calib_imu_to_velo.txt", "../calib_velo_to_cam.txt", "../calib_cam_to_cam.txt", "oxts", "oxts/data",

@@ -23,9 +23,9 @@ from faults.killing import (
 )
 from street import Street
 
-from gnss_sem_map.account import Account
-from gnss_sem_map.mapping import REMOVED, STATIC, build_maps, map_chunks
-from gnss_sem_map.output.ownership import MARKER, is_partial
+from gnss_sem_map.files.ownership import MARKER, is_partial
+from gnss_sem_map.mapping.fusion import REMOVED, STATIC, build_maps, map_chunks
+from gnss_sem_map.run_stats import Account
 
 OLD = {
     "run.json": "{}",
@@ -161,7 +161,7 @@ def test_a_mapping_killed_at_every_second_change_goes_on_to_the_same_bytes(
 
 
 def clear_work(work: Path) -> None:
-    from gnss_sem_map.output import work_folder
+    from gnss_sem_map.files import work_folder
 
     work_folder.clear(work)
 

@@ -14,11 +14,13 @@ from faults import mistakes_inertial, mistakes_sweeps
 from faults.layouts import as_odometry, as_table_log, copy_of
 from faults.mistakes import Mistake
 
-from gnss_sem_map import config, labels, pipeline, preflight
-from gnss_sem_map.account import Account
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.preflight.findings import Level, Preflight
+from gnss_sem_map.evaluation import preflight
+from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
 
@@ -46,7 +48,7 @@ def page_of(drive: Path) -> tuple[Preflight | None, str]:
         )
         segmenter = None
         if folder is not None:
-            label_set = labels.label_set(settings.classes)
+            label_set = open_label_set(settings.classes)
             segmenter = open_segmenter(
                 f"labels:{folder}", label_set, expected_size=log.calibration.image_size
             )

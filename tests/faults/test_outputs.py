@@ -16,8 +16,8 @@ from faults.killing import content, write_result
 from street import Street
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.output.ownership import MARKER, is_whole
-from gnss_sem_map.output.place import new_folder
+from gnss_sem_map.files.output_folder import new_folder
+from gnss_sem_map.files.ownership import MARKER, is_whole
 
 RUN = {
     "run.json": "{}",

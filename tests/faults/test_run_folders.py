@@ -13,11 +13,12 @@ import pytest
 import street
 from faults.harness import gnss_sem_map
 
-from gnss_sem_map import config, tiles
+from gnss_sem_map import config
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.io.calibrating import calibrate
-from gnss_sem_map.io.scoring import score_run
-from gnss_sem_map.merging import merge_runs
+from gnss_sem_map.evaluation.fit_sensor_model import calibrate
+from gnss_sem_map.evaluation.score_run import score_run
+from gnss_sem_map.mapping.merging import merge_runs
+from gnss_sem_map.voxels import tiles
 
 RAW_IDS = {street.ROAD: 40, street.SIDEWALK: 48, street.VEHICLE: 10, street.BUILDING: 50}
 

@@ -12,8 +12,8 @@ from faults.harness import gnss_sem_map
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import split
 from factor_graphs.measurements import ImuSamples, far_off
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.io import open_drive
 
 ABSURD_S = ["1e9", "-1e9", "1e300", "1e18", "86400", "-100000", "nan"]
 ABSURD_DATES = [

@@ -13,10 +13,10 @@ import pytest
 from faults.killing import street_drive
 from street import Street
 
-from gnss_sem_map.account import Account
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import build_maps
-from gnss_sem_map.seen_scans import Drive
+from gnss_sem_map.mapping.fusion import build_maps
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.run_stats import Account
 
 UNGUARDED = """
 import sys

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from gnss_sem_map import config
 from gnss_sem_map.conventions import NAMED_AXES, SensorConventions, matrix_of
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.io import open_drive
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 RNG = np.random.default_rng(0)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from street import Street
 
-from gnss_sem_map import tiles
+from gnss_sem_map.voxels import tiles
 
 
 def command(*arguments: str | Path) -> list[str]:

@@ -5,11 +5,11 @@ import pytest
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.labels import LabelSet, label_set
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, pack
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, pack
 
 VOXEL_M = 0.2
-LABELS = label_set()
+LABELS = open_label_set()
 ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION = range(5)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.atomic import replacing
+from gnss_sem_map.files.atomic import replacing
 
 
 def half_of_a_map(path: Path) -> None:

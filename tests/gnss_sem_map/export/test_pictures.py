@@ -10,10 +10,10 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.render import Camera
-from gnss_sem_map.labels import label_set
-from gnss_sem_map.voxel_map import SemanticMap, VoxelMap, pack
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
 
-NAMES = label_set().names
+NAMES = open_label_set().names
 
 
 def strip(length_m: float) -> SemanticMap:
@@ -27,12 +27,12 @@ def strip(length_m: float) -> SemanticMap:
     evidence[len(road) :, NAMES.index("vegetation")] = -10
     order = np.argsort(pack(indices))
     hits = np.ones(len(indices), np.uint32)
-    return SemanticMap.of(VoxelMap(0.2, label_set(), pack(indices)[order], evidence[order], hits))
+    return SemanticMap.of(VoxelMap(0.2, open_label_set(), pack(indices)[order], evidence[order], hits))
 
 
 def near(image: np.ndarray, name: str, tolerance: float = 0.35) -> np.ndarray:
     """Where the image (h, w, 3) RGB shows a class: its colour, lighter or darker."""
-    colour = label_set().colours[NAMES.index(name)].astype(float)
+    colour = open_label_set().colours[NAMES.index(name)].astype(float)
     colour /= np.linalg.norm(colour)
     norm = np.maximum(np.linalg.norm(image.astype(float), axis=2), 1e-9)
     return np.asarray((image @ colour / norm > 1 - 0.02 * tolerance) & (image.min(axis=2) < 200))
@@ -63,7 +63,7 @@ def test_the_legend_names_the_classes_that_are_there_and_no_others(
     write_topview(street, tmp_path / "street.png")
     write_topview(strip(40), tmp_path / "strip.png")
     swatches = [read(tmp_path / name)[-80:] for name in ("street.png", "strip.png")]
-    colours = label_set().colours
+    colours = open_label_set().colours
     shown = [
         [name for name, c in zip(NAMES, colours, strict=True) if (s == c).all(axis=2).any()] for s in swatches
     ]

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement import RefinementSettings, refine
-from gnss_sem_map.voxel_map import State, VoxelMap, entropy_of, pack
+from gnss_sem_map.voxels.voxel_map import State, VoxelMap, entropy_of, pack
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 BUILDING = URBAN.index("building")
 
 

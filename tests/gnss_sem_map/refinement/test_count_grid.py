@@ -15,7 +15,7 @@ from gnss_sem_map.refinement.count_grid import (
     evidence_log_odds,
     paper_log_odds,
 )
-from gnss_sem_map.voxel_map import pack
+from gnss_sem_map.voxels.voxel_map import pack
 
 BUILDING, VEGETATION = 3, 4
 
@@ -33,7 +33,7 @@ def test_counts_are_those_of_a_loop_over_all_pairs(seed, cell, layer, reach):
     rng = np.random.default_rng(seed)
     keys, labels = voxels(rng, 120, 12)
     counts = count_grid(keys, labels, (BUILDING, VEGETATION), cell, layer, reach)
-    from gnss_sem_map.voxel_map import AXIS_OFFSET, unpack
+    from gnss_sem_map.voxels.voxel_map import AXIS_OFFSET, unpack
 
     indices = unpack(keys) + AXIS_OFFSET
     columns, layers = indices[:, :2] // cell, indices[:, 2] // layer

@@ -12,18 +12,19 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import logit
 from scipy.stats import norm
 
-from gnss_sem_map import config, labels, pipeline
-from gnss_sem_map.evaluation import Tables, confusion
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.io.point_labels import read_labels
-from gnss_sem_map.point_labels import PointLabels, label_points
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.label_files import read_labels
+from gnss_sem_map.evaluation.metrics import Tables, confusion
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.point_labels import PointLabels, label_points
 from gnss_sem_map.refinement.kerbs import Kerbs, find_kerbs
 from gnss_sem_map.refinement.levels import StepSettings
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, keys_of
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
 
-URBAN = labels.label_set()
+URBAN = open_label_set()
 ROAD, SIDEWALK, BUILDING = (URBAN.index(name) for name in ("road", "sidewalk", "building"))
 SIZE_M = 0.2
 

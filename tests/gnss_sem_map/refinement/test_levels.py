@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from sklearn.linear_model import LinearRegression
 
-from gnss_sem_map import labels
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement import RefinementSettings, levels, tell_ways
 from gnss_sem_map.refinement.levels import StepSettings, tell_levels
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, keys_of
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
 
-URBAN = labels.label_set()
+URBAN = open_label_set()
 ROAD, SIDEWALK, BUILDING = (URBAN.index(name) for name in ("road", "sidewalk", "building"))
 SIZE_M = 0.2
 Floats = NDArray[np.float64]

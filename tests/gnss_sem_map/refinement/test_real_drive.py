@@ -3,11 +3,11 @@
 import pytest
 import tracklets
 
-from gnss_sem_map import labels
 from gnss_sem_map.config import Settings
-from gnss_sem_map.io import open_drive
-from gnss_sem_map.motion import find_moving
-from gnss_sem_map.seen_scans import Drive
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.segmentation import open_segmenter
 
 DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
@@ -17,7 +17,7 @@ DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
 def test_the_van_and_the_car_go_and_the_parked_vehicles_stay(real_data):
     log = open_drive(real_data / DRIVE)
     segmenter = open_segmenter(
-        f"labels:{real_data / 'labels/kitti_raw_0005/probabilities'}", labels.label_set()
+        f"labels:{real_data / 'labels/kitti_raw_0005/probabilities'}", open_label_set()
     )
     drive = Drive(log, log.reference, segmenter, Settings())
     figures = tracklets.removal(drive, find_moving(drive).points, real_data / DRIVE)

@@ -5,11 +5,11 @@ import pytest
 from pydantic import ValidationError
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement import RefinementSettings, refine, with_removed
-from gnss_sem_map.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, pack
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, pack
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION = range(5)
 
 
@@ -167,7 +167,7 @@ def test_a_class_set_without_buildings_skips_that_step_and_says_so(tmp_path):
     file = tmp_path / "warehouse.yaml"
     file.write_text(f"name: warehouse\nclasses:\n{classes}")
     grid = np.array([(0, 0, 0), (1, 0, 0)])
-    refined, report = refine(voxel_map(grid, [0, 1], names=label_set(file)))
+    refined, report = refine(voxel_map(grid, [0, 1], names=open_label_set(file)))
     assert refined.labels.tolist() == [0, 1]
     skipped = {step.name: step.skipped for step in report.steps}
     assert "lacks" in skipped["building and vegetation"]

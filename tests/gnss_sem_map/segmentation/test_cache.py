@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import MissingLabels, open_segmenter
 from gnss_sem_map.segmentation.cache import STEP, write_cache
 from gnss_sem_map.segmentation.checkpoints import write_network
 from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet
 from gnss_sem_map.sensor_log import Image
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 CITYSCAPES = ("road", "sidewalk", "building", "vegetation", "car", "truck", "sky", "pole")
 
 

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import MissingLabels, open_segmenter
 from gnss_sem_map.sensor_log import Image
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 NAMES = (*URBAN.names, "other")
 DATA = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
 

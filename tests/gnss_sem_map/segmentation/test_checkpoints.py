@@ -12,14 +12,14 @@ import torch
 from safetensors.torch import save_file
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.checkpoints import write_network
 from gnss_sem_map.segmentation.networks import NetworkSegmenter
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet
 from gnss_sem_map.sensor_log import Image
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 PIXELS = np.random.default_rng(0).integers(0, 256, (45, 83, 3), dtype=np.uint8)
 KITTI6 = ("sky", "building", "road", "sidewalk", "vegetation", "car")
 

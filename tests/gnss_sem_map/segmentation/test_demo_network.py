@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from gnss_sem_map import label_calibration
-from gnss_sem_map.labels import label_set, taxonomy
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set, taxonomy
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, DEMO_NETWORK, open_segmenter
 from gnss_sem_map.segmentation.training import TrainingSettings, train
 from gnss_sem_map.segmentation.training_data import LabelledFolder
 from gnss_sem_map.sensor_log import Image
 from gnss_sem_map.simulation import prepare
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 DEMO_SEED = 0
 
 
@@ -49,7 +49,7 @@ def test_it_knows_the_classes_of_the_map_in_streets_it_has_not_seen(
 
 
 def test_its_calibration_is_of_other_streets_than_the_demos_and_trusts_its_answers() -> None:
-    found = label_calibration.read(DEMO_CALIBRATION, URBAN)
+    found = sensor_model.read(DEMO_CALIBRATION, URBAN)
     seeds = {int(street.name.split("_drive_")[1].split("_")[0]) for street in found.streets}
     assert seeds == {101, 102}
     assert found.log_likelihoods[:5].argmax(axis=1).tolist() == [0, 1, 2, 3, 4]

@@ -14,11 +14,11 @@ from torch.nn.functional import interpolate
 transformers = pytest.importorskip("transformers", reason="needs the extra [hf]")
 
 from gnss_sem_map.errors import ConfigError, DataError  # noqa: E402
-from gnss_sem_map.labels import label_set  # noqa: E402
+from gnss_sem_map.labels.label_set import open_label_set  # noqa: E402
 from gnss_sem_map.segmentation import open_segmenter  # noqa: E402
 from gnss_sem_map.sensor_log import Image  # noqa: E402
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 NAMES = ("road", "sidewalk", "car", "building", "vegetation", "sky")
 LABELS = {"id2label": dict(enumerate(NAMES)), "label2id": {name: i for i, name in enumerate(NAMES)}}
 PIXELS = np.random.default_rng(1).integers(0, 256, (64, 96, 3), dtype=np.uint8)

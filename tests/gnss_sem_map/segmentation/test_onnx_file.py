@@ -15,13 +15,13 @@ onnx = pytest.importorskip("onnx", reason="needs the package onnx")
 from onnx import TensorProto, helper  # noqa: E402
 
 from gnss_sem_map.errors import ConfigError, DataError  # noqa: E402
-from gnss_sem_map.labels import label_set  # noqa: E402
+from gnss_sem_map.labels.label_set import open_label_set  # noqa: E402
 from gnss_sem_map.segmentation import open_segmenter  # noqa: E402
 from gnss_sem_map.segmentation.checkpoints import write_network  # noqa: E402
 from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet  # noqa: E402
 from gnss_sem_map.sensor_log import Image  # noqa: E402
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 PIXELS = np.random.default_rng(2).integers(0, 256, (32, 64, 3), dtype=np.uint8)
 
 

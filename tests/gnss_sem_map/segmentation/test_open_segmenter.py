@@ -8,21 +8,21 @@ import sys
 import pytest
 
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import SCHEMES, no_segmenter_message, open_segmenter
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 
 WITHOUT = """
 import sys
 for name in {absent!r}:
     sys.modules[name] = None
 from gnss_sem_map.errors import ConfigError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 assert not set(sys.modules) & {{"torch", "cv2", "transformers", "onnxruntime"}} - set({absent!r})
 try:
-    open_segmenter({spec!r}, label_set("urban"))
+    open_segmenter({spec!r}, open_label_set("urban"))
 except ConfigError as error:
     print(error)
 """

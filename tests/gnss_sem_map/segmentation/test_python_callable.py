@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Image
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 PIXELS = np.random.default_rng(5).integers(0, 256, (9, 13, 3), dtype=np.uint8)
 
 MODULE = """

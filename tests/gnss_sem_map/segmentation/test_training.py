@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.labels import label_set
-from gnss_sem_map.output.ownership import write_list
+from gnss_sem_map.files.ownership import write_list
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.training import (
     NETWORK,
@@ -35,7 +35,7 @@ from gnss_sem_map.segmentation.training_data import (
 )
 from gnss_sem_map.sensor_log import Image
 
-URBAN = label_set("urban")
+URBAN = open_label_set("urban")
 CALM = TrainingSettings(
     width=16, steps=4, batch_size=2, crop_px=(64, 32), validate_every=2, learning_rate=3e-3, warmup_steps=2
 )
@@ -178,7 +178,7 @@ def test_another_class_set_gets_a_new_last_layer_on_the_old_network(streets: Any
     )
     timid = CALM.model_copy(update={"steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0})
     train(
-        **streets, out=tmp_path / "b", label_set=label_set(ground), settings=timid, device="cpu",
+        **streets, out=tmp_path / "b", label_set=open_label_set(ground), settings=timid, device="cpu",
         initial=tmp_path / "a" / NETWORK,
     )  # fmt: skip
     after = torch.load(tmp_path / "b" / STATE, weights_only=True)["network"]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.simulation import Simulation, corrupt_class_image, write_corrupted_labels
 from gnss_sem_map.simulation.corruption import CLASS_NAMES
@@ -68,7 +68,7 @@ def test_the_written_labels_are_a_segmenter_s_cache(
     folder = write_corrupted_labels(town_drive, tmp_path / "labels")
     assert len(list(folder.glob("*.npz"))) == 12
     size = (simulation.camera.width, simulation.camera.height)
-    cached = CachedLabels(folder, label_set("urban"), expected_size=size)
+    cached = CachedLabels(folder, open_label_set("urban"), expected_size=size)
     assert set(cached.class_names) == set(CLASS_NAMES)
 
 

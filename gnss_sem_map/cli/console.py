@@ -1,0 +1,156 @@
+"""What the terminal shows: progress, warnings, tables and summaries."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from gnss_sem_map.evaluation.preflight.findings import Preflight
+    from gnss_sem_map.run_stats import Progress
+    from gnss_sem_map.segmentation.cache import CacheReport
+
+
+@contextmanager
+def progress_bars() -> Iterator[Progress]:
+    """A progress bar per stage on stderr; nothing when that is not a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield show
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Warnings on stderr, a line each."""
+    for warning in warnings:
+        typer.echo(f"warning: {warning}", err=True)
+
+
+def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
+    """What a run was and cost, in three lines or as JSON."""
+    if as_json:
+        typer.echo(json.dumps(about))
+        return
+    counts, seconds = about["counts"], about["seconds"]
+    typer.echo(
+        f"{about['name']}: {counts.get('scans', 0)} scans, {counts.get('points', 0)} points,"
+        f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
+    )
+    typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
+    typer.echo(f"results in {out}")
+
+
+def print_merged(about: dict[str, Any], out: Path) -> None:
+    """What came of two runs, and how the second came to lie on the first; what does not fit on stderr."""
+    match, (first, second) = about["match"], about["merged"]
+    before, now = (_percent(match["coinciding"][moment]) for moment in ("by_georeference", "now"))
+    typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
+    if match["shift_m"] is not None:
+        typer.echo(
+            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {now} % of its voxels fall"
+            f" on {first}, {before} % did by georeference"
+        )
+    else:
+        typer.echo(f"{second} lies by georeference: {now} % of its voxels fall on {first}")
+        warn([f"{second} could not be laid onto {first}: {match['reason']}"] if match["reason"] else [])
+    typer.echo(f"results in {out}")
+
+
+def print_metrics(metrics: dict[str, Any]) -> None:
+    """One table: accuracy and IoU per class before and after refinement, then the single figures."""
+    from rich.console import Console
+    from rich.table import Table
+
+    raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
+    table = Table(
+        title="Semantics, % of labelled points",
+        caption="accuracy: of the points that carry the class, how many are of it (eq. 14; elsewhere: precision)",
+    )
+    table.add_column("class")
+    for column in ("accuracy raw", "refined", "IoU raw", "refined"):
+        table.add_column(column, justify="right")
+    for name, after in refined["classes"].items():
+        before = raw["classes"][name] or {}
+        after = after or {}
+        cells = (side.get(figure) for figure in ("accuracy", "iou") for side in (before, after))
+        table.add_row(name, *map(_percent, cells))
+    means = (side[f"mean_{figure}"] for figure in ("accuracy", "iou") for side in (raw, refined))
+    table.add_section()
+    table.add_row("mean", *map(_percent, means))
+    console = Console(soft_wrap=True)
+    console.print(table)
+    moving = metrics["dynamic"]
+    lines = [
+        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined, of all points",
+        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
+        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
+        f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",
+    ]
+    if "trajectory" in metrics:
+        t = metrics["trajectory"]
+        lines.append(
+            f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
+            f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
+            f" {100 * t['rpe_translation_share']:.2f} % relative"
+        )
+        if "position_nees_per_dof" in t:
+            lines.append(
+                f"  squared error by its claimed variance (NEES per degree of freedom): position"
+                f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
+                " honest is 1 on average over many drives"
+            )
+    for line in lines:
+        console.print(line, highlight=False)
+
+
+def print_cache(report: CacheReport, out: Path) -> None:
+    """How many images were segmented, what that cost, and how to use them."""
+    if not report.written and not report.skips:
+        there = f"all {report.kept} images are segmented" if report.kept else "the drive has no images"
+        typer.echo(f"nothing was to do: {there}")
+    else:
+        cost = f" ({report.bytes_per_frame / 1000:.0f} kB each, {report.images_per_second:.1f} images/s)"
+        typer.echo(
+            f"{report.written} images segmented{cost if report.written else ''}, {report.kept} kept,"
+            f" {len(report.skips)} skipped"
+        )
+    if report.written or report.kept:
+        typer.echo(f"now use --segmenter labels:{out}")
+
+
+def print_preflight(name: str, page: Preflight, out: Path) -> None:
+    """One page: every check with its level and what was found; under it the probable mistake and what to do."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(soft_wrap=True)
+    styles = {"green": "green", "amber": "yellow", "red": "bold red"}
+    console.print(
+        f"{name}: the pre-flight is {page.level} ({page.seconds:.1f} s)", highlight=False, markup=False
+    )
+    for found in page.findings:
+        level = str(found.level)
+        line = Text.assemble((f"{level:>5}", styles[level]), f"  {found.check}: {found.evidence}")
+        console.print(line, highlight=False)
+        for more in filter(None, (found.mistake, found.remedy)):
+            console.print(f"       {more}", highlight=False, markup=False)
+    console.print(f"results in {out}", highlight=False, markup=False)
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f}"

@@ -1,0 +1,302 @@
+"""Table logs: a user's own drive as plain tables, with scans and images beside them where there are any.
+
+    imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
+                                                       or as `imu_axes`, `force_unit`, `rate_unit` of log.yaml say
+    gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
+    log.yaml            optional: see `LogFile`
+    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
+    images/stamps.csv   number,stamp_s             images/<number>.png    rectified; or .jpg
+
+Stamps are seconds on one clock.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, ValidationError
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu, far_off
+from gnss_sem_map.conventions import SensorConventions
+from gnss_sem_map.datasets import frames
+from gnss_sem_map.datasets.gnss_fixes import usable_fixes
+from gnss_sem_map.datasets.stamps import (
+    LONGEST_FIX_STEP_S,
+    LONGEST_FRAME_STEP_S,
+    LONGEST_IMU_STEP_S,
+    LONGEST_SWEEP_S,
+    check_unit,
+    in_order,
+)
+from gnss_sem_map.errors import DataError, PointTimesError
+from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
+from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+
+Array = NDArray[np.float64]
+MOST_TABLE_BYTES = 1 << 30
+MOST_DIGITS = 19
+MOST_OUTSIDE = 0.1
+"""Share of a sweep's points that may have no time of it."""
+UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
+SWEEPS_S = (0.01, 0.6)
+"""What most of a sweep takes: scanners turn 2 to 50 times a second."""
+Matrix4 = tuple[
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+    tuple[float, float, float, float],
+]
+IDENTITY: Matrix4 = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+
+IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
+GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
+
+
+class LogFile(SensorConventions):
+    """What `log.yaml` may say about the drive; its axes, units and clocks are those of `SensorConventions`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    epoch_ns: int = Field(0, description="Unix time, ns, of stamp zero.")
+    p_imu_antenna: tuple[float, float, float] = Field(
+        (0, 0, 0), description="GNSS antenna in the imu frame, m."
+    )
+    T_imu_lidar: Matrix4 = Field(IDENTITY, description="LiDAR to IMU.")
+    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to rectified camera.")
+    K: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = (
+        Field(None, description="Intrinsics of the rectified camera, px.")
+    )
+    image_size: tuple[int, int] | None = Field(None, description="Width and height of the images, px.")
+    camera_time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
+    imu_noise: ImuNoise | None = Field(
+        None, description="Noise of the IMU; a good consumer unit when absent."
+    )
+    lidar_is_compensated: bool = Field(
+        False, description="Scans of four columns are already motion-compensated to their stamp."
+    )
+
+
+def read(drive: Path) -> SensorLog:
+    """Open a table log; raises DataError when a table is missing, malformed or empty."""
+    about = _about(drive / "log.yaml")
+    imu_rows = _table(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
+    gnss_rows, fix_skips = _fixes(drive / "gnss.csv")
+    frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
+    gnss, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
+    skips = [
+        Skip("samples", shown(drive / name), str(repairs))
+        for name, repairs in (("imu.csv", imu_repairs), ("gnss.csv", gnss_repairs))
+        if repairs.dropped
+    ]
+    scans, scan_skips = _scans(drive / "lidar", about.lidar_is_compensated)
+    images, image_skips = _images(drive / "images", about.image_size)
+    return SensorLog(
+        name=shown(drive.name),
+        epoch_ns=about.epoch_ns,
+        calibration=_calibration(about, drive / "log.yaml"),
+        scans=scans,
+        images=images,
+        frame=frame,
+        imu=imu,
+        gnss=gnss,
+        imu_noise=about.imu_noise,
+        conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
+        skips=(*skips, *fix_skips, *scan_skips, *image_skips),
+    )
+
+
+def _about(path: Path) -> LogFile:
+    if not is_file(path):
+        return LogFile()
+    try:
+        return LogFile.model_validate(read_yaml(path) or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise DataError(
+            f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; known keys are {sorted(LogFile.model_fields)}"
+        ) from None
+
+
+def _fixes(path: Path) -> tuple[Array, list[Skip]]:
+    """The rows of the receiver that are fixes, as they come, and what was left out."""
+    rows = _table(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S)
+    stamped = np.isfinite(rows[:, 0])
+    stamped[stamped] = ~far_off(rows[stamped, 0])
+    usable, skips = usable_fixes(rows[stamped, 0], rows[stamped, 1:4], rows[stamped, 4:7], shown(path))
+    if not stamped.all():
+        skips.append(
+            Skip("fix", shown(path), f"{(~stamped).sum()} rows: no stamp, or one far off all others")
+        )
+    if not usable.any():
+        raise DataError(
+            f"{shown(path)}: no usable fix among {len(rows)} rows; expected degrees and metres of WGS 84, and standard"
+            " deviations above 0" + (f"; found {skips[0].reason}" if skips else "")
+        )
+    return rows[stamped][usable], skips
+
+
+def _calibration(about: LogFile, path: Path) -> Calibration:
+    camera = (about.T_camera_lidar, about.K, about.image_size)
+    if any(part is None for part in camera) and any(part is not None for part in camera):
+        raise DataError(
+            f"{path}: a camera needs all of T_camera_lidar, K and image_size; found only some of them"
+        )
+    return Calibration(
+        T_imu_lidar=np.array(about.T_imu_lidar, np.float64),
+        T_camera_lidar=None if about.T_camera_lidar is None else np.array(about.T_camera_lidar, np.float64),
+        K=None if about.K is None else np.array(about.K, np.float64),
+        image_size=about.image_size,
+        p_imu_antenna=np.array(about.p_imu_antenna, np.float64),
+        camera_time_offset_s=about.camera_time_offset_s,
+    )
+
+
+def _table(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
+    """The named columns of a CSV file, whatever their order: (n, len(columns)); the first is a stamp, s."""
+    table = _columns(path, columns, dict.fromkeys(columns, "float64"))
+    rows = np.column_stack([table[name].to_numpy() for name in columns]).astype(np.float64)
+    check_unit(rows[:, 0], longest_step_s, shown(path))
+    return rows
+
+
+def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any:
+    """The named columns of a CSV file as an Arrow table; raises DataError for anything else."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: missing; expected a table with columns {','.join(columns)}")
+    content = read_bytes(path, MOST_TABLE_BYTES)
+    try:
+        options = csv.ConvertOptions(
+            include_columns=list(columns),
+            column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
+            strings_can_be_null=True,
+        )
+        table = csv.read_csv(pa.BufferReader(content), convert_options=options)
+        if len(set(table.column_names)) < len(columns):
+            raise ValueError("a column is there twice")
+    except (pa.ArrowException, ValueError, KeyError) as error:
+        raise DataError(
+            f"{shown(path)}: {' '.join(str(error).split())[:200]}; expected numbers in columns {','.join(columns)}"
+        ) from None
+    if table.num_rows == 0:
+        raise DataError(f"{shown(path)}: empty; expected rows of {','.join(columns)}")
+    return table
+
+
+def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
+    """Stamp of every frame, the first where there are several; and the lines that were left out.
+
+    A number may have 19 digits: it is never a floating number.
+    """
+    table = _columns(path, ("number", "stamp_s"), {"number": "string", "stamp_s": "float64"})
+    texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
+    check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
+    stamps: dict[int, float] = {}
+    skips = []
+    for line, (text, stamp) in enumerate(zip(texts, seconds.tolist(), strict=True), 2):
+        number = _whole(text or "")
+        if number is None or not np.isfinite(stamp):
+            skips.append(Skip(what, f"{shown(path)}: line {line}", "no number, or no stamp"))
+        elif number in stamps:
+            skips.append(Skip(what, f"{shown(path)}: line {line}", f"frame {number} has a stamp already"))
+        else:
+            stamps[number] = stamp
+    if not stamps:
+        raise DataError(f"{shown(path)}: found no whole number with a stamp among {len(texts)} rows")
+    return stamps, skips
+
+
+def _whole(text: str) -> int | None:
+    """A frame number, as `7`, `0007` or, as some programs write it, `7.0`; None for anything else."""
+    whole = text.strip()
+    head, point, tail = whole.partition(".")
+    if point and not tail.strip("0"):
+        whole = head
+    return int(whole) if whole.isdecimal() and len(whole) <= MOST_DIGITS else None
+
+
+def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
+    """Number, stamp and file of every frame that has both; and what was left out."""
+    found = frames.numbered(what, folder, *suffixes)
+    if not found.files and not is_file(folder / "stamps.csv"):
+        return [], found.skips
+    stamps, skips = _stamps(folder / "stamps.csv", what)
+    skips += [
+        Skip(what, shown(path), "no stamp for this frame")
+        for number, path in found.files.items()
+        if number not in stamps
+    ]
+    skips += frames.missing(what, folder, stamps, found.files) + found.skips
+    return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
+
+
+def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:
+    found, skips = _stamped("scan", folder, ".bin")
+    scans = [
+        Scan(path.stem, n, t, partial(_read_scan, path, t, is_compensated, frames.state_of(path)))
+        for n, t, path in found
+    ]
+    return in_order("scan", scans, skips), skips
+
+
+def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.State | None) -> Points:
+    if is_compensated:
+        rows = frames.read_points(path, 4, state)
+        return Points(rows[:, :3], rows[:, 3], None)
+    rows = frames.read_points(path, 5, state)
+    with np.errstate(invalid="ignore"):  # of NaN that signal
+        after = rows[:, 4].astype(np.float64)
+    _leave_out_of_sweep(rows, after, shown(path))
+    return Points(rows[:, :3], rows[:, 3], stamp + after)
+
+
+def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> None:
+    """Make points without a time of this sweep such as cannot be used; raises DataError when they are many."""
+    outside = ~(np.abs(after) <= LONGEST_SWEEP_S)
+    count = int(outside.sum())
+    if count > MOST_OUTSIDE * len(rows):
+        with np.errstate(invalid="ignore", over="ignore"):
+            largest = float(np.nanmax(np.abs(after), initial=0.0))
+        mistake = _mistake_of(after)
+        raise PointTimesError(
+            f"{where}: {count} of {len(rows)} point times are none, or up to {largest:.4g} s off the scan's stamp;"
+            f" expected seconds, at most {LONGEST_SWEEP_S:g}; {mistake}",
+            mistake,
+        )
+    if count:
+        rows[outside, :3], after[outside] = np.nan, 0.0
+    if np.ptp(after) > LONGEST_SWEEP_S:
+        raise DataError(
+            f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}"
+        )
+
+
+def _mistake_of(after: Array) -> str:
+    """What times of a sweep probably are that are no seconds after its stamp; none is sorted out by a few odd ones."""
+    known = after[np.isfinite(after)]
+    if not len(known):
+        return "point times are not numbers"
+    low, middle, high = np.percentile(known, [5, 50, 95])
+    unit = next(
+        (unit for size, unit in UNITS.items() if SWEEPS_S[0] <= (high - low) / size <= SWEEPS_S[1]), None
+    )
+    # a float32 holds the time of day, or of the epoch, too coarsely to tell the points of a sweep apart
+    if abs(middle) > LONGEST_SWEEP_S and high - low <= max(LONGEST_SWEEP_S, 1e-5 * abs(middle)):
+        return "point times are absolute, or of another clock than the scan stamps"
+    return f"point times are in {unit}" if unit else "point times are no seconds of one sweep"
+
+
+def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
+    found, skips = _stamped("image", folder, *frames.IMAGE_SUFFIXES)
+    images = [Image(n, t, partial(frames.read_image, path, size)) for n, t, path in found]
+    return in_order("image", images, skips), skips

@@ -1,0 +1,125 @@
+"""Files numbered by frame: the number in the name is the key, the position in the folder means nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, shown, status
+from gnss_sem_map.sensor_log import Skip
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+"""Of two images of one frame the first kind is read."""
+MOST_POINTS = 10_000_000
+FARTHEST_M, NEAREST_M = 1000.0, 1e-6
+"""No LiDAR on a road sees farther; and a coordinate nearer to zero, but not zero, is no measurement."""
+NO_POINTS, EVERY = 0.1, 8
+"""With so many of its points out of these bounds a file is no scan: of random bytes nine in ten coordinates are. Every
+eighth point tells it at no cost."""
+LARGEST_NUMBER = 2**63 - 1
+
+State = tuple[int, int]
+"""Size in bytes and time of the last change, ns, of a file."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The files of a folder by frame number, in order, and those that were left out."""
+
+    files: dict[int, Path]
+    skips: list[Skip]
+
+
+def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
+    """The files whose name is a number, of any of these endings; none when there is no such folder.
+
+    Of several files of one frame the one of the first ending stays, then the first by name. Raises DataError for a
+    folder that cannot be listed.
+    """
+    if not is_folder(folder):
+        return Frames({}, [])
+    of_kind = [path for path in inside(folder) if path.suffix.lower() in suffixes and path.stem.isdecimal()]
+    files: dict[int, Path] = {}
+    skips = []
+    for path in sorted(of_kind, key=lambda path: suffixes.index(path.suffix.lower())):
+        number = int(path.stem)
+        if number > LARGEST_NUMBER:
+            skips.append(Skip(what, shown(path), f"frame number above {LARGEST_NUMBER}"))
+        elif number in files:
+            skips.append(Skip(what, shown(path), f"frame {number} has another file, {files[number].name}"))
+        else:
+            files[number] = path
+    return Frames(dict(sorted(files.items())), skips)
+
+
+def state_of(path: Path) -> State | None:
+    """How a file is now, to be compared when it is read; None where that cannot be known."""
+    try:
+        found = status(path)
+    except DataError:
+        return None  # said when it is read
+    return None if found is None else (found.st_size, found.st_mtime_ns)
+
+
+def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDArray[np.float32]:
+    """Rows of little-endian float32 (n, columns).
+
+    Raises DataError for a file that is cut short, empty, too large, or no longer in the `state` that it was in.
+    """
+    with os.fdopen(open_file(path), "rb", buffering=0) as file:
+        found = os.fstat(file.fileno())
+        size = found.st_size
+        if state is not None and state != (size, found.st_mtime_ns):
+            raise DataError(
+                f"{shown(path)}: changed while the drive was read; found {size} bytes, once {state[0]}"
+            )
+        if size > 4 * columns * MOST_POINTS:
+            raise DataError(
+                f"{shown(path)}: found {size} bytes, more than {MOST_POINTS} points; is it a scan?"
+            )
+        try:
+            rows = np.empty((size // (4 * columns), columns), "<f4")
+            if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
+                raise DataError(
+                    f"{shown(path)}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more"
+                    " than 0"
+                )
+        except OSError as error:
+            raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
+    _refuse_other_bytes(rows, path)
+    return rows
+
+
+def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
+    """Points that were not measured, zero or not finite, are no reason to refuse a scan."""
+    sizes = np.abs(rows[::EVERY, :3])
+    out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
+    share = float(out.any(axis=1).mean())
+    if share > NO_POINTS:
+        raise DataError(
+            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
+            f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
+        )
+
+
+def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3); raises DataError for a damaged file or another (width, height) than the calibration's."""
+    return read_picture(path, size)
+
+
+def missing(what: str, folder: Path, known: Iterable[int], files: dict[int, Path]) -> list[Skip]:
+    """One skip for every run of known frames without a file."""
+    absent = sorted(set(known) - set(files))
+    breaks = [i for i in range(1, len(absent)) if absent[i] != absent[i - 1] + 1]
+    runs = [absent[a:b] for a, b in zip([0, *breaks], [*breaks, len(absent)], strict=True) if a < b]
+    return [
+        Skip(what, f"{shown(folder)}: frames {run[0]} to {run[-1]}", f"{len(run)} files missing", len(run))
+        for run in runs
+    ]

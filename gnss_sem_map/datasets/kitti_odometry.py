@@ -1,0 +1,177 @@
+"""KITTI odometry and SemanticKITTI sequences: `sequences/08` with poses in the camera frame.
+
+Scans are motion-compensated to mid sweep. Line k of `poses.txt` and `times.txt` belongs to frame k; both usually cover
+more frames than there are scans. `poses.txt` are T_camera0_k in the frame of the first camera, so
+T_map_lidar = inv(Tr) P Tr: the map is the lidar frame at frame 0, which is not georeferenced.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import far_off
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import frames, kitti_calibration
+from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
+from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+
+Array = NDArray[np.float64]
+
+SIX_DIGITS = 2e-4
+"""How far rows of six digits, multiplied many times over, are off a rotation."""
+FARTHEST_M = 1e6
+
+
+def read(sequence: Path) -> SensorLog:
+    """Open an odometry sequence; raises DataError when calibration, poses or times are missing or malformed."""
+    file = sequence / "calib.txt"
+    rows = kitti_calibration.read_rows(file, {"P2": 12, "Tr": 12})
+    Tr = rows["Tr"].reshape(3, 4)
+    Tr = kitti_calibration.transform(Tr[:, :3], Tr[:, 3], f"{shown(file)}: Tr")
+    times = _times(sequence / "times.txt")
+    poses = _poses(sequence / "poses.txt")
+    if len(times) != len(poses):
+        raise DataError(
+            f"{shown(sequence)}: found {len(poses)} poses and {len(times)} times, expected as many;"
+            " are poses.txt and times.txt of the same sequence?"
+        )
+    scan_files = frames.numbered("scan", sequence / "velodyne", ".bin")
+    image_files = frames.numbered("image", sequence / "image_2", *frames.IMAGE_SUFFIXES)
+    size = _image_size(image_files.files)
+    K, T_camera_camera0 = kitti_calibration.split_projection(rows["P2"], f"{shown(file)}: P2")
+    calibration = Calibration(
+        T_imu_lidar=np.eye(4), T_camera_lidar=T_camera_camera0 @ Tr, K=K, image_size=size
+    )
+    skips = [
+        *_left_out("scan", sequence / "velodyne", len(poses), scan_files),
+        *_left_out("image", sequence / "image_2", len(poses), image_files),
+    ]
+    return SensorLog(
+        name=f"sequence {shown(sequence.name)}",
+        epoch_ns=0,
+        calibration=calibration,
+        scans=tuple(
+            Scan(
+                path.stem,
+                number,
+                float(times[number]),
+                partial(_read_compensated, path, frames.state_of(path)),
+            )
+            for number, path in scan_files.files.items()
+            if number < len(poses)
+        ),
+        images=tuple(
+            Image(number, float(times[number]), partial(frames.read_image, path, size))
+            for number, path in image_files.files.items()
+            if number < len(poses)
+        ),
+        given=Trajectory(times, _lidar_poses(poses, Tr)),
+        skips=tuple(skips),
+    )
+
+
+def _left_out(what: str, folder: Path, poses: int, found: frames.Frames) -> list[Skip]:
+    """Frames with a pose and no file, files without a pose, and files of a frame that has another one."""
+    beyond = [path for number, path in found.files.items() if number >= poses]
+    return [
+        *(frames.missing(what, folder, range(poses), found.files) if is_folder(folder) else ()),
+        *(Skip(what, shown(path), "no pose for this frame") for path in beyond),
+        *found.skips,
+    ]
+
+
+def _times(path: Path) -> Array:
+    """Stamps, s, that increase; raises DataError, with the line, for anything else."""
+    times = _table(path, 1)[:, 0]
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if len(backwards):
+        line = int(backwards[0]) + 2
+        raise DataError(
+            f"{shown(path)}: line {line}: found {times[line - 1]:.9g} after {times[line - 2]:.9g}, expected times that"
+            " increase"
+        )
+    check_unit(times, LONGEST_FRAME_STEP_S, shown(path))
+    off = np.flatnonzero(far_off(times))
+    if len(off):
+        raise DataError(
+            f"{shown(path)}: line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others; expected the time of"
+            " one frame after the other"
+        )
+    return times
+
+
+def _poses(path: Path) -> Array:
+    """Poses (k, 3, 4); raises DataError, with the line, for one that is no rigid transform."""
+    poses = _table(path, 12).reshape(-1, 3, 4)
+    R = poses[:, :, :3]
+    with np.errstate(all="ignore"):
+        off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+        wrong = ~(off <= SIX_DIGITS) | ~(np.linalg.det(R) > 0)
+    if wrong.any():
+        line = int(np.flatnonzero(wrong)[0])
+        raise DataError(
+            f"{shown(path)}: line {line + 1}: {kitti_calibration.rotation_fault(R[line])}, expected a rotation in a"
+            f" rigid pose; {wrong.sum()} of {len(poses)} poses are like that"
+        )
+    far = ~(np.abs(poses[:, :, 3]) <= FARTHEST_M).all(axis=1)
+    if far.any():
+        line = int(np.flatnonzero(far)[0])
+        raise DataError(
+            f"{shown(path)}: line {line + 1}: found a position {np.abs(poses[line, :, 3]).max():.3g} m away, expected"
+            f" at most {FARTHEST_M:g} m"
+        )
+    return poses
+
+
+def _lidar_poses(poses: Array, Tr: Array) -> Array:
+    T_camera0_camera = np.tile(np.eye(4), (len(poses), 1, 1))
+    T_camera0_camera[:, :3] = poses
+    T_map_lidar: Array = np.linalg.inv(Tr) @ T_camera0_camera @ Tr
+    # poses.txt has six digits: make the rotations orthonormal again
+    u, _, vt = np.linalg.svd(T_map_lidar[:, :3, :3])
+    T_map_lidar[:, :3, :3] = u @ vt
+    return T_map_lidar
+
+
+def _read_compensated(path: Path, state: frames.State | None) -> Points:
+    rows = frames.read_points(path, state=state)
+    return Points(rows[:, :3], rows[:, 3], None)
+
+
+def _table(path: Path, columns: int) -> Array:
+    """Rows of numbers; raises DataError, with the line, for anything else."""
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: missing; expected one line of {columns} numbers per frame")
+    rows = []
+    for number, line in enumerate(read_lines(path), 1):
+        if not line.strip():
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise DataError(
+                f"{shown(path)}: line {number}: found {line[:40]!r}, expected {columns} finite numbers"
+            )
+        rows.append(row)
+    if not rows:
+        raise DataError(f"{shown(path)}: empty; expected one line of {columns} numbers per frame")
+    return np.array(rows)
+
+
+def _image_size(files: dict[int, Path]) -> tuple[int, int] | None:
+    """(width, height) of the first image that can be read: the odometry calibration does not say it."""
+    for path in files.values():
+        try:
+            height, width = frames.read_image(path, None).shape[:2]
+        except DataError:
+            continue
+        return width, height
+    return None

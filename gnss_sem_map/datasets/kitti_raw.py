@@ -1,0 +1,283 @@
+"""KITTI raw drives: `<date>/<date>_drive_<nnnn>_sync`, calibration in the date folder.
+
+Facts that this reader stands on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
+turns clockwise; raw scans are not motion-compensated; the stamp of a scan is its middle; the image is exposed 8.5 ms
+before its stamp; oxts jitters against the scans, so nothing may be paired by index. Line k of a stamp file belongs
+to frame k, and is blank when the frame is missing.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuSamples, far_off
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import frames, kitti_calibration
+from gnss_sem_map.datasets.gnss_fixes import usable_fixes
+from gnss_sem_map.datasets.stamps import in_order, sweep_fault
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
+from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+
+Array = NDArray[np.float64]
+STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
+FIRST_YEAR, LAST_YEAR = 1980, 2200
+"""Of GPS, and of nanoseconds in 64 bits."""
+MOST_ROW_BYTES = 10_000
+
+CAMERA_TIME_OFFSET_S = -0.0085
+ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.01])
+"""How far the unit's first roll, pitch and yaw are believed; a looser yaw lets a short track turn the whole map."""
+OXTS_NOISE = ImuNoise(
+    accelerometer_noise_density=5e-4,
+    gyroscope_noise_density=6e-5,
+    accelerometer_bias_walk=1e-5,
+    gyroscope_bias_walk=1e-6,
+    accelerometer_bias_stddev=0.02,
+    gyroscope_bias_stddev=1e-4,
+)
+"""Of the RT3003, whose rates and forces are already corrected for bias by its own filter. Gyroscopes by its data sheet,
+0.2 °/√h and stable to 2 °/h; accelerometers worse than by that, 0.005 m/s/√h, for it stands in a car that shakes."""
+OXTS_COLUMNS = 30
+LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
+SPECIFIC_FORCE = slice(11, 14)
+"""ax ay az: in the body; af al au are levelled with the unit's own attitude and would leak it."""
+ANGULAR_RATE = slice(17, 20)
+POSITION_ACCURACY = 23
+LEAST_ACCURACY_M = 1e-4
+"""Zero is no standard deviation; what is too small to be true is for the pre-flight to say."""
+
+
+def read(drive: Path) -> SensorLog:
+    """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed."""
+    calibration = _calibration(drive.parent, has_images=is_folder(drive / "image_02"))
+    oxts_ns, oxts, skips = _oxts(drive)
+    stamps = _seconds(oxts_ns, int(oxts_ns[0]))
+    is_fix, fix_skips = usable_fixes(
+        stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]], shown(drive / "oxts")
+    )
+    if not is_fix.any():
+        raise DataError(
+            f"{shown(drive / 'oxts')}: not one of {len(oxts)} rows is a fix; found {fix_skips[0].reason}; expected"
+            " degrees, metres of WGS 84 and an accuracy above 0 (columns 1 to 3, and 24)"
+        )
+    epoch_ns = int(oxts_ns[0])
+    fixes = oxts[is_fix]
+    frame = LocalFrame(*(float(v) for v in fixes[0, [LAT, LON, ALT]]))
+    accuracy = np.maximum(fixes[:, POSITION_ACCURACY], LEAST_ACCURACY_M)
+    gnss = GnssFixes(
+        stamps[is_fix], frame.to_map(*fixes[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
+    )
+    reference = Trajectory(gnss.stamps, _reference_poses(gnss.positions, fixes))
+    imu_stamps, imu_rows, imu_skips = _imu_rows(drive, epoch_ns, stamps, oxts)
+    scans, scan_skips = _scans(drive, epoch_ns)
+    images, image_skips = _images(drive, epoch_ns, calibration.image_size)
+    return SensorLog(
+        name=shown(drive.name),
+        epoch_ns=epoch_ns,
+        calibration=calibration,
+        scans=scans,
+        images=images,
+        frame=frame,
+        imu=ImuSamples(imu_stamps, imu_rows[:, SPECIFIC_FORCE], imu_rows[:, ANGULAR_RATE]),
+        gnss=gnss,
+        imu_noise=OXTS_NOISE,
+        initial_attitude=AttitudePrior(_attitudes(oxts[:1])[0], ATTITUDE_STDDEVS_RAD),
+        reference=reference,
+        skips=(*skips, *fix_skips, *imu_skips, *scan_skips, *image_skips),
+    )
+
+
+def _calibration(date: Path, has_images: bool) -> Calibration:
+    file = date / "calib_imu_to_velo.txt"
+    imu_to_velo = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
+    T_lidar_imu = kitti_calibration.transform(imu_to_velo["R"], imu_to_velo["T"], f"{shown(file)}: R")
+    T_imu_lidar = np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
+    if not has_images:
+        return Calibration(T_imu_lidar)
+    of_lidar, of_cameras = date / "calib_velo_to_cam.txt", date / "calib_cam_to_cam.txt"
+    velo_to_cam = kitti_calibration.read_rows(of_lidar, {"R": 9, "T": 3})
+    cameras = kitti_calibration.read_rows(of_cameras, {"R_rect_00": 9, "P_rect_02": 12, "S_rect_02": 2})
+    K, T_camera_camera0 = kitti_calibration.split_projection(
+        cameras["P_rect_02"], f"{shown(of_cameras)}: P_rect_02"
+    )
+    T_camera0_rectified = kitti_calibration.transform(
+        cameras["R_rect_00"], np.zeros(3), f"{shown(of_cameras)}: R_rect_00"
+    )
+    T_camera0_lidar = kitti_calibration.transform(velo_to_cam["R"], velo_to_cam["T"], f"{shown(of_lidar)}: R")
+    return Calibration(
+        T_imu_lidar=T_imu_lidar,
+        T_camera_lidar=T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar,
+        K=K,
+        image_size=kitti_calibration.image_size(cameras["S_rect_02"], f"{shown(of_cameras)}: S_rect_02"),
+        camera_time_offset_s=CAMERA_TIME_OFFSET_S,
+    )
+
+
+def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
+    """Unix nanoseconds by frame number; blank lines are frames that do not exist, absurd years are left out."""
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
+    stamps, skips = {}, []
+    for number, line in enumerate(read_lines(path)):
+        text = line.strip()
+        if not text:
+            continue
+        if STAMP.fullmatch(text) is None:
+            raise _no_stamp(path, number, text)
+        if not FIRST_YEAR <= int(text[:4]) <= LAST_YEAR:
+            skips.append(
+                Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, no time of a drive")
+            )
+            continue
+        try:
+            stamps[number] = int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))
+        except ValueError:
+            raise _no_stamp(path, number, text) from None
+    return stamps, skips
+
+
+def _no_stamp(path: Path, number: int, text: str) -> DataError:
+    return DataError(
+        f"{shown(path)}: line {number + 1}: found {text[:40]!r}, expected `yyyy-mm-dd hh:mm:ss.nnnnnnnnn`"
+    )
+
+
+def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
+    return np.asarray((stamps_ns - epoch_ns) * 1e-9, np.float64)
+
+
+def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
+    """Stamps and rows of the navigation unit, sorted, without repeats; and what was left out."""
+    found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
+    stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
+    skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
+    rows: dict[int, Array] = {}
+    for number, path in found.files.items():
+        fault, row = _oxts_row(path)
+        if number not in stamps:
+            fault = "no stamp for this frame"
+        elif not fault and stamps[number] in rows:
+            fault = "repeated stamp"
+        if fault:
+            skips.append(Skip("oxts", shown(path), fault))
+        else:
+            rows[stamps[number]] = row
+    order = sorted(rows)
+    off = far_off(np.array(order, np.float64) * 1e-9)
+    for stamp, is_off in zip(order, off, strict=True):
+        if is_off:
+            skips.append(
+                Skip(
+                    "oxts", shown(drive / "oxts"), f"stamp {np.datetime64(stamp, 'ns')} is far off all others"
+                )
+            )
+    order = [stamp for stamp, is_off in zip(order, off, strict=True) if not is_off]
+    if len(order) < 3:
+        raise DataError(
+            f"{shown(drive / 'oxts')}: found {len(order)} usable rows of {len(found.files)}, expected at least 3"
+            + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else "")
+        )
+    return np.array(order, np.int64), np.stack([rows[stamp] for stamp in order]), skips
+
+
+def _oxts_row(path: Path) -> tuple[str, Array]:
+    """What is wrong with a row of the navigation unit, if anything, and its numbers; the accuracy may be none."""
+    try:
+        row = np.array(read_text(path, MOST_ROW_BYTES).split(), np.float64)
+    except DataError as error:
+        return str(error), np.empty(0)
+    except ValueError:
+        row = np.empty(0)
+    if row.shape != (OXTS_COLUMNS,) or not np.isfinite(np.delete(row, POSITION_ACCURACY)).all():
+        return f"found {row.size} numbers, expected {OXTS_COLUMNS} finite ones", row
+    if not (np.abs(row[[*range(11, 14), *range(17, 20)]]) <= LARGEST_OF_IMU).all():
+        return "found a force or a rate that no sensor gives", row
+    return "", row
+
+
+def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[Array, Array, list[Skip]]:
+    """The 100 Hz rows of the `_extract` twin when it lies beside the drive, else the 10 Hz rows of the drive."""
+    twin = drive.with_name(drive.name.replace("_sync", "_extract"))
+    if twin == drive or not is_folder(twin / "oxts" / "data"):
+        return stamps, oxts, []
+    twin_ns, rows, skips = _oxts(twin)
+    return _seconds(twin_ns, epoch_ns), rows, skips
+
+
+def _reference_poses(positions: Array, oxts: Array) -> Array:
+    """What the unit itself says: T_map_imu (k, 4, 4)."""
+    T_map_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
+    T_map_imu[:, :3, :3] = _attitudes(oxts)
+    T_map_imu[:, :3, 3] = positions
+    return T_map_imu
+
+
+def _attitudes(oxts: Array) -> Array:
+    """R_map_imu (k, 3, 3) by the unit itself. Yaw is 0 towards east, counter-clockwise."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_euler("ZYX", oxts[:, [YAW, PITCH, ROLL]]).as_matrix())
+
+
+def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
+    folder = drive / "velodyne_points"
+    found = frames.numbered("scan", folder / "data", ".bin")
+    if not found.files:
+        return (), found.skips + _all_missing("scan", folder)
+    (middle, skips), (start, in_start), (end, in_end) = (
+        _stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
+    )
+    skips += in_start + in_end + found.skips + frames.missing("scan", folder, middle, found.files)
+    scans = []
+    for number, path in found.files.items():
+        if number not in middle or number not in start or number not in end:
+            skips.append(Skip("scan", shown(path), "no stamp for this frame"))
+            continue
+        stamp, begun, ended = ((t[number] - epoch_ns) * 1e-9 for t in (middle, start, end))
+        fault = sweep_fault(stamp, begun, ended)
+        if fault is not None:
+            skips.append(Skip("scan", shown(path), fault))
+        else:
+            read = partial(_read_sweep, path, begun, ended, frames.state_of(path))
+            scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
+    return in_order("scan", scans, skips), skips
+
+
+def _read_sweep(path: Path, start: float, end: float, state: frames.State | None) -> Points:
+    """A sweep with the stamp of every point, from its azimuth: rear, left, front, right, rear."""
+    rows = frames.read_points(path, state=state)
+    azimuths = np.arctan2(rows[:, 1], rows[:, 0], dtype=np.float64)
+    stamps = azimuths * ((start - end) / (2 * np.pi))
+    stamps += (start + end) / 2
+    return Points(rows[:, :3], rows[:, 3], stamps)
+
+
+def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
+    folder = drive / "image_02"
+    found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
+    if not found.files:
+        return (), found.skips + _all_missing("image", folder)
+    stamps, skips = _stamps_ns(folder / "timestamps.txt")
+    skips += found.skips + frames.missing("image", folder, stamps, found.files)
+    images = []
+    for number, path in found.files.items():
+        if number in stamps:
+            stamp = (stamps[number] - epoch_ns) * 1e-9
+            images.append(Image(number, stamp, partial(frames.read_image, path, size)))
+        else:
+            skips.append(Skip("image", shown(path), "no stamp for this frame"))
+    return in_order("image", images, skips), skips
+
+
+def _all_missing(what: str, folder: Path) -> list[Skip]:
+    """The frames of a sensor that has no file at all, if it has stamps."""
+    path = folder / "timestamps.txt"
+    return frames.missing(what, folder, _stamps_ns(path)[0], {}) if is_file(path) else []

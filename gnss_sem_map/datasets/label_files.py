@@ -1,0 +1,50 @@
+"""SemanticKITTI `.label` files: one little-endian uint32 per point, and folders of them keyed by scan name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import inside, is_folder, read_bytes, shown
+
+MOST_LABEL_BYTES = 1 << 28
+
+
+def read_labels(path: Path) -> NDArray[np.uint32]:
+    """The entries of one file; raises DataError when it is cut short."""
+    return _values(path, "<u4")
+
+
+def read_confidence(path: Path) -> NDArray[np.float16]:
+    """The probabilities of one file; raises DataError when it is cut short, or they are none."""
+    found = _values(path, "<f2")
+    if not ((found >= 0) & (found <= 1)).all():
+        raise DataError(f"{shown(path)}: found values outside 0..1, expected probabilities")
+    return found
+
+
+def _values(path: Path, dtype: str) -> NDArray[Any]:
+    content, size = read_bytes(path, MOST_LABEL_BYTES), np.dtype(dtype).itemsize
+    if len(content) % size:
+        raise DataError(
+            f"{shown(path)}: truncated label file; found {len(content)} bytes, expected a multiple of {size}"
+        )
+    return np.frombuffer(content, dtype)
+
+
+def label_files(folder: Path) -> dict[str, Path]:
+    """The label files of a folder by scan name; raises DataError when there are none."""
+    found = inside(folder) if is_folder(folder) else []
+    files = {path.stem: path for path in found if path.suffix == ".label"}
+    if not files:
+        raise DataError(f"{shown(folder)}: no .label files; expected one per scan")
+    return files
+
+
+def truth_folder(truth: Path) -> Path:
+    """Where the truth's labels are: the folder itself, or `labels` in it."""
+    return truth / "labels" if is_folder(truth / "labels") else truth

@@ -1,0 +1,1 @@
+"""Moving objects, found in the scans before there is a map."""

@@ -1,0 +1,299 @@
+"""How sharp the map is: bad poses, calibration or time offsets show as blur, and need no truth to be seen.
+
+Points are gathered in cubes of half a metre. Where many sweeps saw the same cube, its points should lie on one
+surface: the standard deviation across the surface is its thickness. Sharpness is consistency, not accuracy: a bent
+map can be sharp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
+from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.voxels import kernels
+from gnss_sem_map.voxels.voxel_map import keys_of
+
+Array = NDArray[np.float64]
+Keys = NDArray[np.int64]
+
+UPPER = np.triu_indices(3)
+GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
+"""A surface is ground when its normal is steeper than the first (its z), a wall when flatter than the second."""
+LENGTH_STEP_S = 1.0
+THINNEST_M = 1e-4
+"""No LiDAR measures finer: keeps the logarithm of the entropy finite."""
+SCANS, LAST_SCAN, SUMS = 1, 2, 3
+"""Words of a cube's row behind its key: sweeps that saw it, the last of them, and ten sums (float64): the number of
+points, first and second moments about the cube's middle."""
+CUBE_WORDS = SUMS + 10
+SMALLEST_TABLE = 1 << 14
+
+
+class SharpnessSettings(BaseModel):
+    """How sharpness is measured; figures are comparable only with the same settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    nearest_m: float = Field(3.5, ge=0, description="Nearer returns are left out.")
+    farthest_m: float = Field(50.0, gt=0, description="Farther returns are left out.")
+    every_nth_point: int = Field(3, gt=0, description="Of every sweep, this part of the points is used.")
+    cell_size_m: float = Field(0.5, gt=0, description="Edge of the cubes whose thickness is measured.")
+    min_points: int = Field(30, ge=4, description="Cubes with fewer points do not count.")
+    min_scans: int = Field(10, gt=0, description="Nor do those that fewer sweeps saw.")
+    voxel_size_m: float = Field(0.2, gt=0, description="Edge of the voxels that are counted.")
+    max_scans: int = Field(
+        400, gt=0, description="A longer drive is sampled in stretches that sum up to this."
+    )
+    stretch_scans: int = Field(40, gt=0, description="Sweeps in a row of every stretch.")
+
+
+@dataclass(frozen=True, eq=False)
+class Sharpness:
+    """How sharp a map is; NaN where no cube was seen often enough."""
+
+    thickness_m: float
+    """Median over the cubes of the standard deviation across the surface."""
+    ground_thickness_m: float
+    wall_thickness_m: float
+    mean_map_entropy: float
+    """Mean over the cubes of ½ ln det(2 π e covariance), nat (Droeschel, Stückler, Behnke 2014); lower is sharper."""
+    voxels_per_m: float
+    """Occupied voxels per metre driven; NaN where the vehicle stood."""
+    voxels: int
+    cells: int
+    scans: int
+
+    def as_dict(self) -> dict[str, float | int | None]:
+        """The figures by name, None for NaN: JSON has no NaN."""
+        return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
+
+
+def of_clouds(
+    clouds: Iterable[Array], length_m: float, settings: SharpnessSettings | None = None
+) -> Sharpness:
+    """Sharpness of sweeps whose points (n, 3) are in the map; `length_m` is how far the vehicle drove."""
+    settings = settings or SharpnessSettings()
+    stretch = _Stretch(settings)
+    for p_map in clouds:
+        stretch.add(_Cloud.of(p_map, settings))
+    return _sharpness([stretch], length_m)
+
+
+def of_drive(
+    log: SensorLog,
+    trajectories: Sequence[Trajectory],
+    settings: SharpnessSettings | None = None,
+    progress: Progress = silent,
+) -> list[Sharpness]:
+    """Sharpness of one drive by each of several trajectories; every sweep is read once.
+
+    Sweeps that cannot be read, or that leave a trajectory, are left out for all of them. What moves is not taken
+    out: it blurs alike for every trajectory.
+    """
+    settings = settings or SharpnessSettings()
+    stretches = _stretches(log.scans, settings)
+    gathered = [[_Stretch(settings) for _ in stretches] for _ in trajectories]
+    stamps: list[list[float]] = [[] for _ in stretches]
+    numbered = [(n, scan) for n, stretch in enumerate(stretches) for scan in stretch]
+
+    def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
+        return _clouds(numbered_scan[1], trajectories, log.calibration.T_imu_lidar, settings)
+
+    for done, ((n, scan), clouds) in enumerate(ahead(clouds_of, numbered), 1):
+        if clouds is not None:
+            stamps[n].append(scan.stamp)
+            for of_one, cloud in zip(gathered, clouds, strict=True):
+                of_one[n].add(cloud)
+        progress("sharpness", done, len(numbered))
+    lengths = [sum(_length(t, np.array(s)) for s in stamps) for t in trajectories]
+    return [_sharpness(of_one, length) for of_one, length in zip(gathered, lengths, strict=True)]
+
+
+def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tuple[Scan, ...]]:
+    """The whole drive, or stretches of neighbouring sweeps spread evenly over it."""
+    if len(scans) <= settings.max_scans:
+        return [scans] if scans else []
+    count = max(1, settings.max_scans // settings.stretch_scans)
+    starts = np.linspace(0, len(scans) - settings.stretch_scans, count).astype(int)
+    return [scans[start : start + settings.stretch_scans] for start in starts.tolist()]
+
+
+def _clouds(
+    scan: Scan, trajectories: Sequence[Trajectory], T_imu_lidar: Array, settings: SharpnessSettings
+) -> list[_Cloud] | None:
+    """A sweep in the map, by each trajectory; None when it cannot be read, or leaves a trajectory or the map."""
+    every, (nearest_m, farthest_m) = settings.every_nth_point, (settings.nearest_m, settings.farthest_m)
+    try:
+        points = scan.read()
+        stamps = None if points.stamps is None else points.stamps[::every]
+        some = Points(points.xyz[::every], points.intensity[::every], stamps)
+        placed = [
+            usable_points_in_map(some, scan.stamp, t, T_imu_lidar, nearest_m, farthest_m)[0]
+            for t in trajectories
+        ]
+        return [_Cloud.of(p_map, settings) for p_map in placed]
+    except (DataError, MeasurementError):
+        return None  # counted when the map is built
+
+
+def _length(trajectory: Trajectory, stamps: Array) -> float:
+    if len(stamps) < 2:
+        return 0.0
+    every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))  # jitter is no way driven
+    positions = trajectory.at(np.append(stamps[:-1:every], stamps[-1]), EXTRAPOLATE_S)[:, :3, 3]
+    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """The points (n, 3) of a sweep in the map, and in which cubes and voxels they lie."""
+
+    p_map: Array
+    cubes: Keys
+    voxels: Keys
+
+    @classmethod
+    def of(cls, p_map: Array, settings: SharpnessSettings) -> _Cloud:
+        """Raises DataError for a point that is not inside the map."""
+        return cls(p_map, keys_of(p_map, settings.cell_size_m), keys_of(p_map, settings.voxel_size_m))
+
+
+class _Stretch:
+    """The points of neighbouring sweeps, as sums per cube and as occupied voxels; it grows with the place only."""
+
+    def __init__(self, settings: SharpnessSettings) -> None:
+        self.scans = 0
+        self._settings = settings
+        self._cubes, self._voxels = _empty(SMALLEST_TABLE, CUBE_WORDS), _empty(SMALLEST_TABLE, 1)
+        self._cube_count = self.voxels = 0
+
+    def add(self, cloud: _Cloud) -> None:
+        """One more sweep."""
+        self.scans += 1
+        done = 0
+        while done < len(cloud.cubes):
+            self._cubes = _with_room(self._cubes, self._cube_count)
+            self._cube_count, done = _gather(
+                self._cubes, self._cubes.view(np.float64), self._cube_count, done, cloud.cubes, cloud.p_map,
+                self._settings.cell_size_m, self.scans,
+            )  # fmt: skip
+        done = 0
+        while done < len(cloud.voxels):
+            self._voxels = _with_room(self._voxels, self.voxels)
+            self.voxels, done = _occupy(self._voxels, self.voxels, done, cloud.voxels)
+
+    def surfaces(self) -> tuple[Array, Array]:
+        """Variances (c, 3), smallest first, of the cubes seen often enough, and the |z| of their normals (c,)."""
+        seen = self._cubes[:, SCANS] >= self._settings.min_scans
+        sums = self._cubes.view(np.float64)[seen, SUMS:]
+        sums = sums[sums[:, 0] >= self._settings.min_points]
+        mean = sums[:, 1:4] / sums[:, :1]
+        covariances = np.empty((len(sums), 3, 3))
+        i, j = UPPER
+        covariances[:, i, j] = covariances[:, j, i] = sums[:, 4:] / sums[:, :1] - mean[:, i] * mean[:, j]
+        variances, axes = np.linalg.eigh(covariances)
+        return np.maximum(variances, THINNEST_M**2), np.abs(axes[:, 2, 0])
+
+
+def _empty(slots: int, words: int) -> Keys:
+    return np.zeros((slots, words), np.int64)
+
+
+def _with_room(rows: Keys, count: int) -> Keys:
+    """The table itself, or when it is half full one twice as large."""
+    if 2 * count < len(rows):
+        return rows
+    larger = _empty(2 * len(rows), rows.shape[1])
+    kernels.rehash(rows, larger)
+    return larger
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
+    """Row of a key, entered where it is new, and whether it is; one row must be empty."""
+    row = kernels.find_or_insert(rows, key)
+    is_new = rows[row, 0] == 0
+    rows[row, 0] = key
+    return row, is_new
+
+
+@njit(cache=True, nogil=True)
+def _gather(
+    rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
+) -> tuple[int, int]:
+    """Add points from `start` on to their cubes, moments about the cube's middle, until the table is half full.
+
+    `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
+    """
+    for i in range(start, len(keys)):
+        if 2 * count >= len(rows):
+            return count, i
+        row, is_new = _row_of(rows, keys[i])
+        count += is_new
+        if rows[row, LAST_SCAN] != scan:
+            rows[row, LAST_SCAN] = scan
+            rows[row, SCANS] += 1
+        x, y, z = p_map[i, 0] / size_m, p_map[i, 1] / size_m, p_map[i, 2] / size_m
+        x, y, z = (
+            (x - np.floor(x) - 0.5) * size_m,
+            (y - np.floor(y) - 0.5) * size_m,
+            (z - np.floor(z) - 0.5) * size_m,
+        )
+        here = sums[row, SUMS:]
+        here[0] += 1.0
+        here[1] += x
+        here[2] += y
+        here[3] += z
+        here[4] += x * x
+        here[5] += x * y
+        here[6] += x * z
+        here[7] += y * y
+        here[8] += y * z
+        here[9] += z * z
+    return count, len(keys)
+
+
+@njit(cache=True, nogil=True)
+def _occupy(rows: Keys, count: int, start: int, keys: Keys) -> tuple[int, int]:
+    """Add keys from `start` on, until the table is half full; returns how many there are, and the first not added."""
+    for i in range(start, len(keys)):
+        if 2 * count >= len(rows):
+            return count, i
+        _, is_new = _row_of(rows, keys[i])
+        count += is_new
+    return count, len(keys)
+
+
+def _sharpness(stretches: list[_Stretch], length_m: float) -> Sharpness:
+    surfaces = [stretch.surfaces() for stretch in stretches]
+    variances = np.concatenate([np.empty((0, 3)), *(variances for variances, _ in surfaces)])
+    steepness = np.concatenate([np.empty(0), *(steepness for _, steepness in surfaces)])
+    voxels = sum(stretch.voxels for stretch in stretches)
+    thickness = np.sqrt(variances[:, 0])
+    entropies = 0.5 * (3 * np.log(2 * np.pi * np.e) + np.log(variances).sum(axis=1))
+    return Sharpness(
+        thickness_m=_median(thickness),
+        ground_thickness_m=_median(thickness[steepness > GROUND_NORMAL]),
+        wall_thickness_m=_median(thickness[steepness < WALL_NORMAL]),
+        mean_map_entropy=float(entropies.mean()) if len(entropies) else float("nan"),
+        voxels_per_m=voxels / length_m if length_m > 1.0 else float("nan"),
+        voxels=voxels,
+        cells=len(thickness),
+        scans=sum(stretch.scans for stretch in stretches),
+    )
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

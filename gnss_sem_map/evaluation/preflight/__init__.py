@@ -1,0 +1,34 @@
+"""The pre-flight: a log tested against physics, and its sensors against each other, before any work.
+
+`check` runs every check of this folder on a small sample of the drive. Every wrong sensor convention that we know makes
+one of them amber or red, and the finding names the probable mistake and the line that mends it.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+from gnss_sem_map.config import Settings
+from gnss_sem_map.evaluation.preflight import camera, inertial, positions, sweeps
+from gnss_sem_map.evaluation.preflight.findings import Preflight
+from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.segmentation import Segmenter
+from gnss_sem_map.sensor_log import SensorLog
+
+
+def check(
+    log: SensorLog, settings: Settings, segmenter: Segmenter | None = None, *, with_camera: bool = True
+) -> Preflight:
+    """Every check that the sensors of a drive allow; raises nothing for what it finds wrong.
+
+    `with_camera` is for runs that use no image: a wrong camera cannot make their map wrong.
+    """
+    start = time.perf_counter()
+    sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
+    rooms = (inertial, positions, sweeps, *((camera,) if with_camera else ()))
+    _ = sample.trajectory  # most checks need it: known before they run side by side
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda room: tuple(room.check(sample)), rooms))
+    findings = tuple(finding for some in found for finding in some)
+    return Preflight(findings, time.perf_counter() - start, sample.whole_solution)

@@ -1,0 +1,25 @@
+"""The camera: its matrix, its images' size and clock, then depth edges against image edges, and labels likewise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gnss_sem_map.evaluation.preflight import camera_matrix, camera_pose, image_files, labels
+from gnss_sem_map.evaluation.preflight.findings import Finding, Level
+from gnss_sem_map.evaluation.preflight.sample import Sample
+
+
+def check(sample: Sample) -> Iterator[Finding]:
+    """What costs nothing first; a camera that cannot be used is not looked through."""
+    log = sample.log
+    if not log.images or not log.calibration.has_camera:
+        return
+    size, files = image_files.check(sample)
+    matrix = camera_matrix.check(log.calibration, size)
+    yield from (matrix, *files)
+    if any(finding.level is Level.RED for finding in (matrix, *files)):
+        return  # what is wrong there is wrong all over the image
+    pose = tuple(camera_pose.check(sample))
+    yield from pose
+    # where the camera is wrong, right labels do not fit the scans either
+    yield from labels.check(sample, against_lidar=all(finding.level is Level.GREEN for finding in pose))

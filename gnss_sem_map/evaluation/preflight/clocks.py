@@ -1,0 +1,83 @@
+"""How late the fixes are: the lag at which their way and their course agree best with the IMU's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.measurements import GnssFixes, ImuSamples
+from gnss_sem_map.evaluation.preflight.dead_reckoning import agreement, windows_of
+from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral, way_of
+from gnss_sem_map.evaluation.preflight.response import turn_gain
+from gnss_sem_map.evaluation.preflight.track import Track
+
+Array = NDArray[np.float64]
+
+# Lags that are tried, s: coarsely as far as a receiver's message may be late, then finely around the best.
+FARTHEST_S, COARSE_S, FINE_S = 3.0, 0.1, 0.02
+# Twice the logarithm of the likelihood must gain so much: four standard deviations of one unknown.
+FOUR_SIGMA = 16.0
+
+
+@dataclass(frozen=True)
+class Lag:
+    """By how much a fix is later than its stamp, s; `gain` is twice the logarithm of the likelihood against no lag."""
+
+    seconds: float
+    gain: float
+    observable: bool
+    """Whether another lag would have been noticed: half a second to either side fits clearly worse."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether chance alone would not find it."""
+        return self.gain > FOUR_SIGMA
+
+
+NO_LAG = Lag(0.0, 0.0, False)
+
+
+def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j) -> Lag:
+    """The lag that fits best, whatever the axes in the plane: z of the IMU is up, its rate in rad/s.
+
+    `lever` is where the antenna is said to be, m, ahead + i left. What a mistake in the axes would change is free:
+    the sign of the turns, the heading, the hand.
+    """
+    start, end = float(imu.stamps[0]), float(imu.stamps[-1])
+    farthest = min(FARTHEST_S, (end - start) / 4)
+    windows = windows_of(fixes, start + farthest, end - farthest)
+    turned = SmoothedIntegral.of(imu.stamps, imu.angular_rate[:, 2])
+    backwards = ImuSamples(imu.stamps, imu.specific_force, -imu.angular_rate)
+    ways = [way_of(unit, lever, mirrored=hand) for unit in (imu, backwards) for hand in (False, True)]
+
+    def misfits(lag: float) -> tuple[float, float, float, int]:
+        """Of the ways, and how many independent errors that is; of the courses, likewise."""
+        found = [agreement(windows, imu.stamps, way, lag) for way in ways] if windows is not None else []
+        best = min(found, key=lambda one: one.rest, default=None)
+        gain = turn_gain(turned, track, lag)
+        return (
+            max(best.rest, 1e-9) if best is not None else 1.0,
+            best.independent if best is not None else 0.0,
+            max(gain.misfit, 1e-6) if gain is not None else 1.0,
+            gain.intervals if gain is not None else 0,
+        )
+
+    def likelihoods(lags: Array) -> Array:
+        """Logarithms, up to a constant: normal errors of the ways, and Laplace's of the turns."""
+        rests, free, turns, intervals = np.array([misfits(lag) for lag in lags]).T
+        # as many independent errors as where the fit is best, for all: elsewhere the lag itself makes them alike
+        at_best = int(np.argmin(rests * turns))
+        return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
+
+    count = round(farthest / COARSE_S)
+    coarse = np.linspace(-count, count, 2 * count + 1) * COARSE_S
+    scores = likelihoods(coarse)
+    best = float(coarse[int(np.argmax(scores))])
+    fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)
+    around = likelihoods(fine)
+    found = float(fine[int(np.argmax(around))])
+    beside = scores[np.abs(np.abs(coarse - found) - 0.5) < COARSE_S]
+    observable = len(beside) > 0 and 2 * (scores.max() - beside.max()) > FOUR_SIGMA
+    return Lag(found, float(2 * (around.max() - around[-1])), bool(observable))

@@ -1,0 +1,173 @@
+"""A run folder against the truth: its point labels, its removed points, its trajectory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.accuracy import errors, pose_nees, relative_error
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import config
+from gnss_sem_map.datasets.label_files import label_files, read_confidence, read_labels, truth_folder
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation import metrics
+from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
+
+LARGEST = 1e12
+"""No stamp in s, and no length in m, is larger."""
+
+ONE_SECOND = 10
+"""Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
+
+
+def score_run(
+    out: Path, truth: Path, label_set: LabelSet | None = None, restrict_to: Path | None = None
+) -> dict[str, Any]:
+    """Everything that can be scored of a run folder, as `metrics.json` holds it; also written there.
+
+    `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
+    the imu in the map frame at the scans' stamps). `label_set` is that of the run's settings unless given.
+    `restrict_to`: only points labelled there. Raises DataError.
+    """
+    _check_scorable(out)
+    label_set = label_set or open_label_set(config.load(out / "config.yaml").classes)
+    metrics = _known_metrics(out) | _score_points(out, truth, label_set, restrict_to)
+    path = truth / "trajectory_lidar.tum"
+    if is_file(path):
+        metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
+    amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
+    return metrics
+
+
+def _check_scorable(out: Path) -> None:
+    """Raise DataError for a folder that says nothing of single points, which are what is scored."""
+    about = read_run(out)
+    if "merged" in about:
+        made_of = about["merged"] if isinstance(about["merged"], list) else [about["merged"]]
+        raise DataError(
+            f"{shown(out)}: a merged map has no labels of single points; evaluate the runs that it was made of,"
+            f" {' and '.join(map(str, made_of))}"
+        )
+    if not is_folder(out / "map"):
+        raise DataError(
+            f"{shown(out)}: found a trajectory without a map; make the map with `gnss-sem-map run ... --write-labels`"
+        )
+    if not is_folder(out / "labels"):
+        raise DataError(
+            f"{shown(out / 'labels')}: no point labels in this run; make it again with --write-labels"
+        )
+
+
+def _known_metrics(out: Path) -> dict[str, Any]:
+    """What the run itself measured without a truth."""
+    return read_json(out / "metrics.json")
+
+
+def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
+    tables = metrics.Tables.of(label_set)
+    count = len(label_set.names)
+    refined = np.zeros((count, count + 1), np.int64)
+    raw, moved = refined.copy(), np.zeros((3, 2), np.int64)
+    sure = np.zeros((metrics.CALIBRATION_BINS, 3))
+    for name, true in _truths(out / "labels", truth_folder(truth)):
+        where = f"{out / 'labels' / name}.label"
+        predicted = read_labels(out / "labels" / f"{name}.label")
+        before = read_labels(out / "labels_raw" / f"{name}.label")
+        moved += metrics.dynamic_counts(read_labels(out / "removed" / f"{name}.label"), true, tables, where)
+        if restrict_to is not None:
+            chosen = read_labels(restrict_to / f"{name}.label")
+            if len(chosen) != len(true):
+                raise DataError(
+                    f"{shown(restrict_to / name)}.label: found {len(chosen)} labels for {len(true)} points"
+                )
+            true = np.where(chosen & 0xFFFF != 0, true, 0).astype(np.uint32)
+        refined += metrics.confusion(predicted, true, tables, where)
+        raw += metrics.confusion(before, true, tables, where)
+        confidence = read_confidence(out / "confidence" / f"{name}.bin")
+        if len(confidence) != len(predicted):
+            raise DataError(f"{where}: found {len(confidence)} probabilities for {len(predicted)} labels")
+        sure += metrics.calibration_counts(confidence, predicted, true, tables)
+    return {
+        "semantics": {
+            "raw": metrics.semantics(raw, label_set),
+            "refined": metrics.semantics(refined, label_set),
+        },
+        "dynamic": metrics.dynamic(moved),
+        "calibration": metrics.calibration(sure),
+    }
+
+
+def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32]]]:
+    """Name and true ids of every scan that the run labelled; every one must have a truth, and at least one."""
+    wanted, known = label_files(predictions), label_files(truth)
+    missing = sorted(set(wanted) - set(known))
+    if missing:
+        raise DataError(
+            f"{truth}: no truth for {len(missing)} of {len(wanted)} scans, first {missing[0]}; is it another drive?"
+        )
+    return [(name, read_labels(known[name])) for name in wanted]
+
+
+def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second.
+
+    Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom.
+    """
+    error = errors(estimate, truth)
+    stamps = error.stamps
+    relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
+    scores = {
+        "ate_m": error.ate_m,
+        "horizontal_rms_m": error.horizontal_rms_m,
+        "vertical_rms_m": error.vertical_rms_m,
+        "heading_rms_deg": error.heading_rms_deg,
+        "tilt_rms_deg": error.tilt_rms_deg,
+        "ate_aligned_m": _aligned_rms(estimate.at(stamps)[:, :3, 3], truth.at(stamps)[:, :3, 3]),
+        "rpe_translation_m": relative.translation_m,
+        "rpe_translation_share": relative.translation_share,
+        "rpe_rotation_deg": relative.rotation_deg,
+    }
+    if estimate.covariances is None:
+        return scores
+    position, orientation = pose_nees(estimate, truth)
+    return scores | {
+        "position_nees_per_dof": float(position.mean()) / 3,
+        "orientation_nees_per_dof": float(orientation.mean()) / 3,
+    }
+
+
+def _aligned_rms(points: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    """Root mean square distance after the best rotation and translation (Kabsch)."""
+    moved, fixed = points - points.mean(axis=0), reference - reference.mean(axis=0)
+    u, _, vt = np.linalg.svd(fixed.T @ moved)
+    proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rest = fixed - moved @ (u @ proper @ vt).T
+    return float(np.sqrt((rest**2).sum(axis=1).mean()))
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read `stamp tx ty tz qx qy qz qw`; raises DataError for anything else."""
+    lines = [line.split("#")[0] for line in read_lines(path)]
+    try:
+        rows = np.array([[float(word) for word in line.split()] for line in lines if line.strip()])
+    except ValueError as error:
+        raise DataError(f"{shown(path)}: {str(error)[:100]}; expected eight numbers per line") from None
+    if rows.ndim != 2 or rows.shape[1] != 8 or not (np.abs(rows) <= LARGEST).all():
+        raise DataError(f"{shown(path)}: found {rows.shape} numbers, expected eight finite ones per line")
+    if not np.allclose((rows[:, 4:] ** 2).sum(axis=1), 1, atol=2e-2):
+        raise DataError(
+            f"{shown(path)}: found quaternions that are no rotation, expected qx qy qz qw of length one"
+        )
+    T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_map_imu[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    T_map_imu[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0], T_map_imu)

@@ -1,0 +1,142 @@
+"""Arrays in an `.npz` file: what each is, and how large, is known before a byte of it is unpacked."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import MOST_BYTES, open_file, shown
+
+MOST_MEMBERS = 100
+MOST_HEADER_BYTES = 10_000
+CHUNK_BYTES = 1 << 18
+KINDS_OF_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+HEADER = re.compile(
+    r"\{'descr': '([<>|=]?[biufcU]\d{1,6})', 'fortran_order': (True|False),"
+    r" 'shape': \(((?:\d{1,18}, ?)*\d{0,18})\),? ?\}\s*"
+)
+"""What numpy writes, and nothing that would have to be evaluated."""
+
+_ERRORS = (
+    zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, KeyError, IndexError, OverflowError,
+    RuntimeError, NotImplementedError,
+)  # fmt: skip
+"""What `zipfile` raises for a damaged archive."""
+
+
+class Archive:
+    """An open `.npz` file; `open_archive` makes it."""
+
+    def __init__(self, path: Path, members: zipfile.ZipFile) -> None:
+        self._path, self._members = path, members
+
+    def array(self, name: str, most_bytes: int = MOST_BYTES) -> Member:
+        """What an array is; raises DataError where there is none, or it is not stored as numpy does."""
+        entries = {entry.filename: entry for entry in self._members.infolist()[:MOST_MEMBERS]}
+        entry = entries.get(f"{name}.npy")
+        if entry is None:
+            raise DataError(f"{shown(self._path)}: no {name} in it; found {sorted(entries)[:8]}")
+        if entry.flag_bits & 1:
+            raise DataError(f"{shown(self._path)}: {name} is encrypted; expected a plain .npz")
+        if entry.compress_type not in KINDS_OF_COMPRESSION:
+            raise DataError(
+                f"{shown(self._path)}: {name} is compressed by method {entry.compress_type}, expected none or deflate"
+                " (np.savez, np.savez_compressed)"
+            )
+        with self._damage(), self._members.open(entry) as file:
+            dtype, is_fortran, shape, start = _header(file)
+        size = math.prod(shape) * dtype.itemsize
+        if dtype.itemsize == 0 or size > most_bytes or start + size != entry.file_size:
+            raise DataError(
+                f"{shown(self._path)}: {name} is {dtype} {shape} in {entry.file_size} bytes, expected as many as that"
+                f" needs and at most {most_bytes}"
+            )
+        return Member(self, entry, dtype, is_fortran, shape, start)
+
+    def unpack(self, member: Member) -> NDArray[Any]:
+        """The values of an array."""
+        values = np.empty(member.shape[::-1] if member.is_fortran else member.shape, member.dtype)
+        room = values.reshape(-1).view(np.uint8)
+        with self._damage(), self._members.open(member.entry) as file:
+            file.read(member.start)
+            done = 0
+            while done < len(room):
+                chunk = file.read(min(CHUNK_BYTES, len(room) - done))
+                if not chunk:
+                    raise EOFError("it ends too early")
+                room[done : done + len(chunk)] = np.frombuffer(chunk, np.uint8)
+                done += len(chunk)
+            file.read(1)  # the checksum is compared at the end
+        return values.T if member.is_fortran else values
+
+    @contextmanager
+    def _damage(self) -> Iterator[None]:
+        try:
+            yield
+        except DataError:
+            raise
+        except _ERRORS as error:
+            raise _damaged(self._path, error) from None
+
+
+class Member:
+    """One array of an archive, not yet unpacked."""
+
+    def __init__(
+        self, archive: Archive, entry: zipfile.ZipInfo, dtype: np.dtype[Any], is_fortran: bool,
+        shape: tuple[int, ...], start: int,
+    ) -> None:  # fmt: skip
+        self._archive, self.entry, self.dtype, self.shape = archive, entry, dtype, shape
+        self.is_fortran, self.start = is_fortran, start
+
+    def read(self) -> NDArray[Any]:
+        """The values; raises DataError when they are damaged."""
+        return self._archive.unpack(self)
+
+
+@contextmanager
+def open_archive(path: Path, most_bytes: int = MOST_BYTES) -> Iterator[Archive]:
+    """An `.npz` file; raises DataError when it is no archive, or larger than that."""
+    with os.fdopen(open_file(path), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
+            raise DataError(f"{shown(path)}: found {size} bytes, expected at most {most_bytes}")
+        try:
+            members = zipfile.ZipFile(file)
+        except _ERRORS as error:
+            raise _damaged(path, error) from None
+        with members:
+            yield Archive(path, members)
+
+
+def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:
+    """Type, order and shape of an array, and where its values begin."""
+    magic = file.read(8)
+    if magic[:6] != b"\x93NUMPY" or len(magic) < 8 or magic[6] not in (1, 2, 3):
+        raise ValueError("no array of numpy")
+    words = 2 if magic[6] == 1 else 4
+    length = int.from_bytes(file.read(words), "little")
+    if length > MOST_HEADER_BYTES:
+        raise ValueError(f"a header of {length} bytes")
+    found = HEADER.fullmatch(file.read(length).decode("latin1"))
+    if found is None:
+        raise ValueError("no plain array")
+    shape = tuple(int(side) for side in found[3].replace(" ", "").split(",") if side)
+    return np.dtype(found[1]), found[2] == "True", shape, 8 + words + length
+
+
+def _damaged(path: Path, error: Exception) -> DataError:
+    why = " ".join(str(error).split())[:200] or type(error).__name__
+    return DataError(f"{shown(path)}: damaged file, or no .npz of plain arrays ({why})")

@@ -1,0 +1,317 @@
+"""Where results go: one command at a time, beside what was there, and in its place when they are whole.
+
+What lies at OUT is replaced only when all of it is ours (`ownership`), and never when it is, holds or lies in an
+input. The new result is written in `.OUT.work/part`; the old one moves to `.OUT.work/old`, the new one to OUT, and only
+then is the old one removed. Killed in between, the next command moves the old one back.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TextIO
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files import ownership, work_folder
+
+NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
+"""Errors of file systems that know no locks: there we go on without."""
+FIRST_WORDS = "gnss-sem-map writes"
+RESUMABLE = "what is mapped so far is kept: `gnss-sem-map run ... --resume` goes on"
+
+
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """A place for results that is ours alone until the claim ends."""
+
+    out: Path
+    """Absolute, links followed."""
+    by_name: Callable[[str], bool]
+    """Whether a folder without a list may hold a file of this path: results of older versions have no list."""
+
+    @property
+    def work(self) -> Path:
+        """The work folder beside it."""
+        return self.out.with_name(f".{self.out.name}.work")
+
+
+_HELD: dict[Path, Claim] = {}
+"""The claims of this process: one that is already held is claimed again without a second look."""
+
+
+@contextmanager
+def claimed(
+    out: Path,
+    inputs: Iterable[Path | str | None] = (),
+    by_name: Callable[[str], bool] = lambda name: False,
+) -> Iterator[Claim]:
+    """Have a place for results for ourselves, and know before any work that they can be put there.
+
+    What a killed command left in the work folder is put right: an old result moved back, a new one that was not
+    finished removed; what is mapped stays until a result is there. Raises DataError when another command writes there,
+    when what is there is not ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
+    """
+    real = real_path(out)
+    if real in _HELD:
+        refuse_inputs(real, inputs)
+        yield _HELD[real]
+        return
+    claim = Claim(real, by_name)
+    refuse_places(real)
+    refuse_inputs(real, inputs)
+    with _parents(real), locked(real):
+        work_folder.refuse_foreign(claim.work)
+        with _explained(claim.work):
+            _move_back(claim)
+            refuse_foreign(claim)
+            ownership.remove_partials(claim.out)
+            work_folder.drop_results(claim.work)
+        work_folder.make(claim.work)
+        _HELD[real] = claim
+        try:
+            yield claim
+        except BaseException as error:
+            if work_folder.holds_work(claim.work):
+                error.add_note(RESUMABLE)
+            raise
+        finally:
+            del _HELD[real]
+            with suppress(OSError):  # the next command tries again
+                if not work_folder.holds_work(claim.work):
+                    work_folder.clear(claim.work)
+
+
+@contextmanager
+def new_folder(out: Path, by_name: Callable[[str], bool] = lambda name: False) -> Iterator[Path]:
+    """A folder to write into; it becomes `out` when the block ends well and vanishes when it does not.
+
+    An earlier result of ours at `out` is replaced, and what was kept for --resume is removed. Raises DataError as
+    `claimed` does, when the disk is full, and when the old result can no longer be replaced: then it says where the
+    new one is.
+    """
+    with claimed(out, by_name=by_name) as claim:
+        part = claim.work / work_folder.PART
+        try:
+            part.mkdir()
+            yield part
+            ownership.write_list(part)
+            _swap(claim, part)
+        except OSError as error:
+            raise DataError(
+                f"{out}: cannot write the results ({error.strerror or error}); free the disk or choose another -o"
+            ) from None
+        finally:
+            with suppress(OSError):  # what cannot be removed is named by the next command
+                work_folder.drop_results(claim.work)
+        with suppress(OSError):
+            work_folder.clear(claim.work)
+
+
+def _swap(claim: Claim, part: Path) -> None:
+    out, old = claim.out, claim.work / work_folder.OLD
+    try:
+        refuse_foreign(claim)  # hours may have passed
+        if out.exists() and any(out.iterdir()):
+            if ownership.read_list(out) is None:
+                ownership.write_list(out)  # of an older version, ours by its names
+            out.rename(old)
+        try:
+            part.rename(out)
+        except OSError:
+            if old.exists():
+                old.rename(out)
+            raise
+    except (OSError, DataError) as error:
+        kept = _free_name(out)
+        part.rename(kept)
+        why = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{out}: the earlier results stay ({why}); the new ones are in {kept}") from None
+
+
+def _free_name(out: Path) -> Path:
+    names = (out.with_name(f"{out.name}.new{n or ''}") for n in range(1_000_000))
+    return next(path for path in names if not os.path.lexists(path))
+
+
+def _move_back(claim: Claim) -> None:
+    """Put the old result back to its place when a command was killed before it had put the new one there."""
+    out, old = claim.out, claim.work / work_folder.OLD
+    free = not os.path.lexists(out) or (out.is_dir() and not any(out.iterdir()))
+    if free and ownership.is_whole(old):
+        old.rename(out)
+
+
+@contextmanager
+def _explained(work: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{error.filename or work}: an earlier command could not remove it, nor can this one ({error.strerror});"
+            " see to its rights, or remove it"
+        ) from None
+
+
+def real_path(out: Path) -> Path:
+    """Where a result goes: absolute, all links followed; raises DataError for a link that leads nowhere."""
+    try:
+        real = Path(os.path.realpath(out))
+        if real.is_symlink():
+            raise DataError(f"{out}: is a link to itself; choose another -o")
+        str(real).encode()  # not every format's writer can open what is no text
+    except (OSError, ValueError) as error:
+        raise DataError(f"{str(out)!r}: is no place for results ({error}); choose another -o") from None
+    return real
+
+
+def refuse_places(out: Path) -> None:
+    """Raise DataError for places that are somebody's whole world: / and the folders where we are and live."""
+    for what, place in (("the folder that you are in", _here()), ("your home", _home())):
+        if place is not None and (out == place or out in place.parents):
+            raise DataError(
+                f"{out}: is {what}, or holds it; choose a folder of its own, such as -o {out / 'out'}"
+            )
+    if not out.name:
+        raise DataError(f"{out}: is the root of all files; choose another -o")
+
+
+def _here() -> Path | None:
+    try:
+        return Path(os.path.realpath(os.getcwd()))
+    except OSError:  # it was removed
+        return None
+
+
+def _home() -> Path | None:
+    home = os.path.expanduser("~")
+    return None if home == "~" else Path(os.path.realpath(home))
+
+
+def refuse_inputs(out: Path, inputs: Iterable[Path | str | None]) -> None:
+    """Raise DataError when a place for results is, holds or lies in one of the inputs, whatever links lead there."""
+    for given in inputs:
+        if given is None or not os.path.exists(given):
+            continue
+        absolute = Path(os.path.abspath(given))
+        for place in {
+            absolute,
+            Path(os.path.realpath(given)),
+            Path(os.path.realpath(absolute.parent)) / absolute.name,
+        }:
+            if out == place or out in place.parents:
+                raise DataError(f"{out}: is or holds {given}, which is read; choose another -o")
+            if place in out.parents:
+                raise DataError(f"{out}: lies in {given}, which is read; choose an -o outside")
+
+
+def refuse_foreign(claim: Claim) -> None:
+    """Raise DataError when anything at the place of the results is not ours, or may not be replaced."""
+    out = claim.out
+    if not os.path.lexists(out):
+        return
+    if not out.is_dir():
+        raise DataError(f"{out}: exists and is no run folder; choose another -o or remove it")
+    if os.path.ismount(out):
+        raise DataError(
+            f"{out}: is a mount point, which cannot be replaced; choose a folder in it: -o {out / 'out'}"
+        )
+    try:
+        if not any(out.iterdir()):
+            return
+        strange = ownership.foreign(out, claim.by_name)
+        folders = [Path(place) for place, _, _ in os.walk(out)]
+    except OSError as error:
+        raise DataError(f"{out}: cannot be read ({error.strerror}); choose another -o") from None
+    if strange is not None and ownership.read_list(out) is None:
+        raise DataError(
+            f"{out}: exists and is no run folder (it holds {strange}, and no list of what we wrote); choose another -o"
+            " or remove it"
+        )
+    if strange is not None:
+        raise DataError(
+            f"{out / strange}: is not ours, or was changed since we wrote it; move it away, or choose another -o"
+        )
+    for folder in (out.parent, *folders):
+        if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+            raise DataError(
+                f"{folder}: may not be changed, so the results there cannot be replaced; choose another -o"
+            )
+        if folder != out.parent and os.path.ismount(folder):
+            raise DataError(f"{folder}: is a mount point, which cannot be replaced; choose another -o")
+
+
+@contextmanager
+def _parents(out: Path) -> Iterator[None]:
+    """The folders above a place for results; those that we make vanish again when nothing came into them."""
+    missing = [folder for folder in out.parents if not folder.exists()]
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{out}: cannot be made ({error.strerror}); choose another -o") from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            for folder in missing:
+                folder.rmdir()
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Be the only command that writes a place: `.OUT.lock` says who does. The lock of a dead process holds nobody.
+
+    Raises DataError when another command writes there, or the lock cannot be written.
+    """
+    path = out.with_name(f".{out.name}.lock")
+    try:
+        file = _lock(path, out)
+    except OSError as error:
+        raise DataError(f"{out}: cannot be written ({error.strerror}); choose another -o") from None
+    with file:
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
+
+
+def _lock(path: Path, out: Path) -> TextIO:
+    while True:
+        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        if not stat.S_ISREG(os.fstat(number).st_mode):
+            os.close(number)
+            raise DataError(f"{path}: is in the way, and no lock of ours; move it away")
+        file = os.fdopen(number, "r+", encoding="utf-8", errors="replace")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = file.read(200).strip() or f"{FIRST_WORDS} it"
+            file.close()
+            raise DataError(f"{out}: {holder}; wait for it, or choose another -o") from None
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                file.close()
+                raise
+        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+            break
+        file.close()  # its holder ended just now, and removed it
+    said = file.read()
+    if said and not said.startswith(FIRST_WORDS):
+        file.close()
+        raise DataError(f"{path}: is in the way, and no lock of ours; move it away")
+    file.seek(0)
+    file.truncate()
+    file.write(
+        f"{FIRST_WORDS} it now (process {os.getpid()} on {socket.gethostname()},"
+        f" since {datetime.now().astimezone():%Y-%m-%d %H:%M:%S})\n"
+    )
+    file.flush()
+    return file

@@ -1,0 +1,100 @@
+"""PNG and JPEG: the size is read from the header before anything is decoded, and a damaged file is refused whole."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageFile
+
+from gnss_sem_map.errors import DataError, ImageSizeError
+from gnss_sem_map.files.untrusted import read_bytes, shown
+
+MOST_PIXELS, LONGEST_SIDE = 64_000_000, 65_535
+MOST_FILE_BYTES = 256 << 20
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+DEPTH = len(PNG) + 16
+"""Where a PNG says how many bits a channel has."""
+FAULTS = (
+    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, ZeroDivisionError,
+    struct.error, zlib.error,
+)  # fmt: skip
+"""What Pillow raises for damaged files."""
+
+Image.MAX_IMAGE_PIXELS = None  # our own limit is lower, and an error in place of a warning
+warnings.filterwarnings("ignore", "Invalid APNG", UserWarning)  # an animation that is none is a plain picture
+
+
+def read_picture(
+    path: Path, size: tuple[int, int] | None = None, needs_colour: bool = False
+) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3) of a PNG or JPEG.
+
+    Raises DataError for a damaged one, one of another (width, height), and where `needs_colour` one of other than three
+    channels of 8 bits.
+    """
+    content = read_bytes(path, MOST_FILE_BYTES)
+    with _opened(path, content) as picture:
+        _check_size(path, picture.size, size)
+        if needs_colour and (picture.mode not in ("RGB", "P") or _depth(content) > 8):
+            raise DataError(f"{shown(path)}: found {_described(picture, content)}, expected 8-bit colour")
+        return np.array(picture.convert("RGB"))
+
+
+def read_ids(path: Path) -> NDArray[np.uint8]:
+    """The values (h, w) of an 8-bit grey PNG; raises DataError for anything else."""
+    content = read_bytes(path, MOST_FILE_BYTES)
+    with _opened(path, content) as picture:
+        if not content.startswith(PNG) or picture.mode != "L" or _depth(content) != 8:
+            raise DataError(
+                f"{shown(path)}: found {_described(picture, content)}, expected an 8-bit grey PNG of class ids,"
+                " not colours"
+            )
+        return np.array(picture)
+
+
+@contextmanager
+def _opened(path: Path, content: bytes) -> Iterator[ImageFile.ImageFile]:
+    """A picture whose header is sound and whose checksums are right; raises DataError, also while it is decoded."""
+    kind = "PNG" if content.startswith(PNG) else "JPEG" if content.startswith(JPEG) else None
+    if kind is None:
+        raise DataError(f"{shown(path)}: damaged image; expected PNG or JPEG")
+    try:
+        with Image.open(io.BytesIO(content), formats=(kind,)) as picture:
+            width, height = picture.size
+            if width * height > MOST_PIXELS or max(width, height) > LONGEST_SIDE:
+                raise ValueError(f"{width} x {height} pixels, at most {MOST_PIXELS}")
+            picture.verify()
+        with Image.open(io.BytesIO(content), formats=(kind,)) as picture:
+            yield picture
+    except DataError:
+        raise
+    except FAULTS as error:
+        reason = " ".join(str(error).split())[:100]
+        raise DataError(f"{shown(path)}: damaged image ({reason}); expected PNG or JPEG") from None
+
+
+def _depth(content: bytes) -> int:
+    return content[DEPTH] if content.startswith(PNG) else 8
+
+
+def _described(picture: ImageFile.ImageFile, content: bytes) -> str:
+    """What a picture is, in words."""
+    shape = (picture.height, picture.width, len(picture.getbands()))
+    return f"uint{_depth(content)} {shape}{' by a palette' if picture.mode == 'P' else ''}"
+
+
+def _check_size(path: Path, found: tuple[int, int], size: tuple[int, int] | None) -> None:
+    if size is not None and found != size:
+        raise ImageSizeError(
+            f"{shown(path)}: found {found[0]} x {found[1]} pixels, expected {size[0]} x {size[1]} as in the"
+            " calibration; is this the right camera, and the rectified image?",
+            found,
+        )

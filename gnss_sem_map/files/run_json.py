@@ -1,0 +1,32 @@
+"""What a run says of itself, read back: it may have been damaged or written over since."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.files.untrusted import is_file, shown
+
+
+def read_run(out: Path) -> dict[str, Any]:
+    """The content of run.json; raises DataError for a folder without one, or a damaged one."""
+    path = out / "run.json"
+    if not is_file(path):
+        raise DataError(
+            f"{shown(path)}: no run folder here; expected the -o of an earlier `gnss-sem-map run`"
+        )
+    return read_json(path)
+
+
+def inputs_of(out: Path) -> dict[str, str]:
+    """The drive and the segmenter that a run was made of, as far as it names them; raises DataError."""
+    inputs = read_run(out).get("inputs", {})
+    if not isinstance(inputs, dict):
+        raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: found {type(inputs).__name__})")
+    found = {name: inputs[name] for name in ("drive", "segmenter") if inputs.get(name) is not None}
+    wrong = [name for name, value in found.items() if not isinstance(value, str) or not value]
+    if wrong:
+        raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: {wrong[0]} is no text)")
+    return found

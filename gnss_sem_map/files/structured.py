@@ -1,0 +1,131 @@
+"""YAML and JSON by one loader each, which no content can make slow, large or deep, nor bring to run anything.
+
+In our YAML only true and false are truth values (`vehicles: off` is a word, as it looks), dates are words, and there
+are no tags. Aliases count as much as what they stand for, so that a few lines cannot stand for a billion.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.files.untrusted import read_text, shown
+
+MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 20_000
+MOST_JSON_BYTES = 64 << 20
+MOST_NODES = 200_000
+DEEPEST = 30
+MOST_DIGITS = 40
+
+
+class _Refused(yaml.YAMLError):
+    """YAML that we do not take, though it may be right."""
+
+
+class _Loader(yaml.SafeLoader):
+    """Scalars, lists and mappings, none too many."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._count = self._depth = 0
+        self._weights: dict[int, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """One node with all in it; counted, with what an alias stands for."""
+        event = self.peek_event()
+        if getattr(event, "tag", None) is not None:
+            raise _Refused(f"found the tag {event.tag!r}, expected none")
+        is_alias = isinstance(event, yaml.AliasEvent)
+        before = self._count
+        self._count += 1
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise _Refused(f"nested deeper than {DEEPEST} levels")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if is_alias:
+            if id(node) not in self._weights:
+                raise _Refused("an alias stands for something that it is part of")
+            self._count += self._weights[id(node)]
+        else:
+            self._weights[id(node)] = self._count - before
+        if self._count > MOST_NODES:
+            raise _Refused(f"more than {MOST_NODES} values, aliases written out")
+        return node
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """A whole number of a bearable length."""
+        if len(node.value) > MOST_DIGITS:
+            raise _Refused(f"a number of {len(node.value)} digits, expected at most {MOST_DIGITS}")
+        return int(super().construct_yaml_int(node))
+
+
+_REPLACED = ("tag:yaml.org,2002:bool", "tag:yaml.org,2002:timestamp")
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _REPLACED]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile("^(true|false)$"), list("tf"))
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+
+
+def parse_yaml(text: str) -> Any:
+    """What YAML text says; raises ValueError, in one line, for text that is none or that we do not take."""
+    if max(map(len, text.split("\n"))) > LONGEST_YAML_LINE:
+        raise ValueError(f"a line of more than {LONGEST_YAML_LINE} characters")
+    try:
+        loader = _Loader(text)
+        try:
+            return loader.get_single_data()
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError) as error:
+        raise ValueError(" ".join(str(error).split())[:200] or type(error).__name__) from None
+
+
+def read_yaml(path: Path, error: type[SemMapError] = DataError) -> Any:
+    """What a YAML file says; raises `error` for a file that cannot be read, or that we do not take."""
+    try:
+        return parse_yaml(read_text(path, MOST_YAML_BYTES, error))
+    except SemMapError:
+        raise
+    except ValueError as problem:
+        raise error(f"{shown(path)}: not YAML ({problem})") from None
+
+
+def read_json(path: Path, error: type[SemMapError] = DataError) -> dict[str, Any]:
+    """The mapping that a JSON file holds; raises `error` for anything else."""
+    text = read_text(path, MOST_JSON_BYTES, error)
+    try:
+        content = json.loads(text)
+    except RecursionError:
+        raise error(f"{shown(path)}: damaged (nested too deep)") from None
+    except ValueError as problem:
+        raise error(f"{shown(path)}: damaged ({' '.join(str(problem).split())[:200]})") from None
+    if not isinstance(content, dict):
+        raise error(f"{shown(path)}: damaged (found {type(content).__name__}, expected a mapping)")
+    return content
+
+
+def not_finite(content: Any, place: str = "") -> str | None:
+    """Where in nested lists and mappings a number is infinite or none, as `a.b.0`; None where there is no such."""
+    if isinstance(content, float) and not math.isfinite(content):
+        return place
+    parts = (
+        content.items()
+        if isinstance(content, dict)
+        else enumerate(content)
+        if isinstance(content, list)
+        else ()
+    )
+    for name, part in parts:
+        found = not_finite(part, f"{place}.{name}" if place else str(name))
+        if found is not None:
+            return found
+    return None

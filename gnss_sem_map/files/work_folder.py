@@ -1,0 +1,118 @@
+"""The hidden folder beside a result: what a run has done so far, and the new result until it is whole.
+
+.OUT.work/.gnss-sem-map.json     says that we made this folder
+          chunks.json, 0/, 1/    what is mapped (`chunks`)
+          answers/               what a network said of the images (`remembering`)
+          part/                  the new result while it is written
+          old/                   the result before it, from when it is replaced until it is removed
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files import ownership
+
+CHUNKS, ANSWERS, PART, OLD = "chunks.json", "answers", "part", "old"
+OF_CHUNKS = re.compile(
+    r"\.[^/]+\.\d+\.part|chunks\.json"
+    r"|(\d+|\.\d+\.\d+\.part)/(record\.json|\w+/|\w+/-?\d+_-?\d+\.npy|(\w+/)?\.[^/]+\.\d+\.part)?"
+)
+OURS = re.compile(
+    rf"\.gnss-sem-map\.json|part/.*|old/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?|{OF_CHUNKS.pattern}"
+)
+"""Paths of everything that we ever write into a work folder."""
+
+
+def make(folder: Path) -> None:
+    """Make a work folder, unless it is there; raises DataError when something else is, or it cannot be written."""
+    refuse_foreign(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if ownership.read_list(folder) is None:
+            ownership.write_list(folder)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Raise DataError when a work folder is none, or holds anything that we did not write."""
+    if not os.path.lexists(folder):
+        return
+    if folder.is_symlink() or not folder.is_dir():
+        raise DataError(f"{folder}: is in the way, and no folder of ours; move it away")
+    names = [path.relative_to(folder).as_posix() + "/" * _is_folder(path) for path in folder.rglob("*")]
+    if ownership.read_list(folder) is None and not all(map(ownership.is_partial, names)):
+        raise DataError(f"{folder}: exists and holds no interrupted run; remove it")
+    strange = [name for name in names if not OURS.fullmatch(name)]
+    if strange:
+        raise DataError(
+            f"{folder / min(strange)}: is in the folder of an interrupted run, and not ours; move it away"
+        )
+
+
+def holds_work(folder: Path) -> bool:
+    """Whether there is something that --resume can use."""
+    done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
+    return done or any((folder / ANSWERS).glob("*.npz"))
+
+
+def clear(folder: Path) -> None:
+    """Remove a work folder with all that we wrote into it; what is not ours stays. Raises OSError.
+
+    First goes what says that it can be resumed, last what says that it is ours.
+    """
+    if not folder.is_dir() or folder.is_symlink():
+        return
+    forget(folder)
+    drop_results(folder)
+    if {path.name for path in folder.iterdir()} <= {ownership.MARKER}:
+        (folder / ownership.MARKER).unlink(missing_ok=True)
+        folder.rmdir()
+
+
+def forget(folder: Path) -> None:
+    """Remove what is mapped and what a network said; raises OSError."""
+    forget_chunks(folder)
+    forget_answers(folder)
+
+
+def forget_answers(folder: Path) -> None:
+    """Remove what a network said; raises OSError."""
+    _remove_known(folder, folder / ANSWERS)
+
+
+def forget_chunks(folder: Path) -> None:
+    """Remove what is mapped, first of all what says that it can be used; raises OSError."""
+    (folder / CHUNKS).unlink(missing_ok=True)
+    for path in sorted(folder.iterdir()):
+        if OF_CHUNKS.fullmatch(path.name + "/" * _is_folder(path)):
+            _remove_known(folder, path)
+
+
+def drop_results(folder: Path) -> None:
+    """Remove the results in a work folder: the new one, and the one before it as far as it is ours. Raises OSError."""
+    part, old = folder / PART, folder / OLD
+    if part.is_dir():
+        shutil.rmtree(part)  # we made it, in a folder of ours
+    if old.is_dir():
+        ownership.remove(old)
+
+
+def _remove_known(work: Path, path: Path) -> None:
+    if not _is_folder(path):
+        path.unlink(missing_ok=True)
+        return
+    for inside in sorted(path.iterdir()):
+        if OURS.fullmatch(inside.relative_to(work).as_posix() + "/" * _is_folder(inside)):
+            _remove_known(work, inside)
+    if not any(path.iterdir()):
+        path.rmdir()
+
+
+def _is_folder(path: Path) -> bool:
+    return path.is_dir() and not path.is_symlink()

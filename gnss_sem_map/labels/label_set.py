@@ -1,0 +1,219 @@
+"""Class sets and the tables that map other data's classes onto them, by name and never by index.
+
+A `LabelSet` is what the map distinguishes; a `Taxonomy` is what some network or data set distinguishes. Both are
+YAML files (in `labels/`, or the user's own).
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.untrusted import is_file, shown
+
+OTHER = "other"
+"""The name of the evidence that belongs to none of the map's classes."""
+
+UNLABELLED = -1
+"""The label of a voxel or point of which nothing is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelSet:
+    """The classes of a map, in the order in which evidence is stored."""
+
+    name: str
+    names: tuple[str, ...]
+    """Class names, c of them."""
+    colours: NDArray[np.uint8]
+    """(c, 3) RGB."""
+    semantic_kitti_ids: NDArray[np.uint32]
+    """(c,) raw ids that `.label` files get."""
+    asprs_codes: NDArray[np.uint8]
+    """(c,) LAS classification codes (LAS 1.4; 64 and above are user codes)."""
+    sources: Mapping[str, Mapping[str, str]]
+    """For every known taxonomy: its class name -> ours; what is absent is `other`."""
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if not 2 <= count <= 64 or len(set(self.names)) != count or OTHER in self.names:
+            raise ConfigError(
+                f"class set {self.name!r}: found classes {list(self.names)},"
+                " expected 2 to 64 different names, none of them 'other'"
+            )
+        for source, table in self.sources.items():
+            unknown = sorted(set(table.values()) - set(self.names))
+            if unknown:
+                raise ConfigError(
+                    f"class set {self.name!r}: the table of {source!r} maps to {unknown},"
+                    f" expected one of {list(self.names)}"
+                )
+
+    def index(self, name: str) -> int:
+        """Position of a class; raises ConfigError, with the nearest name, where there is none."""
+        if name not in self.names:
+            raise ConfigError(
+                f"class set {self.name!r} has no class {name!r}{_did_you_mean(name, self.names)}"
+            )
+        return self.names.index(name)
+
+    def table_from(self, source_names: Sequence[str], source: str | None = None) -> NDArray[np.float32]:
+        """The (s, c + 1) 0/1 matrix that sums the probabilities of s source classes into ours and, last, `other`.
+
+        Without `source`, a name may be one of ours, `other`, or a name of any known taxonomy, provided that they
+        agree. Raises ConfigError for a name that nobody knows.
+        """
+        table = np.zeros((len(source_names), len(self.names) + 1), np.float32)
+        for row, name in enumerate(source_names):
+            table[row, self._target(name, source)] = 1.0
+        return table
+
+    def _target(self, name: str, source: str | None) -> int:
+        if name == OTHER:
+            return len(self.names)
+        if source is None and name in self.names:
+            return self.names.index(name)
+        known = [source] if source is not None else list(self.sources)
+        targets = {
+            self.sources[s].get(name, OTHER) for s in known if s in self.sources and name in taxonomy(s).names
+        }
+        if len(targets) == 1:
+            target = targets.pop()
+            return len(self.names) if target == OTHER else self.names.index(target)
+        everything = sorted(
+            {n for s in known if s in self.sources for n in taxonomy(s).names} | set(self.names)
+        )
+        if not targets:
+            raise ConfigError(
+                f"class {name!r} is unknown to the class set {self.name!r}{_did_you_mean(name, everything)};"
+                " name it `other` or add it to the `sources` of the class set file"
+            )
+        raise ConfigError(f"class {name!r} is ambiguous: {sorted(targets)}; say which taxonomy it is of")
+
+
+@dataclass(frozen=True, eq=False)
+class Taxonomy:
+    """The classes of a data set or network, with their ids."""
+
+    name: str
+    names: tuple[str, ...]
+    ids: Mapping[str, Mapping[str, int]]
+    """For each kind of id (such as `train_id`): class name -> id."""
+    void: Mapping[str, tuple[int, ...]]
+    """For each kind of id: the ids that say nothing."""
+
+    def lookup(self, label_set: LabelSet, kind: str, size: int = 256) -> NDArray[np.int16]:
+        """Table from id to class index: c is `other`, -1 void, -2 an id that the taxonomy does not know."""
+        table = np.full(size, -2, np.int16)
+        table[[i for i in self.void[kind] if 0 <= i < size]] = UNLABELLED
+        rows = label_set.table_from(self.names, self.name).argmax(1)
+        for name, row in zip(self.names, rows, strict=True):
+            if 0 <= self.ids[kind].get(name, -1) < size:
+                table[self.ids[kind][name]] = row
+        return table
+
+
+def open_label_set(name_or_file: str | Path = "urban") -> LabelSet:
+    """Read a class set: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
+    content = _read(name_or_file)
+    try:
+        classes = content["classes"]
+        return LabelSet(
+            name=_word(content["name"]),
+            names=tuple(_word(c["name"]) for c in classes),
+            colours=np.array([[_whole(v, 256) for v in c["colour"]] for c in classes], np.uint8).reshape(
+                -1, 3
+            ),
+            semantic_kitti_ids=np.array(
+                [_whole(c["semantic_kitti_id"], 1 << 16) for c in classes], np.uint32
+            ),
+            asprs_codes=np.array([_whole(c["asprs_code"], 256) for c in classes], np.uint8),
+            sources={
+                _word(s): {_word(theirs): _word(ours) for theirs, ours in table.items()}
+                for s, table in content.get("sources", {}).items()
+            },
+        )
+    except _CONTENT_ERRORS as error:
+        raise ConfigError(
+            f"class set {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]};"
+            " expected name, classes (name, colour, semantic_kitti_id, asprs_code) and sources"
+        ) from None
+
+
+def taxonomy(name_or_file: str | Path) -> Taxonomy:
+    """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
+    content = _read(name_or_file)
+    try:
+        classes, kinds = content["classes"], [_word(kind) for kind in content["ids"]]
+        void = content.get("void", {})
+        return Taxonomy(
+            name=_word(content["name"]),
+            names=tuple(_word(c["name"]) for c in classes),
+            ids={
+                kind: {_word(c["name"]): _whole(c[kind], 1 << 16) for c in classes if kind in c}
+                for kind in kinds
+            },
+            void={kind: tuple(_whole(i, 1 << 16) for i in void.get(kind, ())) for kind in kinds},
+        )
+    except _CONTENT_ERRORS as error:
+        raise ConfigError(
+            f"taxonomy {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]}; expected name, ids and classes"
+            " with those ids"
+        ) from None
+
+
+_CONTENT_ERRORS = (KeyError, TypeError, ValueError, OverflowError, AttributeError, IndexError)
+LONGEST_WORD = 100
+
+
+def _word(value: Any) -> str:
+    if (
+        not isinstance(value, str | int)
+        or not 0 < len(str(value)) <= LONGEST_WORD
+        or not str(value).isprintable()
+    ):
+        raise ValueError(f"found {str(value)[:100]!r}, expected a name")
+    return str(value)
+
+
+def _whole(value: Any, below: int) -> int:
+    if type(value) is not int or not -1 <= value < below:
+        raise ValueError(f"found {str(value)[:100]!r}, expected a whole number below {below}")
+    return value
+
+
+_CACHE: dict[str, dict[str, Any]] = {}
+
+
+def _read(name_or_file: str | Path) -> dict[str, Any]:
+    shipped = resources.files("gnss_sem_map") / "labels"
+    available = sorted(f.name.removesuffix(".yaml") for f in shipped.iterdir())
+    name = str(name_or_file)
+    if name in _CACHE:
+        return _CACHE[name]
+    if name in available:
+        file = Path(str(shipped / f"{name}.yaml"))
+    elif is_file(Path(name), ConfigError):
+        file = Path(name)
+    else:
+        raise ConfigError(f"no class set {shown(name)!r}: expected one of {available} or a YAML file")
+    content = read_yaml(file, ConfigError)
+    if not isinstance(content, dict):
+        raise ConfigError(f"{name}: found {type(content).__name__}, expected a mapping with name and classes")
+    if name in available:
+        _CACHE[name] = content
+    return content
+
+
+def _did_you_mean(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {close[0]!r}?" if close else f"; known are {list(known)[:12]}"

@@ -1,0 +1,289 @@
+"""From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
+
+A drive is mapped in chunks of scans that know nothing of each other: in memory for a short one, else one after another
+or in several processes, each chunk put away on disk (`chunks`), so that memory does not grow with the drive and an
+interrupted run goes on where it was. Sums are integers: all of these give the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
+from gnss_sem_map.mapping.labelled_scans import Drive, look_at
+from gnss_sem_map.mapping.worker_processes import in_processes
+from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.segmentation import Segmenter
+from gnss_sem_map.sensor_log import Image, Scan, SensorLog, Skip, file_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
+
+STATIC, REMOVED = "static", "removed"
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """What stands, and what was seen moving: no point is in both."""
+
+    static: VoxelMap
+    removed: VoxelMap
+
+
+def build_map(
+    log: SensorLog,
+    trajectory: Trajectory,
+    segmenter: Segmenter | None,
+    settings: Settings,
+    account: Account,
+    progress: Progress = silent,
+) -> VoxelMap:
+    """Every point of every scan in one map, in memory; see `build_maps`."""
+    return build_maps(Drive(log, trajectory, segmenter, settings), account, progress).static
+
+
+def build_maps(
+    drive: Drive,
+    account: Account,
+    progress: Progress = silent,
+    *,
+    work: Path | None = None,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
+) -> Maps:
+    """Every point of every scan, at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
+
+    `work` is a folder for what is mapped so far; with `resume` what an interrupted run left there is used (of the same
+    drive, settings and `labels_from`, which says where the labels come from). The caller removes it. `workers`
+    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or belongs to
+    something else.
+    """
+    scans = drive.log.scans
+    _warn(drive, account)
+    if work is None and workers == 1:
+        static, removed = fuse_scans(drive, scans, account, progress)
+        maps = Maps(static.to_map(), removed.to_map())
+    else:
+        with _folder(work) as folder:
+            store = map_chunks(
+                drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from
+            )
+            maps = Maps(store.whole(STATIC), store.whole(REMOVED))
+    _check(drive, account, maps)
+    return maps
+
+
+def map_chunks(
+    drive: Drive,
+    work: Path,
+    account: Account,
+    progress: Progress = silent,
+    *,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
+) -> ChunkStore:
+    """Map a drive into a folder of chunks, whose tiles can be read one by one; memory does not grow with the drive."""
+    scans, mapping = drive.log.scans, drive.settings.mapping
+    chunks = _chunks(drive)
+    store = open_store(
+        work, fingerprint(drive, labels_from), len(chunks), resume, mapping.voxel_size_m, drive.label_set
+    )
+    there = store.done()
+    done = sum(len(chunks[number]) for number in there)
+    pending = [number for number in range(len(chunks)) if number not in there]
+    for number in _map_all(drive, store, pending, workers, _shifted(progress, done, len(scans))):
+        done += len(chunks[number])
+        progress("mapping", done, len(scans))
+    for record in store.records():
+        account.counts.update(record["counts"])
+        account.skips.extend(Skip(**skip) for skip in record["skips"])
+    return store
+
+
+def fuse_scans(
+    drive: Drive, scans: Sequence[Scan], account: Account, progress: Progress = silent
+) -> tuple[VoxelTable, VoxelTable]:
+    """Fuse some scans of a drive: what stands, and what belongs to something that moved."""
+    settings = drive.settings
+    static, removed = _table(settings), _table(settings)
+    for done, seen in enumerate(look_at(drive, scans, account)):
+        if seen is not None:
+            keys = seen.keys
+            moved = np.zeros(len(keys), np.bool_)
+            if drive.moving is not None:
+                moved[drive.moving.get(seen.scan.number, [])] = True
+            if moved.any():
+                removed.add(keys[moved], seen.pixels[moved], seen.classes)
+                static.add(keys[~moved], seen.pixels[~moved], seen.classes)
+            else:
+                static.add(keys, seen.pixels, seen.classes)
+        progress("mapping", done + 1, len(scans))
+    return static, removed
+
+
+def _table(settings: Settings) -> VoxelTable:
+    label_set = open_label_set(settings.classes)
+    calibration = sensor_model.opened(settings.calibration, label_set)
+    return VoxelTable(
+        settings.mapping.voxel_size_m,
+        label_set,
+        settings.labelling.probability_floor,
+        None if calibration is None else calibration.log_likelihoods,
+        settings.labelling.abstain,
+    )
+
+
+def _warn(drive: Drive, account: Account) -> None:
+    if drive.segmenter is None:
+        account.warnings.append("no segmenter: the map shows geometry only")
+    elif not _has_camera(drive):
+        account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
+
+
+def _check(drive: Drive, account: Account, maps: Maps) -> None:
+    if not account.counts["scans"]:
+        why = _first_reason(account, "scan")
+        raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
+    is_labelled = maps.static.observed.any() or maps.removed.observed.any()
+    if drive.segmenter is not None and _has_camera(drive) and not is_labelled:
+        why = _first_reason(account, "labels")
+        account.warnings.append(f"no point got a label, and the map shows geometry only{why}")
+
+
+def _has_camera(drive: Drive) -> bool:
+    return bool(drive.log.images) and drive.log.calibration.has_camera
+
+
+def _first_reason(account: Account, what: str) -> str:
+    """Why the first one was left out, as the end of a sentence; nothing where none was."""
+    return next((f"; first reason: {s.where}: {s.reason}" for s in account.skips if s.what == what), "")
+
+
+@contextmanager
+def _folder(work: Path | None) -> Iterator[Path]:
+    if work is not None:
+        yield work
+        return
+    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        yield Path(folder)
+
+
+def _shifted(progress: Progress, done: int, total: int) -> Progress:
+    return lambda stage, more, _: progress(stage, done + more, total)
+
+
+def _chunks(drive: Drive) -> list[Sequence[Scan]]:
+    scans, count = drive.log.scans, drive.settings.mapping.scans_per_chunk
+    return [scans[i : i + count] for i in range(0, len(scans), count)]
+
+
+def _map_all(
+    drive: Drive, store: ChunkStore, numbers: Sequence[int], workers: int, progress: Progress
+) -> Iterator[int]:
+    """Map these chunks and put them away; yields the number of each that is done."""
+    if workers > 1 and len(numbers) > 1:
+        _check_sendable(drive)
+        yield from in_processes(_map_chunk, (drive, store), numbers, workers)
+        return
+    done = 0
+    for number in numbers:
+        _map_chunk(drive, store, number, _shifted(progress, done, 0))
+        done += len(_chunks(drive)[number])
+        yield number
+
+
+def _map_chunk(drive: Drive, store: ChunkStore, number: int, progress: Progress = silent) -> None:
+    account = Account()
+    static, removed = fuse_scans(drive, _chunks(drive)[number], account, progress)
+    record = {"counts": dict(account.counts), "skips": [asdict(skip) for skip in account.skips]}
+    store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)
+
+
+def _check_sendable(drive: Drive) -> None:
+    try:
+        pickle.dumps(drive.segmenter)
+    except Exception as error:  # noqa: BLE001 (an object may refuse in any way)
+        raise ConfigError(
+            f"this segmenter cannot work in several processes ({error}); write its probabilities with"
+            " `gnss-sem-map segment` first and use labels:FOLDER, or leave out --workers"
+        ) from None
+
+
+def fingerprint(drive: Drive, labels_from: str) -> str:
+    """What two runs share when one may go on with what the other left: everything that decides the map."""
+    log, settings = drive.log, drive.settings
+    names = () if drive.segmenter is None else drive.segmenter.class_names
+    said = [
+        log.name, labels_from, list(names), settings.classes,
+        settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
+        [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
+        [(image.number, image.stamp, _state(image)) for image in log.images], _states(labels_from),
+        log.calibration.image_size, log.calibration.camera_time_offset_s,
+    ]  # fmt: skip
+    digest = hashlib.sha256(repr(said).encode())
+    for array in _arrays(drive):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def answers_fingerprint(drive: Drive, labels_from: str) -> str:
+    """What two runs share when one may use what a network told the other: the network, the images, the classes."""
+    log = drive.log
+    names = () if drive.segmenter is None else drive.segmenter.class_names
+    said = [
+        log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_size,
+        [(image.number, _state(image)) for image in log.images], _states(labels_from),
+    ]  # fmt: skip
+    return hashlib.sha256(repr(said).encode()).hexdigest()
+
+
+def _state(item: Scan | Image) -> tuple[int, int] | None:
+    """Size and time of the file that a scan or an image is read from."""
+    path = file_of(item)
+    return None if path is None else _size_and_time(path)
+
+
+def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
+    """Sizes and times of the files that a segmenter's description names: label files, or those of a network."""
+    place = Path(labels_from.partition(":")[2].partition("?")[0])
+    if not labels_from.partition(":")[2] or not place.exists():
+        return []
+    files = sorted(path for path in place.iterdir() if path.is_file()) if place.is_dir() else [place]
+    return [(path.name, _size_and_time(path)) for path in files]
+
+
+def _size_and_time(path: Path) -> tuple[int, int] | None:
+    try:
+        about = path.stat()
+    except OSError:  # reading it will say so
+        return None
+    return about.st_size, about.st_mtime_ns
+
+
+def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
+    calibration, trajectory = drive.log.calibration, drive.trajectory
+    learnt = sensor_model.opened(drive.settings.calibration, open_label_set(drive.settings.classes))
+    if learnt is not None:
+        yield learnt.log_likelihoods
+    yield from (trajectory.stamps, trajectory.T_map_imu, calibration.T_imu_lidar)
+    for array in (trajectory.velocities, calibration.T_camera_lidar, calibration.K):
+        if array is not None:
+            yield array
+    for number, places in sorted((drive.moving or {}).items()):
+        yield np.array([number])
+        yield places

@@ -1,0 +1,159 @@
+"""Two maps of the same place in one frame, added: what both drives saw counts twice as much.
+
+Voxels are moved by their centres, through the Earth: east, north and up differ from origin to origin. Then the surfaces
+of the second are laid onto those of the first, since the georeference of both errs. A moved voxel lands in the one that
+holds its centre, so geometry shifts by up to half a voxel along each axis; evidence and hits are carried over whole. In
+its own frame a map is added exactly, unless it is laid anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HITS_LIMIT
+from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
+
+PARKED = "vehicle"
+"""Class of what stands elsewhere when the second drive comes: no map is laid onto it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """How the second map came to lie on the first."""
+
+    match: MapMatch | None
+    """By which it was moved; None: by its georeference alone."""
+    reason: str
+    """Why there is no match; empty where there is one, or none was asked for."""
+    coinciding: tuple[float, float]
+    """Share of the second's voxels that fall into one of the first: by georeference, and as it lies now."""
+
+
+@dataclass(frozen=True, eq=False)
+class MergedRuns:
+    """Two runs as one."""
+
+    stands: VoxelMap
+    removed: VoxelMap
+    """What moved."""
+    frame: LocalFrame
+    """Of the first run, and now of both."""
+    laid: Laid
+
+
+def merge(
+    first: VoxelMap,
+    second: VoxelMap,
+    first_frame: LocalFrame | None,
+    second_frame: LocalFrame | None,
+    T: NDArray[np.float64] | None = None,
+) -> VoxelMap:
+    """Both maps in the frame of the first; `T` (4, 4) moves the second in that frame.
+
+    Raises DataError for another voxel size or class set, and for maps of which one is not georeferenced: nothing says
+    then how they lie to each other.
+    """
+    return first + into_frame(second, _known(second_frame), _known(first_frame), T)
+
+
+def merge_runs(
+    first: Path, second: Path, label_set: LabelSet | None = None, match: bool = True
+) -> MergedRuns:
+    """What stands and what was removed in two run folders, in the frame of the first.
+
+    The second is laid onto the first where the two `match`. Raises DataError for a folder without maps, a damaged one,
+    and maps that do not fit together.
+    """
+    frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
+    static, removed = zip(*(_parted(run, label_set) for run in (first, second)), strict=True)
+    laid = lay_onto(static[0], static[1], frames[0], frames[1], match)
+    T = laid.match.T_target_source if laid.match else None
+    stands, gone_too = (merge(a, b, frames[0], frames[1], T) for a, b in (static, removed))
+    return MergedRuns(stands, gone_too, frames[0], laid)
+
+
+def _parted(run: Path, label_set: LabelSet | None) -> tuple[VoxelMap, VoxelMap]:
+    """What stands in a run, and what moved: map/ holds all evidence, refined/ says what of it stands."""
+    everything, stands = tiles.read(run / "map", label_set), tiles.read(run / "refined", label_set).standing
+    try:
+        return stands, everything.voxels - stands
+    except DataError:
+        raise DataError(f"{run}: map/ and refined/ are not of one run; make the run again") from None
+
+
+def lay_onto(
+    first: VoxelMap, second: VoxelMap, first_frame: LocalFrame, second_frame: LocalFrame, match: bool = True
+) -> Laid:
+    """How to move the second map in the frame of the first, and whether more of both coincides then."""
+    p_second = _centres_in(second, second_frame, first_frame)
+    before = _coinciding(first, p_second)
+    if not match:
+        return Laid(None, "", (before, before))
+    try:
+        found = match_maps(first.centres[_stays(first)], p_second[_stays(second)])
+        after = _coinciding(first, _moved(p_second, found.T_target_source))
+        if after <= before:
+            raise NoMatch(f"{after:.0%} of the voxels would coincide, {before:.0%} do by georeference")
+    except NoMatch as error:
+        return Laid(None, str(error), (before, before))
+    return Laid(found, "", (before, after))
+
+
+def _stays(voxels: VoxelMap) -> NDArray[np.bool_]:
+    names = voxels.label_set.names
+    return np.asarray(voxels.labels != (names.index(PARKED) if PARKED in names else len(names)))
+
+
+def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
+    """Share of the points (n, 3) that lie in a voxel of the map."""
+    if not len(p_map):
+        return 0.0
+    return float((voxels.places(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
+
+
+def _known(frame: LocalFrame | None) -> LocalFrame:
+    if frame is None:
+        raise DataError(
+            "cannot merge a map without a georeference: its poses are in a frame of their own; give drives with GNSS"
+        )
+    return frame
+
+
+def into_frame(
+    voxels: VoxelMap, source: LocalFrame, target: LocalFrame, T: NDArray[np.float64] | None = None
+) -> VoxelMap:
+    """The map of one frame in another, moved there by `T` (4, 4); evidence of voxels that land in one is added.
+
+    Raises DataError when a sum overflows, or the frames lie farther apart than voxels reach.
+    """
+    if source == target and T is None:
+        return voxels
+    p_target = _moved(_centres_in(voxels, source, target), np.eye(4) if T is None else T)
+    keys, places = np.unique(keys_of(p_target, voxels.voxel_size_m), return_inverse=True)
+    evidence = np.zeros((len(keys), voxels.evidence.shape[1]), np.int64)
+    hits = np.zeros(len(keys), np.int64)
+    np.add.at(evidence, places, voxels.evidence)
+    np.add.at(hits, places, voxels.hits)
+    if (evidence < -EVIDENCE_LIMIT).any() or (hits > HITS_LIMIT).any():
+        raise DataError("cannot merge these maps: a voxel's evidence would overflow 32 bits")
+    return VoxelMap(
+        voxels.voxel_size_m, voxels.label_set, keys, evidence.astype(np.int32), hits.astype(np.uint32)
+    )
+
+
+def _centres_in(voxels: VoxelMap, source: LocalFrame, target: LocalFrame) -> NDArray[np.float64]:
+    """Centres (v, 3) m in another frame."""
+    return voxels.centres if source == target else target.to_map(*source.to_geodetic(voxels.centres))
+
+
+def _moved(p: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:
+    return p @ T[:3, :3].T + T[:3, 3]

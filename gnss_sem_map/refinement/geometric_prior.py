@@ -1,0 +1,65 @@
+"""Geometry as evidence: how high a voxel stands, and how its surface lies, say what it cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.labels.label_set import LabelSet
+
+
+class GeometrySettings(BaseModel):
+    """At which heights over the ground, and on which surfaces, a class is unlikely."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    against_nat: float = Field(
+        default=2.3, ge=0, description="What a broken rule counts against a class, nat."
+    )
+    road_highest_m: float = Field(default=0.35, description="Road is no higher than this, m.")
+    sidewalk_highest_m: float = Field(default=0.45, description="A sidewalk is no higher than this, m.")
+    way_least_flatness: float = Field(
+        default=0.8,
+        ge=0,
+        le=1,
+        description="Road and sidewalk lie at least this flat (1 is level, 0 upright).",
+    )
+    vehicle_highest_m: float = Field(
+        default=3.5, description="A vehicle is no higher than this (counts twice), m."
+    )
+    building_lowest_m: float = Field(default=0.1, description="A building is no lower than this, m.")
+    building_foot_m: float = Field(
+        default=0.3, description="A building begins no higher than this, and not with level ground, m."
+    )
+    level_flatness: float = Field(default=0.95, ge=0, le=1, description="Flatter than this is level ground.")
+    vegetation_lowest_m: float = Field(
+        default=0.1, description="Vegetation is no lower than this (counts half), m."
+    )
+
+
+def against(
+    heights: NDArray[np.float32],
+    flatness: NDArray[np.float32],
+    label_set: LabelSet,
+    settings: GeometrySettings,
+) -> NDArray[np.float32]:
+    """What heights (v,) m over ground and flatness (v,) add to the log scores: (v, c), zero or negative, nat.
+
+    A flatness that is not known, NaN, breaks no rule. The rules are hand-written and soft: a few looks that agree
+    outweigh them. How low a vehicle reaches is left to the vehicle rules, which know its object.
+    """
+    steep, level = flatness < settings.way_least_flatness, flatness > settings.level_flatness
+    rules = (
+        ("road", (heights > settings.road_highest_m) | steep, 1.0),
+        ("sidewalk", (heights > settings.sidewalk_highest_m) | steep, 1.0),
+        ("vehicle", heights > settings.vehicle_highest_m, 2.0),
+        ("building", heights < settings.building_lowest_m, 1.0),
+        ("building", (heights < settings.building_foot_m) & level, 1.0),
+        ("vegetation", heights < settings.vegetation_lowest_m, 0.5),
+    )
+    result = np.zeros((len(heights), len(label_set.names)), np.float32)
+    for name, broken, weight in rules:
+        if name in label_set.names:
+            result[broken, label_set.index(name)] -= np.float32(weight * settings.against_nat)
+    return result

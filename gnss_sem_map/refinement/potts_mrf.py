@@ -1,0 +1,105 @@
+"""Space as evidence: neighbouring voxels tend to be of one class (mean field of a Potts model)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.voxel_map import softmax
+
+LEAST_PROBABILITY = 1e-12
+HALF_STENCIL = np.array(
+    [
+        (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z
+        for x in (-1, 0, 1)
+        for y in (-1, 0, 1)
+        for z in (-1, 0, 1)
+        if (x, y, z) < (0, 0, 0)
+    ],
+    np.int64,
+)
+"""Key offsets of 13 of the 26 neighbours; the others see the pair from their side."""
+
+
+class SmoothingSettings(BaseModel):
+    """How much the neighbours of a voxel have to say."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    temper: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="A voxel's own evidence is multiplied by this, or neighbours have no say.",
+    )
+    coupling_nat: float = Field(
+        default=0.3, ge=0, description="What a neighbour that is sure of a class adds to it, nat."
+    )
+    iterations: int = Field(default=5, ge=1, le=100, description="Mean-field updates, all voxels at once.")
+
+
+def mean_field(
+    keys: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    observed: NDArray[np.bool_],
+    settings: SmoothingSettings,
+) -> NDArray[np.float32]:
+    """Log probabilities (v, c) in which every voxel has heard its 26 neighbours.
+
+    `keys` (v,) sorted packed voxels, `scores` (v, c) log scores; what no camera `observed` (v,) has no say and stays as
+    it is. q = softmax(U + coupling * sum of q over the neighbours), U = temper * scores, starting from softmax(U).
+    Source: Krähenbühl, Koltun, "Efficient inference in fully connected CRFs" (2011), with neighbours only.
+    """
+    seen = np.flatnonzero(observed)
+    if len(seen) == 0:
+        return scores
+    own = np.float32(settings.temper) * scores[seen]
+    q = softmax(own)
+    for _ in range(settings.iterations):
+        heard = np.zeros_like(q)
+        _hear(keys[seen], q, HALF_STENCIL, heard)
+        q = softmax(own + np.float32(settings.coupling_nat) * heard)
+    result = scores.copy()
+    result[seen] = np.log(np.maximum(q, LEAST_PROBABILITY))
+    return result
+
+
+def infer(
+    keys: NDArray[np.int64],
+    scores: NDArray[np.float32],
+    observed: NDArray[np.bool_],
+    settings: SmoothingSettings,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Log scores (v, c) in which voxels without an observation repeat what their 26 neighbours say, and which (v,) do.
+
+    Each of the `iterations` reaches one voxel farther; a voxel hears observed ones first and only then inferred ones.
+    """
+    scores, known = scores.copy(), observed.copy()
+    for _ in range(settings.iterations):
+        q = np.where(known[:, None], softmax(scores), np.float32(0))
+        heard = np.zeros_like(q)
+        _hear(keys, q, HALF_STENCIL, heard)
+        reached = ~known & heard.any(axis=1)
+        if not reached.any():
+            break
+        scores[reached] = np.float32(settings.coupling_nat) * heard[reached]
+        known |= reached
+    return scores, known & ~observed
+
+
+@njit(cache=True, nogil=True)
+def _hear(keys, q, stencil, heard):
+    """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""
+    for offset in stencil:
+        j = 0
+        for i in range(len(keys)):
+            wanted = keys[i] + offset
+            while keys[j] < wanted:
+                j += 1
+            if keys[j] == wanted:
+                for c in range(q.shape[1]):
+                    heard[i, c] += q[j, c]
+                    heard[j, c] += q[i, c]

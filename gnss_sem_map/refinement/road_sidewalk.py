@@ -1,0 +1,57 @@
+"""Road and sidewalk in a map: where they are, and where they meet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.voxels import kernels
+from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.voxel_map import SemanticMap
+
+ROAD, SIDEWALK = 0, 1
+"""Which of the two `ways` is which."""
+
+
+def ways(label_set: LabelSet) -> tuple[int, int] | None:
+    """Class indices of road and sidewalk; None for a class set that lacks one."""
+    names = label_set.names
+    return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
+
+
+def on_ways(semantic_map: SemanticMap) -> NDArray[np.bool_]:
+    """Which voxels (v,) are shown as road or sidewalk; none where either is missing: nothing is to be told apart."""
+    classes = ways(semantic_map.voxels.label_set)
+    shown = np.where(semantic_map.shown, semantic_map.labels, UNLABELLED)
+    if classes is None or not all((shown == one).any() for one in classes):
+        return np.zeros(len(shown), np.bool_)
+    return np.isin(shown, classes)
+
+
+def around(
+    keys: NDArray[np.int64], sought: NDArray[np.int64], reach: tuple[int, int, int]
+) -> Iterator[NDArray[np.int64]]:
+    """Places (k,) among sorted packed `keys` of what lies around the k `sought`, -1 for nothing there.
+
+    One array per offset within `reach` in x, y and z, x outermost.
+    """
+    for x, y, z in product(*(range(-r, r + 1) for r in reach)):
+        found = np.empty(len(sought), np.int64)
+        kernels.find(keys, sought + ((x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z), found)
+        yield found
+
+
+def meeting(
+    semantic_map: SemanticMap, labels: NDArray[np.integer], classes: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Which voxels (v,) of one of the classes are beside one of the other, in their own layer."""
+    found, keys = np.zeros(len(labels), np.bool_), semantic_map.voxels.keys
+    for own, other in (classes, classes[::-1]):
+        candidates = np.flatnonzero(labels == own)
+        for beside in around(keys, keys[candidates], (1, 1, 0)):
+            found[candidates] |= (beside >= 0) & (labels[beside] == other)
+    return found

@@ -1,0 +1,200 @@
+"""Where the points of a scan fall: in the map, in its voxels, in the image of its moment.
+
+A scan is worked through in blocks that stay in the processor's nearest cache, so that nothing but the answer goes
+through memory: keys for every point, and a short list of those that fall into the image. Inside a block the
+coordinates lie axis by axis, which lets every simple loop here work on several points at once. The readable twin of
+each is the numpy oracle in the tests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import int64, njit
+
+from gnss_sem_map.voxels.kernels import pack_key
+
+BLOCK = 1024
+"""Points at once: three coordinates of each are 24 kB, which fits the first cache of any processor of today."""
+COLUMNS = 4
+"""Of a scan's rows: x, y, z, intensity."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, p_map):
+    """Move the usable points of a scan into the map, one after another; returns how many.
+
+    `rows` (4 n,) as the file has them; `stamps` (n,), or none for a sweep with one pose; `poses` (k, 3, 8), see
+    `_move`, of knots that lie `knots_per_s` in a second, numbered from stamp zero. `valid` (n,) becomes which points
+    are finite and in range, `p_map` (3 m,) where those are.
+    """
+    count, block, knots = 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
+    for start in range(0, len(valid), BLOCK):
+        m = _move_block(
+            rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
+        )
+        _append(block, count, m, p_map)
+        count += m
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _append(block, count, m, p_map):
+    """Write the first m points of a block behind the `count` that are in p_map (3 n,)."""
+    x, y, z, here = block[0], block[1], block[2], p_map[3 * count : 3 * (count + m)]
+    for i in range(m):
+        here[3 * i], here[3 * i + 1], here[3 * i + 2] = x[i], y[i], z[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def place(
+    rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, voxel_size_m, P, nearest_depth_m, half_columns,
+    valid, keys, p_map, points, columns, lines, depths, nearest,
+):  # fmt: skip
+    """Find the voxels of the usable points of a scan, and those that fall into the image; returns both numbers.
+
+    As `to_map`, but what is kept are the `keys` (m,) of their voxels, 0 where no key can be, and what `project` finds
+    with `P`; without an image `nearest` is empty. Where `p_map` is empty the points themselves are not kept.
+    """
+    count, inside, block, knots = 0, 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
+    for start in range(0, len(valid), BLOCK):
+        m = _move_block(
+            rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
+        )
+        x, y, z, here = block[0, :m], block[1, :m], block[2, :m], keys[count : count + m]
+        for i in range(m):
+            here[i] = pack_key(x[i], y[i], z[i], voxel_size_m)
+        if len(p_map) > 0:
+            _append(block, count, m, p_map)
+        if len(nearest) > 0:
+            inside = project(
+                x, y, z, count, P, nearest_depth_m, half_columns, points, columns, lines, depths, inside, nearest
+            )  # fmt: skip
+        count += m
+    return count, inside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move_block(
+    rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
+):
+    """Move the usable ones of the points from `start` into the first columns of `block`; returns how many."""
+    end = min(start + BLOCK, len(valid))
+    here, usable = rows[COLUMNS * start : COLUMNS * end], valid[start:end]
+    mark_usable(here, nearest_m, farthest_m, usable)
+    if len(stamps) > 0:
+        then = stamps[start:end]
+        for i in range(len(then)):
+            knots[i] = then[i] * knots_per_s - first_knot
+    return _transform(here, usable, knots, poses, block)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _coordinates(rows, i):
+    return np.float64(rows[COLUMNS * i]), np.float64(rows[COLUMNS * i + 1]), np.float64(rows[COLUMNS * i + 2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def mark_usable(rows, nearest_m, farthest_m, valid):
+    """Mark the points (n,) that are finite and in range."""
+    nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
+    for i in range(len(valid)):
+        x, y, z = _coordinates(rows, i)
+        square = x * x + y * y + z * z
+        valid[i] = (square >= nearest) & (square <= farthest)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _transform(rows, valid, knots, poses, p_map):
+    """Move the valid points, stretch by stretch of those between the same two knots; returns how many.
+
+    `knots` are stamps as knots since the first: the whole part says which, the rest how far to the next.
+    """
+    i, to, n = 0, 0, len(valid)
+    while i < n:
+        if not valid[i]:
+            i += 1
+            continue
+        k = min(max(int64(knots[i]), 0), len(poses) - 1)
+        end = i + 1
+        while end < n and valid[end] and k <= knots[end] < k + 1:
+            end += 1
+        m = to + end - i
+        here = rows[COLUMNS * i : COLUMNS * end]
+        _move(here, knots[i:end], k, poses[k], p_map[0, to:m], p_map[1, to:m], p_map[2, to:m])
+        i, to = end, m
+    return to
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _move(rows, knots, k, pose, x_map, y_map, z_map):
+    """One stretch, blended linearly between two poses: `pose` (3, 8) is one (3, 4) and what the next one adds."""
+    xx, xy, xz, x0, dxx, dxy, dxz, dx0 = pose[0]
+    yx, yy, yz, y0, dyx, dyy, dyz, dy0 = pose[1]
+    zx, zy, zz, z0, dzx, dzy, dzz, dz0 = pose[2]
+    for i in range(len(x_map)):
+        x, y, z = _coordinates(rows, i)
+        part = knots[i] - k
+        x_map[i] = xx * x + xy * y + xz * z + x0 + part * (dxx * x + dxy * y + dxz * z + dx0)
+        y_map[i] = yx * x + yy * y + yz * z + y0 + part * (dyx * x + dyy * y + dyz * z + dy0)
+        z_map[i] = zx * x + zy * y + zz * z + z0 + part * (dzx * x + dzy * y + dzz * z + dz0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def project(
+    x_map, y_map, z_map, first, P, nearest_depth_m, half_columns, points, columns, lines, depths, inside, nearest
+):  # fmt: skip
+    """Append the points that fall into the image (eq. 3, 4) to the `inside` that do; returns how many do now.
+
+    `points` are numbers, counted from `first`; `columns` and `lines` their pixels, `depths` m. A pixel reaches from its
+    number to the next. That numbers are centres in KITTI's calibration would move points by half a pixel, which a real
+    network's labels do not tell apart (accuracy 80.22 and 80.20 %).
+    `nearest` (h, w) keeps the nearest depth: a point writes into its own line only, `half_columns` to either side;
+    `visible` looks along the columns. Together they are a window, at the price of its edges.
+    """
+    height, width = nearest.shape
+    for i in range(len(x_map)):
+        x, y, z = x_map[i], y_map[i], z_map[i]
+        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+        if not w > nearest_depth_m:
+            continue
+        u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w
+        v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
+        if not (u >= 0 and u < width and v >= 0 and v < height):
+            continue
+        column, line, depth = int64(u), int64(v), np.float32(w)
+        points[inside], columns[inside], lines[inside], depths[inside] = first + i, column, line, depth
+        inside += 1
+        for c in range(max(column - half_columns, 0), min(column + half_columns + 1, width)):
+            nearest[line, c] = min(nearest[line, c], depth)
+    return inside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def visible(
+    points, columns, lines, depths, nearest, half_lines, ratio, slack_m, line_of, column_of, class_width, pixels
+):  # fmt: skip
+    """Keep of the `points` in an image those that nothing nearer hides, with the pixel of the class image each sees.
+
+    `line_of` (h,) and `column_of` (w,) say where a camera pixel lies in the class image. Returns how many stay.
+    """
+    height, kept = len(nearest), 0
+    for i in range(len(points)):
+        line, column, depth = lines[i], columns[i], depths[i]
+        closest = depth
+        for r in range(max(line - half_lines, 0), min(line + half_lines + 1, height)):
+            closest = min(closest, nearest[r, column])
+        points[kept] = points[i]
+        pixels[kept] = line_of[line] * class_width + column_of[column]
+        kept += depth <= (1.0 + ratio) * closest + slack_m
+    return kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gather(probabilities, pixels, classes):
+    """Copy the class probabilities (h, w, c + 1) of some pixels, however the image lies in memory."""
+    width = np.uint32(probabilities.shape[1])
+    for i in range(len(pixels)):
+        line = np.uint32(pixels[i]) // width
+        column = np.uint32(pixels[i]) - line * width
+        for c in range(probabilities.shape[2]):
+            classes[i, c] = probabilities[line, column, c]

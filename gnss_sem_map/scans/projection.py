@@ -1,0 +1,214 @@
+"""From pixels to points: which pixel each map point was seen in, at the moment the image was exposed (eq. 3 to 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.probabilities import LabelImage
+from gnss_sem_map.scans import kernels
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
+from gnss_sem_map.sensor_log import Calibration, Image
+
+NEAREST_DEPTH_M = 0.5
+LARGEST_SHRINK = 8
+
+
+class LabellingSettings(BaseModel):
+    """How points find their pixels, and how far a pixel is believed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    probability_floor: float = Field(
+        0.05,
+        ge=0.01,
+        le=0.5,
+        description="No class gets less probability than this from one look (whole percent).",
+    )
+    occlusion_rows_px: int = Field(
+        7, ge=1, le=101, description="Height of the window in which a nearer point hides a farther one (odd)."
+    )
+    occlusion_columns_px: int = Field(5, ge=1, le=101, description="Width of that window (odd).")
+    occlusion_ratio: float = Field(
+        0.05, ge=0, description="A point is visible up to this share behind the nearest,"
+    )
+    occlusion_m: float = Field(0.3, ge=0, description="plus this distance.")
+    abstain: bool = Field(
+        False,
+        description="A pixel where `other` wins says nothing; by default its five classes share its vote.",
+    )
+    image_within_s: float = Field(
+        0.06, gt=0, description="A scan takes labels from an image at most this far in time."
+    )
+    camera_time_offset_s: float | None = Field(
+        None,
+        description="Moment of exposure minus image stamp; default: what the drive's format is known to have.",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ClassImage:
+    """What a network saw in one image, in the map's classes."""
+
+    seen: NDArray[np.uint8] | LabelImage
+    """(h, w, c + 1), round(255 p); `other` last. Or a label image of the same classes."""
+    shrink: int
+    """Camera pixels per pixel of this image, along each axis."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w)."""
+        image = self.seen.ids if isinstance(self.seen, LabelImage) else self.seen
+        return image.shape[0], image.shape[1]
+
+    @property
+    def probabilities(self) -> NDArray[np.uint8]:
+        """(h, w, c + 1) of every pixel."""
+        return self.seen.probabilities if isinstance(self.seen, LabelImage) else self.seen
+
+    @property
+    def rows(self) -> NDArray[np.uint8]:
+        """The same pixels as one list, (h w, c + 1)."""
+        return self.probabilities.reshape(-1, self.probabilities.shape[2])
+
+    def at(self, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The probabilities (m, c + 1) of some pixels of that list: however the image lies in memory, only these."""
+        if isinstance(self.seen, LabelImage):
+            return np.take(self.seen.table, np.take(self.seen.ids, pixels), axis=0)
+        classes = np.empty((len(pixels), self.seen.shape[2]), np.uint8)
+        kernels.gather(self.seen, pixels, classes)
+        return classes
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The image's camera at the moment of exposure, and room for what falls into it: see `scan_kernels.project`."""
+
+    P: NDArray[np.float64]
+    """(3, 4), from the map to pixels."""
+    inside: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]
+    """Points, columns, lines, depths: (n,) each, of which the first few are filled."""
+    nearest: NDArray[np.float32]
+    """(h, w) m; empty where there is no image."""
+
+
+def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int, over: View | None = None) -> View:
+    """Room for the `n` points of a scan in an image of (width, height): that of the view `over`, if it is enough."""
+    if over is not None and over.nearest.shape == size[::-1] and len(over.inside[0]) >= n:
+        over.nearest.fill(np.inf)
+        return View(P, over.inside, over.nearest)
+    points, columns, lines = (np.empty(n, np.int32) for _ in range(3))
+    nearest = np.full(size[::-1], np.inf, np.float32)
+    return View(P, (points, columns, lines, np.empty(n, np.float32)), nearest)
+
+
+NO_VIEW = view_of(np.zeros((3, 4)), (0, 0), 0)
+"""Where there is no image."""
+
+
+def class_image(
+    probabilities: NDArray[np.uint8] | NDArray[np.floating] | LabelImage,
+    class_names: tuple[str, ...],
+    label_set: LabelSet,
+    image_size: tuple[int, int],
+    where: str,
+) -> ClassImage:
+    """Sum a network's classes by name into the map's, and find the scale against the camera image.
+
+    `probabilities` (h, w, s): uint8 as round(255 p), or floating in 0..1; (h, w) the camera image's size or that size
+    divided by an integer and rounded down. Raises DataError for another size, ConfigError for an unknown class name.
+    """
+    if isinstance(probabilities, LabelImage):
+        return ClassImage(probabilities, _shrink(probabilities.ids.shape, image_size, where))
+    if probabilities.ndim != 3 or probabilities.shape[2] != len(class_names):
+        raise DataError(
+            f"{where}: found shape {probabilities.shape}, expected (h, w, {len(class_names)}) for {list(class_names)}"
+        )
+    shrink = _shrink(probabilities.shape[:2], image_size, where)
+    wanted = (*label_set.names, "other")
+    if probabilities.dtype == np.uint8 and tuple(class_names) == wanted:
+        return ClassImage(np.asarray(probabilities, np.uint8), shrink)
+    table = label_set.table_from(class_names)
+    scale = 1.0 if probabilities.dtype == np.uint8 else 255.0
+    summed = np.rint(np.asarray(probabilities, np.float32) * np.float32(scale) @ table)
+    if not (np.isfinite(summed).all() and (summed >= 0).all()):
+        raise DataError(f"{where}: found probabilities that are negative or not finite; expected 0..1")
+    return ClassImage(np.minimum(summed, 255).astype(np.uint8), shrink)
+
+
+def _shrink(shape: tuple[int, ...], image_size: tuple[int, int], where: str) -> int:
+    width, height = image_size
+    for shrink in range(1, LARGEST_SHRINK + 1):
+        if shape == (height // shrink, width // shrink):
+            return shrink
+    raise DataError(
+        f"{where}: found {shape[1]} x {shape[0]} pixels for a camera of {width} x {height};"
+        f" expected that size, or it divided by 2 to {LARGEST_SHRINK} and rounded down"
+    )
+
+
+def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSettings) -> float:
+    """Moment at which the image was exposed, s."""
+    offset = settings.camera_time_offset_s
+    return image.stamp + (calibration.camera_time_offset_s if offset is None else offset)
+
+
+def view_at(
+    stamp: float, trajectory: Trajectory, calibration: Calibration, n: int, over: View | None = None
+) -> View:
+    """The camera at the moment `stamp`, with room for `n` points; raises DataError when the drive has none.
+
+    Writes over an earlier view, if one is given: fresh memory costs more than what is done with it.
+    """
+    if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
+        raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
+    T_map_imu = trajectory.at(np.array([stamp]), EXTRAPOLATE_S)[0]
+    T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
+    return view_of(np.ascontiguousarray(calibration.K @ T_camera_map[:3]), calibration.image_size, n, over)
+
+
+def visible(
+    view: View, inside: int, classes: ClassImage, settings: LabellingSettings
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Of the `inside` points in the image those that are not hidden (p,), and the pixel of `classes` that each saw.
+
+    A point is hidden when another one of the same scan, in a window around its pixel that fits the LiDAR's spacing, is
+    nearer by more than the tolerance (real data: 7 x 5 px, 5 % + 0.3 m; the exact pixel alone hides nothing, for the
+    LiDAR is sparser than the image).
+    """
+    (height, width), (class_height, class_width) = view.nearest.shape, classes.size
+    points, columns, lines, depths = view.inside
+    pixels = np.empty(inside, np.int32)
+    kept = kernels.visible(
+        points[:inside], columns, lines, depths, view.nearest,
+        settings.occlusion_rows_px // 2, settings.occlusion_ratio, settings.occlusion_m,
+        np.minimum(np.arange(height) // classes.shrink, class_height - 1),
+        np.minimum(np.arange(width) // classes.shrink, class_width - 1), class_width, pixels,
+    )  # fmt: skip
+    return points[:kept], pixels[:kept]
+
+
+def pixels_seen(
+    p_map: NDArray[np.float64],
+    stamp: float,
+    trajectory: Trajectory,
+    calibration: Calibration,
+    classes: ClassImage,
+    settings: LabellingSettings,
+) -> NDArray[np.int32]:
+    """For every map point (n, 3) the row of `classes.rows` that it was seen in at `stamp`, or -1: see `visible`."""
+    view = view_at(stamp, trajectory, calibration, len(p_map))
+    x, y, z = np.ascontiguousarray(p_map.T)
+    inside = kernels.project(
+        x, y, z, 0, view.P, NEAREST_DEPTH_M, settings.occlusion_columns_px // 2, *view.inside, 0, view.nearest
+    )
+    points, seen = visible(view, inside, classes, settings)
+    pixels = np.full(len(p_map), -1, np.int32)
+    pixels[points] = seen
+    return pixels

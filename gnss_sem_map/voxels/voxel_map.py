@@ -1,0 +1,394 @@
+"""The map: a set of voxels with class evidence, in which Bayes' rule (eq. 6) is addition.
+
+Evidence is kept as integer sums of log-likelihoods, so adding is exact: any order of scans, any chunking and
+any merge give the same map, bit for bit. `VoxelTable` collects, `VoxelMap` is the value that comes out, and
+`SemanticMap` is a map with a decision for every voxel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.voxels import kernels
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, FIRST_SUM, UNITS_PER_NAT
+
+SMALLEST_TABLE = 1 << 18
+LARGE_TABLE = 1 << 20
+"""Rows (32 MB for five classes) up to which a table doubles; beyond, it grows by a twelfth and stays under 50 bytes
+per voxel, for growing reads and writes memory in order and is cheap."""
+HIGHEST_LOAD = 0.7
+ANSWER_SHARE = 0.5
+"""With a calibrated network a look is half its answer's measured meaning and half its probabilities: of all mixtures
+tried on held-out streets the most robust."""
+
+
+class MappingSettings(BaseModel):
+    """How points become voxels."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
+    nearest_m: float = Field(
+        2.4,
+        ge=0,
+        description="Returns nearer to the LiDAR than this are left out: the car itself (KITTI's reaches that far).",
+    )
+    farthest_m: float = Field(
+        120.0, gt=0, description="Returns farther from the LiDAR than this are left out."
+    )
+    scans_per_chunk: int = Field(
+        100,
+        ge=1,
+        description="Scans that one process maps before it puts them away: its memory, and what an interruption loses."
+        " The map is the same.",
+    )
+
+
+class State(IntEnum):
+    """Where the label of a voxel comes from."""
+
+    UNOBSERVED = 0
+    """No camera saw it: no label."""
+    OBSERVED = 1
+    """The label is what the fused images say."""
+    INFERRED = 2
+    """No camera saw it; its label comes from its surroundings."""
+    REFINED = 3
+    """Refinement changed the label that the images gave."""
+    REMOVED = 4
+    """Part of something that moved: kept as a layer, not shown in the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelMap:
+    """Voxels with their evidence; `a + b` merges, `a - b` takes a part out again, `a[mask]` selects."""
+
+    voxel_size_m: float
+    label_set: LabelSet
+    keys: NDArray[np.int64]
+    """(v,) packed indices, sorted, unique."""
+    evidence: NDArray[np.int32]
+    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no camera saw the voxel."""
+    hits: NDArray[np.uint32]
+    """(v,) LiDAR points that fell into the voxel."""
+
+    def __post_init__(self) -> None:
+        v, c = len(self.keys), len(self.label_set.names)
+        if self.evidence.shape != (v, c) or self.hits.shape != (v,):
+            raise DataError(
+                f"voxel map: found {v} keys, evidence {self.evidence.shape}, hits {self.hits.shape};"
+                f" expected ({v}, {c}) and ({v},)"
+            )
+        if v > 1 and not (self.keys[1:] > self.keys[:-1]).all():
+            raise DataError("voxel map: keys are not sorted and unique")
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @classmethod
+    def of_rows(cls, rows: NDArray[np.int64], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+        """The map of table rows (v, words) in any order: key, sums and hits, as `voxel_kernels` lays them out."""
+        rows = rows[np.argsort(rows[:, 0])]
+        ints, end = rows.view(np.int32), FIRST_SUM + len(label_set.names)
+        return cls(
+            voxel_size_m,
+            label_set,
+            keys=rows[:, 0].copy(),
+            evidence=ints[:, FIRST_SUM:end].copy(),
+            hits=ints[:, end].astype(np.uint32),
+        )
+
+    def to_rows(self) -> NDArray[np.int64]:
+        """The same voxels as table rows (v, words): 32 bytes each for five classes."""
+        rows = np.zeros((len(self), self.words(self.label_set)), np.int64)
+        ints, end = rows.view(np.int32), FIRST_SUM + len(self.label_set.names)
+        rows[:, 0], ints[:, FIRST_SUM:end], ints[:, end] = self.keys, self.evidence, self.hits
+        return rows
+
+    @staticmethod
+    def words(label_set: LabelSet) -> int:
+        """Width of a row: the key, and the sums and hits two to a word."""
+        return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
+
+    def __add__(self, other: VoxelMap) -> VoxelMap:
+        """Both maps' evidence, voxel by voxel; raises DataError for another voxel size or class set."""
+        if self.voxel_size_m != other.voxel_size_m or self.label_set.names != other.label_set.names:
+            raise DataError(
+                f"cannot add a map of {other.voxel_size_m} m voxels and classes {list(other.label_set.names)} to one of"
+                f" {self.voxel_size_m} m and {list(self.label_set.names)}; build both with the same settings"
+            )
+        room, c = len(self) + len(other), self.evidence.shape[1]
+        keys, evidence = np.empty(room, np.int64), np.empty((room, c), np.int32)
+        hits = np.empty(room, np.uint32)
+        count = kernels.merge(
+            self.keys, self.evidence, self.hits, other.keys, other.evidence, other.hits, keys, evidence, hits
+        )
+        if count < 0:
+            raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
+        return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
+
+    def __sub__(self, part: VoxelMap) -> VoxelMap:
+        """What is left of this map without a part that was added to it; raises DataError for what is no part of it."""
+        places = self.places(part.keys)
+        is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
+        if not is_part or (places < 0).any() or (self.hits[places] < part.hits).any():
+            raise DataError("cannot take one map out of another that does not hold it; were both of one run?")
+        evidence, hits = self.evidence.copy(), self.hits.copy()
+        evidence[places] -= part.evidence
+        hits[places] -= part.hits
+        if evidence[hits == 0].any():
+            raise DataError(
+                "cannot take one map out of another that has other evidence; were both of one run?"
+            )
+        return replace(self, evidence=evidence, hits=hits)[hits > 0]
+
+    def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
+        """The voxels where a boolean mask holds, or those at increasing places."""
+        return replace(
+            self, keys=self.keys[selection], evidence=self.evidence[selection], hits=self.hits[selection]
+        )
+
+    @cached_property
+    def indices(self) -> NDArray[np.int32]:
+        """(v, 3) integer voxel coordinates."""
+        return unpack(self.keys)
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """(v, 3) m, in the map frame."""
+        return (self.indices + np.float64(0.5)) * self.voxel_size_m
+
+    @cached_property
+    def observed(self) -> NDArray[np.bool_]:
+        """(v,) whether any camera saw the voxel."""
+        return np.asarray(self.evidence.any(axis=1))
+
+    @cached_property
+    def labels(self) -> NDArray[np.int8]:
+        """(v,) most probable class (eq. 7), -1 where no camera saw the voxel."""
+        return np.where(self.observed, self.evidence.argmax(axis=1), UNLABELLED).astype(np.int8)
+
+    @cached_property
+    def probabilities(self) -> NDArray[np.float32]:
+        """(v, c) class probabilities (eq. 6, normalised); even where no camera saw the voxel."""
+        return softmax(self.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT))
+
+    def places(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Row of each of these keys in the map, or -1."""
+        found = np.empty(len(keys), np.int64)
+        kernels.find(self.keys, keys, found)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class SemanticMap:
+    """A voxel map with a decision for every voxel: its class, how sure, and where that comes from."""
+
+    voxels: VoxelMap
+    labels: NDArray[np.int8]
+    """(v,) class index, -1 unlabelled."""
+    confidence: NDArray[np.float32]
+    """(v,) probability of the label; 0 where unlabelled."""
+    states: NDArray[np.uint8]
+    """(v,) of `State`."""
+    entropy: NDArray[np.float32] | None = None
+    """(v,) nat, of the class distribution behind `confidence`; None where a map was read from disk."""
+    hits_removed: NDArray[np.uint32] | None = None
+    """(v,) how many of the hits are of points that moved; None: those of the removed voxels, and no others."""
+
+    def __post_init__(self) -> None:
+        for name, values in (
+            ("labels", self.labels),
+            ("confidence", self.confidence),
+            ("states", self.states),
+            ("entropy", self.entropy),
+            ("hits_removed", self.hits_removed),
+        ):
+            if values is not None and values.shape != (len(self.voxels),):
+                raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
+
+    @classmethod
+    def of(cls, voxels: VoxelMap) -> SemanticMap:
+        """The map as fusion leaves it, before any refinement."""
+        probability = voxels.probabilities.max(axis=1, initial=0.0)
+        return cls(
+            voxels=voxels,
+            labels=voxels.labels,
+            confidence=np.where(voxels.observed, probability, 0).astype(np.float32),
+            states=np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8),
+            entropy=entropy_of(voxels.probabilities),
+        )
+
+    def __len__(self) -> int:
+        return len(self.voxels)
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_]:
+        """(v,) voxels with a label that belong to the map: all but the removed ones."""
+        return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
+
+    @property
+    def removed_hits(self) -> NDArray[np.uint32]:
+        """(v,) how many of the hits are of points that moved."""
+        if self.hits_removed is not None:
+            return self.hits_removed
+        return np.where(self.states == State.REMOVED, self.voxels.hits, np.uint32(0))
+
+    @property
+    def standing(self) -> VoxelMap:
+        """What stands: without the removed voxels, and without the hits of what moved through the others."""
+        stands = self.states != State.REMOVED
+        voxels = self.voxels[stands]
+        return replace(voxels, hits=voxels.hits - self.removed_hits[stands])
+
+
+class VoxelTable:
+    """Collects scans into voxels: a hash table that grows, and never loses anything."""
+
+    def __init__(
+        self,
+        voxel_size_m: float,
+        label_set: LabelSet,
+        probability_floor: float = 0.05,
+        answers: NDArray[np.float64] | None = None,
+        abstain: bool = False,
+    ) -> None:
+        """`probability_floor`: no class gets less than this from one look, in whole percent (real_data: 0.05).
+
+        `answers` (c + 1, c) nat, where a network was calibrated: what its answer says of the true class; every look is
+        then half that and half the network's probabilities. `abstain`: a pixel where `other` wins says nothing.
+        """
+        if not voxel_size_m > 0:
+            raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
+        self.voxel_size_m, self.label_set = voxel_size_m, label_set
+        self._floor_percent = round(100 * probability_floor)
+        self._words = VoxelMap.words(label_set)
+        self._columns = tuple(range(len(label_set.names)))
+        self._count = 0
+        self._rows = _empty_table(SMALLEST_TABLE, self._words)
+        share = 1.0 if answers is None else 1.0 - ANSWER_SHARE
+        self._log_table = log_table(len(label_set.names), self._floor_percent, share)
+        self._log_percent = self._log_table[100 * np.arange(256)]
+        self._answers, self._abstain = answer_table(answers, len(label_set.names)), abstain
+
+    def _grow(self) -> None:
+        size = len(self._rows)
+        larger = _empty_table(2 * size if size < LARGE_TABLE else (size + size // 12) // 2 * 2, self._words)
+        kernels.rehash(self._rows, larger)
+        self._rows = larger
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(
+        self,
+        keys: NDArray[np.int64],
+        pixels: NDArray[np.int32] | None = None,
+        classes: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Add the points of one scan: their voxel keys (n,) and, where a camera saw them, what it saw.
+
+        `pixels` (n,) is the row of `classes` that each point saw, -1 for none; `classes` (p, c + 1) are uint8
+        probabilities, `other` last. Raises DataError when a voxel's evidence would overflow.
+        """
+        if pixels is None or classes is None:
+            pixels = np.full(len(keys), -1, np.int32)
+            classes = np.zeros((0, len(self._columns) + 1), np.uint8)
+        looks = np.empty((len(classes), len(self._columns)), np.int32)
+        kernels.log_likelihoods(
+            classes, self._log_table, self._log_percent, self._floor_percent, self._answers, self._abstain,
+            self._columns, looks,
+        )  # fmt: skip
+        done = 0
+        while done < len(keys):
+            self._count, done = kernels.fuse(
+                self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
+                keys, pixels, looks, self._columns,
+            )  # fmt: skip
+            if done < 0:
+                place = unpack(keys[[-1 - done]])[0]
+                raise DataError(
+                    f"voxel {place.tolist()} was seen so often that its evidence overflows; does the vehicle stand"
+                    " there for hours?"
+                )
+            if done < len(keys):
+                self._grow()
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the table takes."""
+        return self._rows.nbytes
+
+    def to_map(self) -> VoxelMap:
+        """Everything collected so far, sorted by key."""
+        return VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
+
+
+def _empty_table(size: int, words: int) -> NDArray[np.int64]:
+    """Zeros that begin at a cache line, so that no row of 32 bytes lies across two."""
+    line = 8  # words of 8 bytes
+    memory = np.zeros(size * words + line, np.int64)
+    start = -(memory.ctypes.data // 8) % line
+    return memory[start : start + size * words].reshape(size, words)
+
+
+def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:
+    """Voxel key of every point (n, 3) m; raises DataError for a point that is NaN or beyond +-2^20 voxels."""
+    keys = np.empty(len(p_map), np.int64)
+    kernels.pack_keys(p_map, voxel_size_m, keys)
+    if not keys.all():
+        bad = int(np.flatnonzero(keys == 0)[0])
+        raise DataError(
+            f"point {bad} of {len(p_map)} at {p_map[bad].tolist()} m is not inside the map, which reaches"
+            f" {AXIS_OFFSET * voxel_size_m / 1000:.0f} km from its origin; check the poses"
+        )
+    return keys
+
+
+def unpack(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Integer voxel coordinates (v, 3) of packed keys."""
+    axes = (keys >> (2 * AXIS_BITS), keys >> AXIS_BITS, keys)
+    return np.stack([(axis & AXIS_MASK) - AXIS_OFFSET for axis in axes], axis=-1).astype(np.int32)
+
+
+def pack(indices: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Packed keys of integer voxel coordinates (v, 3); they sort like (x, y, z)."""
+    x, y, z = (np.asarray(indices, np.int64) + AXIS_OFFSET).T
+    return np.asarray((x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z)
+
+
+@cache
+def log_table(number_of_classes: int, floor_percent: int, share: float = 1.0) -> NDArray[np.int32]:
+    """round(1024 share ln i) for every integer that a floored, normalised uint8 probability can meet; read-only."""
+    largest = number_of_classes * max(100 * 255, floor_percent * 255 * number_of_classes)
+    numbers = np.arange(largest + 1, dtype=np.float64)
+    numbers[0] = 1.0
+    table = np.asarray(np.rint(share * UNITS_PER_NAT * np.log(numbers)), np.int32)
+    table.flags.writeable = False
+    return table
+
+
+def answer_table(answers: NDArray[np.float64] | None, number_of_classes: int) -> NDArray[np.int32]:
+    """The calibrated half of a look in 2^-10 nat, (c + 1, c); no rows where nothing was calibrated."""
+    if answers is None:
+        return np.empty((0, number_of_classes), np.int32)
+    return np.asarray(np.rint(ANSWER_SHARE * UNITS_PER_NAT * answers), np.int32)
+
+
+def entropy_of(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Entropy (v,) nat of class distributions (v, c): 0 where one class is certain, ln c where nothing is known."""
+    return np.asarray(-(probabilities * np.log(np.maximum(probabilities, 1e-30))).sum(axis=1), np.float32)
+
+
+def softmax(log_scores: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Probabilities from log scores, row by row."""
+    shifted = np.exp(log_scores - log_scores.max(axis=1, keepdims=True))
+    return np.asarray(shifted / shifted.sum(axis=1, keepdims=True), np.float32)

@@ -1,0 +1,329 @@
+"""One drive in three formats: every reader gives the same points at the same places, and pairs nothing by position."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import street
+from street import Street
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import detect_format, open_drive
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans.deskew import points_in_map
+from gnss_sem_map.sensor_log import SensorLog
+
+
+@pytest.fixture
+def copy(small_drive: Street, tmp_path: Path) -> Path:
+    """A copy of the KITTI raw drive that a test may damage."""
+    shutil.copytree(small_drive.drive.parent, tmp_path / "2011_09_26")
+    return tmp_path / "2011_09_26" / small_drive.drive.name
+
+
+def true_trajectory(log: SensorLog, driven: Street) -> Trajectory:
+    """The exact motion in the log's own time."""
+    shift = (log.epoch_ns - int(street.EPOCH.astype(np.int64))) * 1e-9
+    stamps = np.arange(driven.motion.start, driven.motion.end, 0.01)
+    return Trajectory(stamps - shift, driven.motion.poses(stamps), driven.motion.velocities(stamps))
+
+
+def test_a_raw_sweep_lands_on_the_street_when_every_point_moves_at_its_own_stamp(small_drive: Street) -> None:
+    log = open_drive(small_drive.drive)
+    trajectory = true_trajectory(log, small_drive)
+    assert detect_format(small_drive.drive) == "kitti-raw"
+    for scan in log.scans:
+        p_map = points_in_map(scan.read(), scan.stamp, trajectory, log.calibration.T_imu_lidar)
+        np.testing.assert_allclose(p_map, small_drive.p_map[scan.number], atol=2e-4)
+
+
+def test_a_table_log_gives_the_same_points(small_drive: Street, tmp_path: Path) -> None:
+    log = open_drive(street.write_table_log(tmp_path, small_drive))
+    trajectory = true_trajectory(log, small_drive)
+    for scan in log.scans:
+        p_map = points_in_map(scan.read(), scan.stamp, trajectory, log.calibration.T_imu_lidar)
+        np.testing.assert_allclose(p_map, small_drive.p_map[scan.number], atol=2e-4)
+    assert log.imu is not None
+    assert log.gnss is not None
+    np.testing.assert_allclose(
+        log.gnss.positions - log.gnss.positions[0],
+        small_drive.motion.poses(log.gnss.stamps)[:, :3, 3]
+        - small_drive.motion.poses(log.gnss.stamps[:1])[:, :3, 3],
+        atol=1e-3,
+    )
+
+
+def test_an_odometry_sequence_gives_the_same_points_in_its_first_lidar_frame(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    log = open_drive(street.write_odometry(tmp_path, small_drive))
+    T_map_first = small_drive.motion.poses(np.array([street.SWEEP_S / 2]))[0] @ street.T_IMU_LIDAR
+    assert log.given is not None
+    for scan in log.scans:
+        points = scan.read()
+        assert points.stamps is None, "odometry scans are compensated: they must not be deskewed again"
+        p_first = points_in_map(points, scan.stamp, log.given, log.calibration.T_imu_lidar)
+        p_map = p_first @ T_map_first[:3, :3].T + T_map_first[:3, 3]
+        np.testing.assert_allclose(p_map, small_drive.p_map[scan.number], atol=5e-4)
+
+
+def test_calibration_is_the_drive_s(small_drive: Street) -> None:
+    calibration = open_drive(small_drive.drive).calibration
+    np.testing.assert_allclose(calibration.T_imu_lidar, street.T_IMU_LIDAR, atol=1e-8)
+    np.testing.assert_allclose(calibration.T_camera_lidar, street.T_CAMERA_LIDAR, atol=1e-8)
+    np.testing.assert_allclose(calibration.K, street.K, atol=1e-6)
+    assert calibration.image_size == (street.WIDTH, street.HEIGHT)
+    assert calibration.camera_time_offset_s == -0.0085
+
+
+def test_specific_force_and_angular_rate_come_from_the_body_columns(small_drive: Street) -> None:
+    log = open_drive(small_drive.drive)
+    stamps = np.arange(len(log.imu.stamps)) * street.SWEEP_S - 0.02
+    np.testing.assert_allclose(
+        log.imu.specific_force, small_drive.motion.specific_force(stamps, street.FRAME), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        log.imu.angular_rate, small_drive.motion.angular_rate(stamps, street.FRAME), atol=1e-9
+    )
+
+
+def test_the_reference_is_what_the_navigation_unit_says(small_drive: Street) -> None:
+    log = open_drive(small_drive.drive)
+    assert log.reference is not None
+    exact = small_drive.motion.poses(log.reference.stamps - 0.02)
+    np.testing.assert_allclose(log.reference.T_map_imu[:, :3, :3], exact[:, :3, :3], atol=1e-6)
+    moved = log.reference.positions - log.reference.positions[0]
+    np.testing.assert_allclose(moved, exact[:, :3, 3] - exact[0, :3, 3], atol=1e-3)
+
+
+def test_missing_files_shift_nothing(copy: Path, small_drive: Street) -> None:
+    for number in (0, 4, 5):
+        (copy / f"velodyne_points/data/{number:010d}.bin").unlink()
+    (copy / "image_02/data/0000000007.png").unlink()
+    log = open_drive(copy)
+    trajectory = true_trajectory(log, small_drive)
+    assert [scan.number for scan in log.scans] == [1, 2, 3, 6, 7, 8, 9, 10, 11]
+    for scan in log.scans:
+        p_map = points_in_map(scan.read(), scan.stamp, trajectory, log.calibration.T_imu_lidar)
+        np.testing.assert_allclose(p_map, small_drive.p_map[scan.number], atol=2e-4)
+        image = log.image_at(scan.stamp, 0.05)
+        assert (image.number if image else None) == (None if scan.number == 7 else scan.number)
+    reasons = [(skip.what, skip.where.split("frames ")[1], skip.reason) for skip in log.skips]
+    assert reasons == [
+        ("scan", "0 to 0", "1 files missing"),
+        ("scan", "4 to 5", "2 files missing"),
+        ("image", "7 to 7", "1 files missing"),
+    ]
+
+
+def test_blank_stamp_lines_skip_their_frames_only(copy: Path, small_drive: Street) -> None:
+    for name in ("", "_start", "_end"):
+        path = copy / f"velodyne_points/timestamps{name}.txt"
+        lines = path.read_text().splitlines()
+        lines[2] = ""
+        path.write_text("\n".join(lines) + "\n")
+    log = open_drive(copy)
+    assert [scan.number for scan in log.scans] == [n for n in range(12) if n != 2]
+    assert log.scans[2].stamp == pytest.approx(0.07 + 0.3, abs=1e-6)
+    assert any(skip.reason == "no stamp for this frame" for skip in log.skips)
+
+
+def test_oxts_rows_that_are_damaged_or_repeated_are_left_out_and_counted(copy: Path) -> None:
+    data = copy / "oxts/data"
+    (data / "0000000003.txt").write_text("1 2 3\n")
+    (data / "0000000005.txt").write_text(
+        (data / "0000000005.txt").read_text().replace("0.050000000000", "nan")
+    )
+    lines = (copy / "oxts/timestamps.txt").read_text().splitlines()
+    lines[8] = lines[7]
+    (copy / "oxts/timestamps.txt").write_text("\n".join(lines) + "\n")
+    log = open_drive(copy)
+    assert [skip.reason for skip in log.skips if skip.what == "oxts"] == [
+        "found 3 numbers, expected 30 finite ones",
+        "repeated stamp",
+    ]
+    assert len(log.imu.stamps) == 14 - 2
+    assert len(log.gnss.stamps) == 14 - 3, "a row without an accuracy is no fix, but its IMU counts"
+
+
+def left_out(log: SensorLog) -> list[tuple[str, int, str]]:
+    return [(skip.what, skip.frames, skip.reason) for skip in log.skips]
+
+
+def test_lost_rows_and_repeated_frame_numbers_are_listed(copy: Path) -> None:
+    for number in (3, 4, 9):
+        (copy / f"oxts/data/{number:010d}.txt").unlink()
+    scans = copy / "velodyne_points/data"
+    shutil.copyfile(scans / "0000000007.bin", scans / "7.bin")
+    log = open_drive(copy)
+    assert len(log.scans) == 12
+    assert left_out(log) == [
+        ("oxts", 2, "2 files missing"),
+        ("oxts", 1, "1 files missing"),
+        ("scan", 1, "frame 7 has another file, 0000000007.bin"),
+    ]
+    shutil.rmtree(scans)
+    assert ("scan", 12, "12 files missing") in left_out(open_drive(copy))
+
+
+def test_frames_of_a_sequence_without_a_file_are_listed(small_drive: Street, tmp_path: Path) -> None:
+    sequence = street.write_odometry(tmp_path, small_drive)
+    (sequence / "velodyne/000004.bin").unlink()
+    (sequence / "image_2/000000.png").unlink()
+    assert left_out(open_drive(sequence)) == [
+        ("scan", 1, "1 files missing"),
+        ("scan", 3, "3 files missing"),
+        ("image", 1, "1 files missing"),
+        ("image", 3, "3 files missing"),
+    ]
+
+
+def test_lines_of_a_stamp_table_that_are_left_out_are_listed(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    stamps = drive / "lidar/stamps.csv"
+    stamps.write_text(stamps.read_text() + "5,0.66\n6,\n40,4.05\n")
+    log = open_drive(drive)
+    assert len(log.scans) == 12
+    assert left_out(log) == [
+        ("scan", 1, "frame 5 has a stamp already"),
+        ("scan", 1, "no number, or no stamp"),
+        ("scan", 1, "1 files missing"),
+    ]
+    assert [scan.stamp for scan in log.scans if scan.number == 5] == [0.55]
+
+
+def test_the_100_hz_twin_is_used_for_the_imu_only(copy: Path) -> None:
+    twin = copy.with_name(copy.name.replace("_sync", "_extract"))
+    shutil.copytree(copy / "oxts", twin / "oxts")
+    lines = (twin / "oxts/timestamps.txt").read_text().splitlines()
+    (twin / "oxts/timestamps.txt").write_text("\n".join(lines[:10]) + "\n")
+    log = open_drive(copy)
+    assert len(log.imu.stamps) == 10
+    assert len(log.gnss.stamps) == 14
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda drive: (drive / name).resolve().unlink()
+
+
+def rewrite(name: str, old: str, new: str) -> Callable[[Path], None]:
+    def change(drive: Path) -> None:
+        path = (drive / name).resolve()
+        content = path.read_text()
+        assert old in content
+        path.write_text(content.replace(old, new, 1))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (remove("../calib_velo_to_cam.txt"), "calib_velo_to_cam.txt: missing calibration file"),
+        (remove("../calib_imu_to_velo.txt"), "calib_imu_to_velo.txt: missing calibration file"),
+        (rewrite("../calib_cam_to_cam.txt", "P_rect_02", "P_rect_07"), "row 'P_rect_02': found nothing"),
+        (rewrite("../calib_velo_to_cam.txt", "R: ", "R: 1 "), "row 'R': found 10 numbers, expected 9"),
+        (rewrite("../calib_imu_to_velo.txt", "R: 1.0", "R: 3.0"), "R: found a matrix of determinant 3"),
+        (remove("oxts/timestamps.txt"), "oxts/timestamps.txt: missing stamps"),
+        (remove("velodyne_points/timestamps_end.txt"), "timestamps_end.txt: missing stamps"),
+        (rewrite("oxts/timestamps.txt", "2011-09-26", "26.9.2011"), "line 1: found '26.9.2011"),
+    ],
+)
+def test_a_broken_drive_is_refused_with_the_file_and_what_was_expected(
+    copy: Path, damage: Callable[[Path], None], says: str
+) -> None:
+    damage(copy)
+    with pytest.raises(DataError, match=says):
+        open_drive(copy)
+
+
+def test_a_truncated_scan_is_named_when_it_is_read(copy: Path) -> None:
+    path = copy / "velodyne_points/data/0000000003.bin"
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(DataError, match=r"0000000003\.bin: truncated scan"):
+        next(scan for scan in open_drive(copy).scans if scan.number == 3).read()
+
+
+def test_a_damaged_image_and_one_of_another_size_are_named_when_read(copy: Path) -> None:
+    path = copy / "image_02/data/0000000002.png"
+    small = street.cv2.imread(str(path))[:40]
+    path.write_bytes(path.read_bytes()[:100])
+    log = open_drive(copy)
+    with pytest.raises(DataError, match="damaged image"):
+        log.images[2].read()
+    street.cv2.imwrite(str(path), small)
+    with pytest.raises(DataError, match="found 300 x 40 pixels, expected 300 x 96"):
+        log.images[2].read()
+
+
+def test_a_folder_that_is_no_drive_says_what_a_drive_looks_like(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_text("")
+    with pytest.raises(DataError, match=r"found \['holiday.jpg'\], expected oxts/"):
+        open_drive(tmp_path)
+    with pytest.raises(DataError, match="no such folder"):
+        open_drive(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "says"),
+    [
+        ("poses.txt", "e+00", "x+00", "poses.txt: line 1"),
+        ("times.txt", "5.000000000e-02\n", "", "poses and 14 times|15 poses and"),
+        ("calib.txt", "Tr:", "Tx:", "row 'Tr': found nothing"),
+    ],
+)
+def test_a_broken_sequence_is_refused(
+    small_drive: Street, tmp_path: Path, name: str, old: str, new: str, says: str
+) -> None:
+    sequence = street.write_odometry(tmp_path, small_drive)
+    rewrite(name, old, new)(sequence)
+    with pytest.raises(DataError, match=says):
+        open_drive(sequence)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "says"),
+    [
+        ("imu.csv", "stamp_s,ax", "time,ax", "imu.csv:.*expected numbers in columns stamp_s,ax"),
+        ("gnss.csv", "0.05000000000\n", "good\n", "gnss.csv:.*expected numbers"),
+        ("log.yaml", '"K"', '"k"', "log.yaml: k: .*known keys are"),
+        ("log.yaml", '"image_size": [300, 96], ', "", "a camera needs all of"),
+    ],
+)
+def test_a_broken_table_log_is_refused(
+    small_drive: Street, tmp_path: Path, name: str, old: str, new: str, says: str
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    content = (drive / name).read_text()
+    if old not in content:
+        pytest.fail(f"{old!r} is not in {name}: {content[:200]}")
+    (drive / name).write_text(content.replace(old, new, 1))
+    with pytest.raises(DataError, match=says):
+        open_drive(drive)
+
+
+def test_the_real_excerpt_keeps_its_frame_numbers(real_data: Path) -> None:
+    log = open_drive(real_data / "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync")
+    assert [scan.number for scan in log.scans] == list(range(114, 154))
+    assert len(log.gnss.stamps) == 154
+    for scan in log.scans[::13]:
+        image = log.image_at(scan.stamp, 0.05)
+        assert image is not None
+        assert image.number == scan.number
+        assert image.stamp - scan.stamp == pytest.approx(0.0105, abs=5e-4)
+        points = scan.read()
+        assert points.stamps is not None
+        assert abs(points.stamps.mean() - scan.stamp) < 0.02
+        assert 0.09 < np.ptp(points.stamps) < 0.11
+
+
+def test_the_real_sequence_has_more_poses_than_scans(real_data: Path) -> None:
+    log = open_drive(real_data / "semantic_kitti/sequences/08")
+    assert [scan.name for scan in log.scans] == [f"{n:06d}" for n in range(10)]
+    assert log.given is not None
+    assert len(log.given) == 4071
+    assert log.calibration.image_size == (1226, 370)

@@ -1,0 +1,252 @@
+"""Moving objects in streets of boxes, ray-cast exactly: every case has one right answer."""
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.dynamics.motion_state import MotionSettings
+from gnss_sem_map.dynamics.moving_objects import MovingObjectDetector, observe
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.refinement.vehicles import Motion
+
+LIDAR_HEIGHT_M, SCAN_S = 1.7, 0.1
+CAR = (4.2, 1.8, 1.5)
+AZIMUTHS, ELEVATIONS = np.radians(np.arange(-180, 180, 0.4)), np.radians(np.arange(-24.8, 2.0, 0.42))
+RAYS = np.stack(
+    [
+        np.outer(np.cos(ELEVATIONS), np.cos(AZIMUTHS)).ravel(),
+        np.outer(np.cos(ELEVATIONS), np.sin(AZIMUTHS)).ravel(),
+        np.outer(np.sin(ELEVATIONS), np.ones_like(AZIMUTHS)).ravel(),
+    ],
+    axis=1,
+)
+
+
+def cast(origin, boxes):
+    """Points (n, 3) where the rays first meet flat ground or a box (low, high), and which: 0 ground, 1 the first."""
+    with np.errstate(divide="ignore"):
+        inverse = 1 / np.where(RAYS == 0, 1e-12, RAYS)
+    best = np.where(RAYS[:, 2] < 0, -origin[2] * inverse[:, 2], np.inf)
+    what = np.zeros(len(RAYS), int)
+    for number, (low, high) in enumerate(boxes, start=1):
+        a, b = (low - origin) * inverse, (high - origin) * inverse
+        near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
+        hit = (near < far) & (near > 0) & (near < best)
+        best[hit], what[hit] = near[hit], number
+    seen = best < 80
+    return origin + RAYS[seen] * best[seen, None], what[seen]
+
+
+def car_at(x, y):
+    return np.array([x - CAR[0] / 2, y - CAR[1] / 2, 0.2]), np.array([x + CAR[0] / 2, y + CAR[1] / 2, CAR[2]])
+
+
+def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=None, matched=False):
+    """Drive along x past facades and cars (functions of time -> x, y or None); the points of each car that went.
+
+    Returns, for each car, the share of its points in all scans that was removed, that share of everything else, and
+    the objects. A camera sees `view_deg` ahead and calls exactly the cars vehicles.
+    """
+    detector = MovingObjectDetector(settings, matched)
+    facades = [(np.array([-40.0, y - 0.2, 0.0]), np.array([110.0, y + 0.2, 9.0])) for y in (-11.0, 12.0)]
+    kept = []
+    for scan in range(scans):
+        t = scan * SCAN_S
+        places = [car(t) for car in cars]
+        boxes = facades + [car_at(*place) if place else car_at(1e4, 0) for place in places]
+        origin = np.array([ego_speed * t, 0.0, LIDAR_HEIGHT_M])
+        p_map, what = cast(origin, boxes)
+        offset = p_map - origin
+        known = abs(np.degrees(np.arctan2(offset[:, 1], offset[:, 0]))) <= view_deg / 2
+        T_map_lidar = np.eye(4)
+        T_map_lidar[:3, 3] = origin + drift_m * np.array([np.sin(t), np.cos(1.7 * t), 0.3 * np.sin(2 * t)])
+        p_map = p_map + T_map_lidar[:3, 3] - origin
+        detector.add(
+            observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings or MotionSettings())
+        )
+        kept.append(what)
+    moving = detector.decide()
+    removed, total = np.zeros(len(cars) + 3), np.zeros(len(cars) + 3)
+    for scan, what in enumerate(kept):
+        total += np.bincount(what, minlength=len(total))
+        removed += np.bincount(what[moving.points[scan]], minlength=len(total))
+    share = removed / np.maximum(total, 1)
+    return share[3:], removed[:3].sum() / total[:3].sum(), moving.objects
+
+
+def parked(x, y):
+    return lambda t: (x, y)
+
+
+def going(x, y, speed, start=0.0, stop=np.inf):
+    return lambda t: (x + speed * (np.clip(t, start, stop) - start), y)
+
+
+ROW = [parked(x, 4.5) for x in (8, 13.5, 19, 24.5, 30)]
+
+
+def test_a_row_of_parked_cars_stays_to_the_last_point():
+    share, others, objects = drive(ROW)
+    np.testing.assert_array_equal(share, 0)
+    assert others == 0
+    assert {o.motion for o in objects} <= {Motion.PARKED, Motion.UNKNOWN}
+    assert sum(o.motion == Motion.PARKED for o in objects) >= len(ROW)
+
+
+@pytest.mark.parametrize(
+    ("name", "mover"),
+    [
+        ("ahead, as fast as the ego vehicle", going(15, 0, 6.0)),
+        pytest.param("ahead, slow", going(18, -3.0, 1.5), marks=pytest.mark.slow),
+        pytest.param("oncoming", going(60, -3.5, -9.0), marks=pytest.mark.slow),
+        ("waits, then leaves", going(14, -3.5, 5.0, start=2.0)),
+        pytest.param("comes, then waits", going(40, -3.5, -6.0, stop=2.0), marks=pytest.mark.slow),
+    ],
+)
+def test_whatever_moves_between_parked_cars_goes_and_they_stay(name, mover):
+    share, others, objects = drive([*ROW, mover])
+    assert share[-1] > 0.98, name
+    np.testing.assert_array_equal(share[:-1], 0, err_msg=name)
+    assert others < 2e-4, name
+    mover_seen = max(objects, key=lambda o: o.probability)
+    assert mover_seen.motion in (Motion.MOVING, Motion.STOPPED_AND_LEFT)
+    assert mover_seen.reason
+
+
+@pytest.mark.slow
+def test_an_overtaken_car_is_followed_around_after_the_camera_lost_it():
+    share, others, _ = drive([*ROW, going(10, -3.5, 2.0)], view_deg=80.0)
+    assert share[-1] > 0.95
+    np.testing.assert_array_equal(share[:-1], 0)
+    assert others < 2e-4
+
+
+def test_a_car_that_no_camera_ever_shows_goes_when_it_moves_and_stays_when_it_is_parked():
+    share, others, _ = drive([going(-12, -3.5, 5.0), parked(-8, 4.5)], view_deg=60.0)
+    assert share[0] > 0.95
+    assert share[1] == 0
+    assert others < 2e-4
+
+
+@pytest.mark.slow
+def test_an_overtaking_car_is_followed_back_to_where_the_camera_had_not_seen_it():
+    share, others, _ = drive([*ROW, going(-20, -3.5, 14.0)], view_deg=80.0)
+    assert share[-1] > 0.95
+    np.testing.assert_array_equal(share[:-1], 0)
+    assert others < 2e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lengths", "goes"), [(0.3, False), pytest.param(0.6, True, marks=pytest.mark.slow)])
+def test_a_car_that_creeps_half_its_length_goes_where_poses_can_be_trusted_alone(lengths, goes):
+    scans = 60
+    creeping = going(14, -3.5, lengths * CAR[0] / (scans * SCAN_S))  # too slow to be seen to go elsewhere
+    for matched in (True, False):
+        share, _, _ = drive([*ROW, creeping], scans=scans, ego_speed=0.0, matched=matched)
+        assert share[-1] > 0.9 if goes and matched else share[-1] < 0.01
+        np.testing.assert_array_equal(share[:-1], 0)
+
+
+@pytest.mark.slow
+def test_poses_that_drift_by_decimetres_remove_no_parked_car():
+    share, _, _ = drive([*ROW, going(60, -3.5, -9.0)], drift_m=0.15)
+    assert share[:-1].max() < 0.02
+    assert share[-1] > 0.95
+
+
+@pytest.mark.slow
+def test_a_car_that_stood_and_was_gone_when_seen_again_has_left():
+    def gone(t):
+        return (25, -3.5) if t < 1.0 else None
+
+    share, _, objects = drive([*ROW, gone], scans=50)
+    assert share[-1] > 0.98
+    assert Motion.STOPPED_AND_LEFT in {o.motion for o in objects}
+    np.testing.assert_array_equal(share[:-1], 0)
+
+
+@pytest.mark.slow
+def test_a_drive_that_stands_still_tells_movers_from_parked_cars():
+    share, others, _ = drive([*ROW, going(-30, -3.5, 8.0)], ego_speed=0.0)
+    assert share[-1] > 0.98
+    np.testing.assert_array_equal(share[:-1], 0)
+    assert others < 2e-4
+
+
+def test_one_scan_alone_removes_nothing():
+    share, others, objects = drive([*ROW, going(60, -3.5, -9.0)], scans=1)
+    assert not share.any()
+    assert others == 0
+    assert {o.motion for o in objects} == {Motion.UNKNOWN}
+
+
+def test_without_vehicles_nothing_is_removed():
+    share, others, objects = drive([])
+    assert len(share) == 0
+    assert others == 0
+    assert objects == ()
+
+
+def test_only_points_of_the_mover_are_removed_and_no_scans_are_no_error():
+    detector = MovingObjectDetector(MotionSettings())
+    assert detector.decide().points == {}
+    mover = {}
+    for scan in range(20):
+        p_map, what = cast(np.array([0.0, 0.0, LIDAR_HEIGHT_M]), [car_at(30 - scan, 3.0)])
+        detector.add(seen(scan, p_map, pose(0.0), what == 1))
+        mover[scan] = what == 1
+    moving = detector.decide()
+    for scan, points in moving.points.items():
+        assert mover[scan][points].all()
+    assert sum(map(len, moving.points.values())) > 0
+
+
+def seen(scan, p_map, T_map_lidar, is_object):
+    """A scan of a camera that looks all around."""
+    known = np.ones(len(p_map), bool)
+    return observe(scan, scan * SCAN_S, p_map, T_map_lidar, is_object, known, MotionSettings())
+
+
+def pose(x):
+    T = np.eye(4)
+    T[:3, 3] = x, 0, LIDAR_HEIGHT_M
+    return T
+
+
+def test_every_point_called_vehicle_is_no_error():
+    detector = MovingObjectDetector()
+    for scan in range(5):
+        p_map, what = cast(np.array([scan, 0.0, LIDAR_HEIGHT_M]), [car_at(12, 3.0)])
+        detector.add(seen(scan, p_map, pose(scan), np.ones(len(what), bool)))
+    removed = sum(map(len, detector.decide().points.values()))
+    assert removed == 0
+
+
+@pytest.mark.slow
+def test_settling_in_windows_says_what_deciding_at_the_end_says_and_forgets_the_points():
+    whole, windows = {}, {}
+    for found, window in ((whole, 1000), (windows, 10)):
+        detector = MovingObjectDetector(MotionSettings(window_scans=window))
+        for scan in range(50):
+            t = scan * SCAN_S
+            cars = [car_at(12, 4.5), car_at(20, 4.5), car_at(60 - 12 * t, -3.5)]
+            p_map, what = cast(np.array([6 * t, 0.0, LIDAR_HEIGHT_M]), cars)
+            detector.add(seen(scan, p_map, pose(6 * t), what > 0))
+            found.update(detector.settle().points)
+        assert (len(found) > 0) == (window == 10)
+        found.update(detector.decide().points)
+        assert list(found) == list(range(50))
+        assert detector.decide().points == {}
+    count = sum(map(len, whole.values()))
+    differ = sum(len(np.setxor1d(whole[scan], windows[scan])) for scan in whole)
+    assert count > 1000
+    assert differ < 0.02 * count
+
+
+def test_empty_scans_and_scans_out_of_order():
+    detector = MovingObjectDetector()
+    nothing = np.empty((0, 3))
+    empty = seen(7, nothing, np.eye(4), np.zeros(0, bool))
+    detector.add(empty)
+    with pytest.raises(DataError, match="time order"):
+        detector.add(empty)
+    assert detector.decide().points[7].shape == (0,)

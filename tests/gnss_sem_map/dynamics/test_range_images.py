@@ -1,0 +1,95 @@
+"""Range images: what a scan says of a place that it hit, looked through, or could not see."""
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.dynamics import range_images
+
+WALL_M = 20.0
+
+
+def wall_image(hole=None):
+    """A wall around the LiDAR, 20 m away, densely sampled; without a `hole` in azimuth, degrees."""
+    azimuths, elevations = np.meshgrid(
+        np.radians(np.arange(-180, 180, 0.2)), np.radians(np.arange(-20, 3, 0.2))
+    )
+    if hole is not None:
+        outside = abs(np.degrees(azimuths) - hole) > 10
+        azimuths, elevations = azimuths[outside], elevations[outside]
+    a, e = azimuths.ravel(), elevations.ravel()
+    points = WALL_M * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+    image = range_images.empty_image()
+    range_images.draw(points, np.eye(4), image)
+    return image
+
+
+def seen_at(image, places, T_lidar_map=None):
+    places = np.asarray(places, float).reshape(-1, 3)
+    hits, throughs = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
+    poses = np.eye(4)[None] if T_lidar_map is None else T_lidar_map[None]
+    range_images.look_at(places, image[None], poses, 3.0, 40.0, 0.3, 0.01, hits, throughs)
+    return hits - throughs
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 179.9, -180.0, -35.0])
+def test_before_the_wall_is_empty_in_the_wall_is_hit_and_behind_it_nothing_is_known(azimuth_deg):
+    a = np.radians(azimuth_deg)
+    direction = np.array([np.cos(a), np.sin(a), -0.05])
+    places = np.outer([10.0, 20.0, 30.0, 2.0], direction / np.linalg.norm(direction))
+    np.testing.assert_array_equal(seen_at(wall_image(), places), [-1, 1, 0, 0])
+
+
+def test_where_nothing_came_back_nothing_is_known():
+    assert seen_at(wall_image(hole=0.0), [(10.0, 0.0, 0.0)]) == 0
+
+
+def test_beams_that_pass_only_above_a_place_have_not_looked_through_it():
+    image = wall_image()
+    row = int((np.degrees(np.arctan2(-1.0, 10.0)) - range_images.LOWEST_DEG) / range_images.ROW_DEG)
+    image[: row + 2] = range_images.EMPTY  # the first is the frame
+    assert seen_at(image, [(10.0, 0.0, -1.0)]) == 0
+    assert seen_at(wall_image(), [(10.0, 0.0, -1.0)]) == -1
+
+
+def test_the_pose_of_the_scan_is_taken_into_account():
+    T_lidar_map = np.eye(4)
+    T_lidar_map[0, 3] = -5.0  # the LiDAR stood at x = 5 m
+    assert seen_at(wall_image(), [(25.0, 0.0, 0.0)], T_lidar_map) == 1
+    assert seen_at(wall_image(), [(20.0, 0.0, 0.0)], T_lidar_map) == -1
+
+
+def test_the_nearest_return_of_a_pixel_counts():
+    image = range_images.empty_image()
+    range_images.draw(np.array([[20.0, 0, 0], [10.0, 0, 0], [15.0, 0, 0], [1.0, 0, 0]]), np.eye(4), image)
+    assert image[image != range_images.EMPTY].tolist() == [1000]
+
+
+def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
+    image = wall_image()
+    middle = 1 + range_images.COLUMNS // 2
+    for columns, expected in ((slice(0, 0), False), (slice(middle + 12, middle + 30), True)):
+        nearer = image.copy()
+        nearer[:, columns] = 800
+        azimuths = np.radians(np.arange(-4, 4.5, 0.4))
+        points = WALL_M * np.stack([np.cos(azimuths), np.sin(azimuths), -0.02 + 0 * azimuths], axis=1)
+        segments = np.zeros(len(points), np.int32)
+        assert range_images.hidden_sides(points, segments, np.eye(4), nearer, 1, 0.5).tolist() == [expected]
+
+
+def test_pixels_are_where_the_angles_say():
+    """The polynomial of the arc tangent against numpy's."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(2000, 3)) * [20, 20, 3]
+    azimuths = np.degrees(np.arctan2(points[:, 1], points[:, 0])) + 180
+    elevations = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+    rows = np.floor((elevations - range_images.LOWEST_DEG) / range_images.ROW_DEG).astype(int)
+    columns = np.floor(azimuths / range_images.COLUMN_DEG).astype(int) % range_images.COLUMNS
+    ranges = np.linalg.norm(points, axis=1)
+    expected = range_images.empty_image()
+    seen = (ranges >= range_images.NEAREST_M) & (rows >= 0) & (rows < range_images.ROWS)
+    centimetres = (ranges[seen] * range_images.UNITS_PER_M).astype(np.uint16)
+    np.minimum.at(expected, (rows[seen] + 1, columns[seen] + 1), centimetres)
+    drawn = range_images.empty_image()
+    range_images.draw(points, np.eye(4), drawn)
+    np.testing.assert_array_equal(drawn[:, 1:-1], expected[:, 1:-1])
+    np.testing.assert_array_equal(drawn[:, [0, -1]], expected[:, [-2, 1]])

@@ -1,0 +1,114 @@
+"""Tracks and their displacement, and the verdicts that follow from evidence."""
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.dynamics.motion_state import MotionSettings, judge
+from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
+from gnss_sem_map.refinement.vehicles import Motion
+
+
+def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False):
+    centre, half = np.array([x, y]), np.array([length / 2, 0.9])
+    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut)
+
+
+def test_two_cars_that_pass_each_other_keep_their_tracks():
+    segments = [
+        s for scan in range(30) for s in (segment(scan, scan * 0.8), segment(scan, 24 - scan * 0.8, 2.5))
+    ]
+    tracks = track(segments, 1.5, np.zeros(60, bool))
+    assert [t.segments for t in tracks] == [list(range(0, 60, 2)), list(range(1, 60, 2))]
+    np.testing.assert_allclose(tracks[0].velocity, [8.0, 0.0], atol=0.1)
+
+
+def test_a_track_survives_five_scans_out_of_sight_and_not_six():
+    for gap, count in ((5, 1), (6, 2)):
+        scans = [*range(10), *range(10 + gap, 20 + gap)]
+        segments = [segment(scan, scan * 0.5) for scan in scans]
+        assert len(track(segments, 1.5, np.zeros(len(segments), bool))) == count
+
+
+def test_on_a_highway_a_fleeting_segment_is_followed_as_far_as_it_drives_and_a_standing_one_is_not():
+    for speed, fleeting, count in ((33.0, True, 1), (33.0, False, 8), (60.0, True, 8)):
+        segments = [segment(scan, scan * 0.1 * speed) for scan in range(8)]
+        assert len(track(segments, 1.5, np.full(8, fleeting))) == count
+
+
+def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
+    segments = [
+        s
+        for scan in range(10)
+        for s in (
+            segment(scan, scan * 2.5),
+            segment(scan, 20 + scan * 2.5),
+            segment(scan, 40 - scan * 3.3, 4.0),
+        )
+    ]
+    tracks = track(segments, 1.5, np.ones(30, bool))
+    assert [t.segments for t in tracks] == [list(range(k, 30, 3)) for k in range(3)]
+    np.testing.assert_allclose(tracks[2].velocity, [-33.0, 0.0], atol=0.5)
+
+
+def test_a_mover_is_displaced_by_the_way_of_both_its_ends():
+    moved = displacement_of([segment(scan, scan * 0.5) for scan in range(20)])
+    assert moved.shift_m == pytest.approx(9.5, abs=1.1)
+    assert moved.speed_m_s == pytest.approx(5.0, rel=0.05)
+
+
+def test_a_parked_car_that_comes_into_view_from_one_end_is_not_displaced():
+    growing = [segment(scan, 2.0 - n / 2, length=n) for scan, n in enumerate(np.linspace(0.5, 4.0, 20))]
+    assert displacement_of(growing).shift_m < 0.1
+
+
+def test_a_car_that_goes_and_then_waits_for_long_is_displaced_all_the_same():
+    places = [*np.linspace(0, 6, 12), *[6.0] * 60]
+    moved = displacement_of([segment(scan, x) for scan, x in enumerate(places)])
+    assert moved.shift_m == pytest.approx(6.0, abs=0.6)
+    assert moved.speed_m_s > 4
+
+
+def test_what_the_edge_of_the_view_cuts_says_nothing_of_motion():
+    assert displacement_of([segment(scan, scan, cut=True) for scan in range(20)]) is None
+    assert displacement_of([segment(scan, scan) for scan in range(3)]) is None
+
+
+def verdict(segments, hits, throughs):
+    objects = judge(segments, np.asarray(hits, float), np.asarray(throughs, float), MotionSettings())
+    return [(o.motion, len(o.segments)) for o in objects]
+
+
+def test_verdicts_follow_the_evidence():
+    parked = [segment(scan, 0.0) for scan in range(10)]
+    going = [segment(scan, scan * 0.8) for scan in range(10)]
+    many, none = np.full(10, 500.0), np.zeros(10)
+    assert verdict(parked, many, none) == [(Motion.PARKED, 10)]
+    assert verdict(parked, none, none) == [(Motion.UNKNOWN, 10)]
+    assert verdict(parked, many / 10, many) == [(Motion.STOPPED_AND_LEFT, 10)]
+    assert verdict(going, many, many / 2) == [(Motion.MOVING, 10)]
+    assert verdict(going, many, none) == [(Motion.PARKED, 10)], "a window between others, never seen through"
+
+
+def test_what_no_image_shows_needs_both_motion_and_free_space():
+    going = [segment(scan, scan * 0.8, shown=False) for scan in range(10)]
+    parked = [segment(scan, 0.0, shown=False) for scan in range(10)]
+    many, few = np.full(10, 500.0), np.full(10, 50.0)
+    assert verdict(going, few, many) == [(Motion.MOVING, 10)]
+    assert verdict(going, many, few) == []
+    assert verdict(parked, few, many) == []
+
+
+def test_the_last_scan_of_a_fast_car_goes_with_it_though_nobody_saw_its_place_empty():
+    going = [segment(scan, scan * 2.8) for scan in range(10)]
+    throughs = np.full(10, 50.0)
+    throughs[-1] = 0.0
+    assert verdict(going, np.full(10, 5.0), throughs) == [(Motion.MOVING, 10)]
+
+
+def test_probability_grows_with_the_evidence():
+    parked = [segment(scan, 0.0) for scan in range(10)]
+    probabilities = [
+        judge(parked, np.full(10, 2.0 * n), np.full(10, 6.0 * n), MotionSettings())[0].probability
+        for n in (0.1, 1, 10)
+    ]
+    assert 0.5 < probabilities[0] < probabilities[1] < probabilities[2] < 1

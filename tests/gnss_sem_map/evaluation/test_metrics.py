@@ -1,0 +1,152 @@
+"""Every figure agrees with scikit-learn, with the independent scorer, and with cases counted by hand."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.metrics import jaccard_score, precision_score
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation import metrics
+from gnss_sem_map.evaluation.metrics import Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.labels.label_set import open_label_set
+
+URBAN = open_label_set()
+TABLES = Tables.of(URBAN)
+PREDICTED = np.array([0, 40, 48, 10, 50, 70], np.uint32)
+TRUE = np.array([0, 1, 10, 11, 13, 15, 16, 18, 20, 30, 40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99,
+                 252, 253, 254, 255, 256, 257, 258, 259], np.uint32)  # fmt: skip
+IDS = {40: [40, 60], 48: [48], 10: [10, 13, 15, 18, 20, 252, 256, 257, 258, 259], 50: [50], 70: [70, 71]}
+
+
+def random_labels(seed: int, n: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    instances = rng.integers(0, 1 << 16, (2, n)).astype(np.uint32) << 16
+    return rng.choice(PREDICTED, n) | instances[0], rng.choice(TRUE, n) | instances[1]
+
+
+def ids(*values: int) -> np.ndarray:
+    return np.array(values, np.uint32)
+
+
+def test_accuracy_and_iou_are_scikit_learn_s_precision_and_jaccard() -> None:
+    prediction, truth = random_labels(0)
+    of_class = {raw: i for i, group in enumerate(IDS.values()) for raw in group}
+    true = np.array([of_class.get(int(t) & 0xFFFF, -1) for t in truth])
+    guess = np.array([of_class.get(int(p) & 0xFFFF, 5) for p in prediction])
+    counted = (true >= 0) & (guess < 5)
+    found = semantics(confusion(prediction, truth, TABLES, "here"), URBAN)
+    labels = list(range(5))
+    accuracy = precision_score(true[counted], guess[counted], labels=labels, average=None)
+    iou = jaccard_score(true[counted], guess[counted], labels=labels, average=None)
+    for i, name in enumerate(URBAN.names):
+        assert found["classes"][name] == {
+            "accuracy": pytest.approx(accuracy[i]),
+            "iou": pytest.approx(iou[i]),
+        }
+    assert found["mean_iou"] == pytest.approx(iou.mean())
+    assert found["coverage"] == pytest.approx((guess[true >= 0] < 5).mean())
+
+
+def test_a_class_that_no_point_is_labelled_of_is_left_out_of_the_mean_and_a_miss_of_the_strict_one() -> None:
+    prediction, truth = ids(40, 40, 10, 0, 0), ids(40, 40, 10, 48, 48)  # all of the sidewalk is unlabelled
+    found = semantics(confusion(prediction, truth, TABLES, "here"), URBAN)
+    assert (found["mean_accuracy"], found["mean_iou"]) == (1.0, 1.0)
+    assert found["strict"] == {"mean_accuracy": pytest.approx(2 / 3), "mean_iou": pytest.approx(2 / 3)}
+    half = semantics(confusion(ids(40, 40, 10, 48, 0), truth, TABLES, "here"), URBAN)
+    assert half["strict"] == {"mean_accuracy": half["mean_accuracy"], "mean_iou": pytest.approx(2.5 / 3)}
+
+
+def test_figures_agree_with_the_independent_scorer_to_the_last_digit(real_data: Path) -> None:
+    spec = importlib.util.spec_from_file_location("score", real_data.parent / "score.py")
+    assert spec is not None
+    assert spec.loader is not None
+    score = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(score)
+    folder = real_data / "semantic_kitti/sequences/08/labels"
+    counts = np.zeros((5, 6), np.int64)
+    for path in sorted(folder.glob("*.label")):
+        prediction = np.fromfile(real_data / "single_frame/08" / path.name, "<u4")
+        counts += confusion(prediction, np.fromfile(path, "<u4"), TABLES, path.name)
+    theirs = score.figures(score.score_pair(real_data / "single_frame/08", folder))
+    ours = semantics(counts, URBAN)
+    assert counts.tolist() == theirs["counts"]
+    assert ours["mean_iou"] == theirs["observed"]["mean_iou"]
+    assert ours["mean_accuracy"] == theirs["observed"]["mean_accuracy"]
+    assert ours["strict"] == {key: theirs["strict"][key] for key in ("mean_accuracy", "mean_iou")}
+    assert ours["coverage"] == theirs["coverage"]
+    for name in URBAN.names:
+        assert ours["classes"][name] == {
+            "accuracy": theirs["observed"]["accuracy"][name], "iou": theirs["observed"]["iou"][name]
+        }  # fmt: skip
+
+
+def test_a_case_counted_by_hand() -> None:
+    """Road 3 right, 1 called sidewalk, 1 unlabelled; sidewalk 1 right; a parking point is not counted."""
+    counts = confusion(ids(40, 40, 40, 48, 0, 48, 40), ids(40, 60, 40, 40, 40, 48, 44), TABLES, "here")
+    found = semantics(counts, URBAN)
+    assert found["classes"]["road"] == {"accuracy": 1.0, "iou": 3 / 4}
+    assert found["classes"]["sidewalk"] == {"accuracy": 1 / 2, "iou": 1 / 2}
+    assert found["classes"]["vehicle"] is None
+    assert found["mean_iou"] == (3 / 4 + 1 / 2) / 2
+    assert found["strict"]["mean_iou"] == (3 / 5 + 1 / 2) / 2
+    assert (found["coverage"], found["points"]) == (5 / 6, 6)
+
+
+def test_a_class_that_is_never_predicted_counts_as_zero() -> None:
+    found = semantics(confusion(ids(40, 40), ids(40, 48), TABLES, "here"), URBAN)
+    assert found["classes"]["sidewalk"] == {"accuracy": 0.0, "iou": 0.0}
+    assert found["mean_iou"] == 1 / 4
+
+
+def test_nothing_predicted_and_nothing_true_are_no_division_by_zero() -> None:
+    nothing = semantics(confusion(ids(0, 0), ids(40, 48), TABLES, "here"), URBAN)
+    assert (nothing["mean_iou"], nothing["strict"]["mean_iou"], nothing["coverage"]) == (None, 0.0, 0.0)
+    empty = semantics(confusion(ids(), ids(), TABLES, "here"), URBAN)
+    assert (empty["mean_iou"], empty["coverage"]) == (None, None)
+    json.dumps([nothing, empty], allow_nan=False)
+
+
+def test_counts_add_over_scans() -> None:
+    a, b = random_labels(1), random_labels(2)
+    both = np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
+    np.testing.assert_array_equal(
+        confusion(*a, TABLES, "a") + confusion(*b, TABLES, "b"), confusion(*both, TABLES, "both")
+    )
+
+
+@pytest.mark.parametrize(
+    ("prediction", "truth", "says"),
+    [(ids(72), ids(40), r"found ids \[72\]"), (ids(40, 40), ids(40), "found 2 labels for 1 points")],
+)
+def test_labels_that_cannot_be_scored_are_refused(
+    prediction: np.ndarray, truth: np.ndarray, says: str
+) -> None:
+    with pytest.raises(DataError, match=says):
+        confusion(prediction, truth, TABLES, "here")
+
+
+def test_removal_is_scored_on_moving_vehicles_and_everything_static() -> None:
+    """Moving: 3 of 4 removed. Parked: 1 of 2 kept. Other static: 3 of 3 kept. A walker, noise and void do not count."""
+    truth = ids(252, 258, 252, 259, 10, 10, 40, 50, 72, 254, 1, 0)
+    removed = ids(1, 1, 1, 0, 0, 1, 0, 0, 0, 1, 1, 1)
+    found = dynamic(dynamic_counts(removed, truth, TABLES, "here"))
+    assert (found["DA"], found["SA"], found["SA_vehicle"]) == (3 / 4, 4 / 5, 1 / 2)
+    assert found["AA"] == pytest.approx((3 / 4 * 4 / 5) ** 0.5)
+    assert dynamic(np.zeros((3, 2), np.int64))["AA"] is None
+
+
+def test_a_calibrated_confidence_has_no_calibration_error_and_a_boast_has_its_size() -> None:
+    rng = np.random.default_rng(3)
+    truth = rng.choice(ids(40, 48, 10, 50, 70), 200_000)
+    confidence = rng.uniform(0.2, 1.0, len(truth))
+    wrong = rng.random(len(truth)) > confidence
+    prediction = np.where(wrong, np.where(truth == 40, 48, 40), truth).astype(np.uint32)
+    counts = metrics.calibration_counts(confidence, prediction, truth, TABLES)
+    assert metrics.calibration(counts)["ece"] < 0.005
+    boast = metrics.calibration_counts(np.ones(len(truth)), prediction, truth, TABLES)
+    assert metrics.calibration(boast)["ece"] == pytest.approx(wrong.mean())

@@ -1,0 +1,86 @@
+"""Classes are mapped by name, never by index."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.labels.label_set import OTHER, open_label_set, taxonomy
+
+URBAN = open_label_set()
+
+
+def test_the_paper_s_five_classes_are_the_default() -> None:
+    assert URBAN.names == ("road", "sidewalk", "vehicle", "building", "vegetation")
+    assert URBAN.semantic_kitti_ids.tolist() == [40, 48, 10, 50, 70]
+
+
+@pytest.mark.parametrize(
+    ("name", "target"),
+    [("car", "vehicle"), ("tree", "vegetation"), ("pavement", "sidewalk"), ("terrain", OTHER), ("fence", OTHER),
+     ("sky", OTHER), ("motorcycle", "vehicle"), ("other", OTHER), ("road", "road")],
+)  # fmt: skip
+def test_a_source_class_goes_where_the_strict_tables_say(name: str, target: str) -> None:
+    row = URBAN.table_from([name])[0]
+    assert row.sum() == 1
+    assert (*URBAN.names, OTHER)[int(row.argmax())] == target
+
+
+def test_probability_is_neither_lost_nor_made() -> None:
+    names = taxonomy("cityscapes").names
+    assert (URBAN.table_from(names).sum(axis=1) == 1).all()
+
+
+def test_an_unknown_class_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'vegetation'"):
+        URBAN.table_from(["vegitation"])
+    with pytest.raises(ConfigError, match="did you mean 'building'"):
+        URBAN.index("buildings")
+
+
+def test_train_ids_and_label_ids_of_the_same_class_agree() -> None:
+    cityscapes = taxonomy("cityscapes")
+    by_train, by_label = (cityscapes.lookup(URBAN, kind) for kind in ("train_id", "label_id"))
+    for name, train_id in cityscapes.ids["train_id"].items():
+        assert by_train[train_id] == by_label[cityscapes.ids["label_id"][name]], name
+    assert by_train[255] == -1
+    assert by_train[77] == -2
+    assert by_train[13] == URBAN.index("vehicle")
+
+
+def test_a_user_s_class_set_is_read_and_checked(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    row = "{name: %s, colour: [1, 2, 3], semantic_kitti_id: 40, asprs_code: 11}"
+    file.write_text(f"name: mine\nclasses: [{row % 'road'}, {row % 'grass'}]\n")
+    assert open_label_set(file).names == ("road", "grass")
+    file.write_text(f"name: mine\nclasses: [{row % 'road'}, {row % 'road'}]\n")
+    with pytest.raises(ConfigError, match="different names"):
+        open_label_set(file)
+    file.write_text("name: mine\nclasses: [{name: road}]\n")
+    with pytest.raises(ConfigError, match="expected name, classes"):
+        open_label_set(file)
+    with pytest.raises(ConfigError, match="no class set 'nothing'"):
+        open_label_set("nothing")
+
+
+def test_ids_of_semantic_kitti_map_as_the_scoring_protocol_says() -> None:
+    table = taxonomy("semantic_kitti").lookup(URBAN, "id", 1 << 16)
+    expected = {
+        40: 0,
+        60: 0,
+        48: 1,
+        10: 2,
+        13: 2,
+        15: 2,
+        18: 2,
+        20: 2,
+        252: 2,
+        257: 2,
+        259: 2,
+        50: 3,
+        70: 4,
+        71: 4,
+    }
+    assert {i: int(table[i]) for i in expected} == expected
+    assert np.isin(table[[44, 72, 51, 80, 30, 16]], [5]).all()

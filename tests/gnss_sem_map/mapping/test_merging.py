@@ -1,0 +1,185 @@
+"""Two maps of one place, made in different frames, become the map of that place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.merging import into_frame, lay_onto, merge, merge_runs
+from gnss_sem_map.refinement import refine
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
+
+URBAN = open_label_set()
+HERE, THERE = LocalFrame(49.011, 8.423, 112.0), LocalFrame(49.0135, 8.4275, 120.0)
+
+
+def street(frame: LocalFrame, seed: int = 0, size: float = 0.2) -> VoxelMap:
+    """A road and a facade at fixed places of the Earth, seen from a drive whose map has this origin."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-60, 60, (40_000, 2)), rng.normal(0, 0.01, 40_000)])
+    wall = np.column_stack([rng.uniform(-60, 60, 20_000), np.full(20_000, 20.0), rng.uniform(0, 8, 20_000)])
+    p_map = frame.to_map(*HERE.to_geodetic(np.vstack([ground, wall])))
+    classes = np.array([[250, 1, 1, 1, 1, 1], [1, 1, 1, 250, 1, 1]], np.uint8)
+    table = VoxelTable(size, URBAN)
+    table.add(keys_of(p_map, size), np.repeat([0, 1], [40_000, 20_000]).astype(np.int32), classes)
+    return table.to_map()
+
+
+def test_two_frames_become_one() -> None:
+    """The facade of the second drive stands where that of the first does, to a voxel, and nothing is lost."""
+    first, second = street(HERE, 0), street(THERE, 1)
+    merged = merge(first, second, HERE, THERE)
+    assert merged.hits.sum() == 120_000
+    np.testing.assert_array_equal(merged.evidence.sum(axis=0), first.evidence.sum(0) + second.evidence.sum(0))
+    moved = into_frame(second, THERE, HERE)
+    for voxels in (first, moved):
+        wall = voxels.centres[voxels.labels == URBAN.index("building")]
+        assert np.abs(wall[:, 1] - 20.0).max() < 0.31
+    far = second.centres[second.labels == URBAN.index("building")]
+    assert np.abs(far[:, 1] - 20.0).min() > 100, "the frames must differ, or this test shows nothing"
+
+
+def test_one_frame_is_added_exactly() -> None:
+    first, second = street(HERE, 0), street(HERE, 1)
+    merged, added = merge(first, second, HERE, LocalFrame(49.011, 8.423, 112.0)), first + second
+    for name in ("keys", "evidence", "hits"):
+        np.testing.assert_array_equal(getattr(merged, name), getattr(added, name))
+
+
+def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
+    """Folders as a run writes them: `map` is everything, `refined` says what of it moved."""
+    for name, frame, seed in (("a", HERE, 0), ("b", THERE, 1)):
+        voxels = street(frame, seed)
+        moved = voxels.labels == URBAN.index("building")
+        refined, _ = refine(voxels[~moved], removed=voxels[moved])
+        assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
+        tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
+        tiles.write(refined, tmp_path / name / "refined", frame)
+    runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
+    stands, removed = runs.stands, runs.removed
+    assert runs.frame == HERE
+    assert stands.hits.sum() + removed.hits.sum() == 120_000
+    assert set(removed.labels) == {URBAN.index("building")}
+    assert URBAN.index("building") not in stands.labels
+    again, _ = refine(stands, removed=removed)
+    assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
+        stands.places(removed.keys) < 0
+    )
+
+
+def test_merged_runs_keep_what_moved_through_standing_voxels_apart(tmp_path: Path) -> None:
+    """Twice the same run: twice the evidence of what stands, and twice that of what moved, in the voxels of both."""
+    stands, moved = street(HERE, 0), street(HERE, 1)
+    refined, _ = refine(stands, removed=moved)
+    assert refined.hits_removed is not None
+    for name in ("a", "b"):
+        tiles.write(SemanticMap.of(stands + moved), tmp_path / name / "map", HERE)
+        tiles.write(refined, tmp_path / name / "refined", HERE)
+    runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
+    for found, once in ((runs.stands, stands), (runs.removed, moved)):
+        np.testing.assert_array_equal(found.keys, once.keys)
+        np.testing.assert_array_equal(found.hits, 2 * once.hits)
+        np.testing.assert_array_equal(found.evidence, 2 * once.evidence)
+
+
+def test_maps_of_different_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
+    tiles.write(SemanticMap.of(street(HERE, 0)), tmp_path / "a" / "map", HERE)
+    tiles.write(SemanticMap.of(street(HERE, 1)), tmp_path / "a" / "refined", HERE)
+    with pytest.raises(DataError, match="not of one run"):
+        merge_runs(tmp_path / "a", tmp_path / "a")
+
+
+def corner(seed: int, length_m: float = 60.0) -> NDArray[np.float64]:
+    """Points on a road between two facades, and on one across its end; other ones for every seed."""
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, 0.01, (4, 20_000))
+    along = rng.uniform(0, length_m, (3, 20_000))
+    up, across = rng.uniform(0, 8, (3, 20_000)), rng.uniform(-8, 8, (2, 20_000))
+    return np.vstack(
+        [
+            np.column_stack([along[0], across[0], 0.1 + noise[0]]),
+            np.column_stack([along[1], -8.1 + noise[1], up[0]]),
+            np.column_stack([along[2], 8.1 + noise[2], up[1]]),
+            np.column_stack([length_m + 0.1 + noise[3], across[1], up[2]]),
+        ]
+    )
+
+
+def voxels_of(p_map: NDArray[np.float64], label: str = "building") -> VoxelMap:
+    table = VoxelTable(0.2, URBAN)
+    classes = np.ones((1, 6), np.uint8)
+    classes[0, URBAN.index(label)] = 250
+    table.add(keys_of(p_map, 0.2), np.zeros(len(p_map), np.int32), classes)
+    return table.to_map()
+
+
+OFF = np.eye(4)
+OFF[:3, :3] = Rotation.from_euler("zx", [0.3, 0.1], degrees=True).as_matrix()
+OFF[:3, 3] = 0.6, -0.4, 0.3
+
+
+def test_the_second_map_is_laid_onto_the_first() -> None:
+    """Two drives of one place, the second's positions off by 0.8 m: its surfaces come back to a few centimetres."""
+    there = (corner(1) - OFF[:3, 3]) @ OFF[:3, :3]  # OFF brings it back
+    first, second = voxels_of(corner(0)), voxels_of(there)
+    laid = lay_onto(first, second, HERE, HERE)
+    assert laid.match is not None, laid.reason
+    back = there @ laid.match.T_target_source[:3, :3].T + laid.match.T_target_source[:3, 3]
+    assert np.abs(back - corner(1)).max() < 0.05
+    assert laid.coinciding[1] > laid.coinciding[0] + 0.3
+    together = merge(first, second, HERE, HERE, laid.match.T_target_source)
+    assert len(together) < 0.75 * len(merge(first, second, HERE, HERE))
+    assert together.hits.sum() == first.hits.sum() + second.hits.sum()
+
+
+def test_a_street_without_an_end_is_not_moved_along_itself() -> None:
+    """Nothing tells how far along: there the georeference stays, across the street the facades decide."""
+    street = corner(0)[:60_000]  # without the facade across
+    middle = (street[:, 0] > 10) & (street[:, 0] < 50)  # its ends would tell
+    second = voxels_of(corner(1)[:60_000][middle] + np.array([0.5, 0.5, 0.2]))
+    laid = lay_onto(voxels_of(street), second, HERE, HERE)
+    assert laid.match is not None, laid.reason
+    np.testing.assert_allclose(laid.match.T_target_source[:3, :3], np.eye(3), atol=2e-3)
+    centre = np.append(second.centres.mean(axis=0), 1)
+    moved = laid.match.T_target_source @ centre - centre
+    assert abs(moved[0]) < 0.05
+    np.testing.assert_allclose(moved[1:3], [-0.5, -0.2], atol=0.05)
+
+
+def test_parked_cars_do_not_hold_a_map() -> None:
+    """Cars that were parked elsewhere the second time are not what it is laid onto."""
+    rng = np.random.default_rng(5)
+    cars = [rng.uniform([10 * k, 3, 0], [10 * k + 4, 5, 1.5], (4_000, 3)) for k in range(1, 5)]
+    first, second = (
+        voxels_of(corner(seed)) + voxels_of(np.vstack(cars) + np.array([shift, 0, 0]), "vehicle")
+        for seed, shift in ((0, 0.0), (1, 1.0))
+    )
+    laid = lay_onto(first, second, HERE, HERE)
+    assert laid.match is None or laid.match.shift_m < 0.02
+
+
+def test_maps_that_share_nothing_lie_by_their_georeference() -> None:
+    elsewhere = voxels_of(corner(1) + np.array([300, 0, 0]))
+    laid = lay_onto(voxels_of(corner(0)), elsewhere, HERE, HERE)
+    assert laid.match is None
+    assert "lie within" in laid.reason
+    assert laid.coinciding == (0.0, 0.0)
+    few = lay_onto(voxels_of(corner(0)[:100]), elsewhere, HERE, HERE)
+    assert "less than 300 voxels" in few.reason
+
+
+def test_maps_that_do_not_fit_together_are_refused() -> None:
+    with pytest.raises(DataError, match="without a georeference"):
+        merge(street(HERE), street(HERE), HERE, None)
+    with pytest.raises(DataError, match=r"0\.4 m voxels"):
+        merge(street(HERE), street(HERE, size=0.4), HERE, HERE)
+    with pytest.raises(DataError, match="not inside the map"):
+        merge(street(HERE), street(HERE), HERE, LocalFrame(-33.9, 18.4, 0.0))

@@ -1,0 +1,129 @@
+"""What stands is hit from everywhere; what moved leaves voxels that scan after scan looks through."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gnss_sem_map.dynamics import range_images, visibility
+from gnss_sem_map.dynamics.motion_state import MotionSettings
+from gnss_sem_map.dynamics.visibility import PLACES_AT_ONCE, AlongTheDrive, Witnesses
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.refinement import RefinementSettings, refine
+from gnss_sem_map.refinement.free_space import ClearingSettings, seen_through
+from gnss_sem_map.voxels.voxel_map import State, VoxelMap, VoxelTable, keys_of
+
+URBAN, MOTION = open_label_set(), MotionSettings()
+EYE_M = 1.8
+FACADE_M = 8.0
+
+
+def ground_and_facades(eye_x: float) -> NDArray[np.float64]:
+    """What a LiDAR at x sees of a long street with a facade on either side, in the map, without noise."""
+    azimuths, elevations = np.meshgrid(
+        np.radians(np.arange(0, 360, 0.2)), np.radians(np.arange(-24, 3, 0.42))
+    )
+    a, e = azimuths.ravel(), elevations.ravel()
+    ray = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+    with np.errstate(divide="ignore"):
+        to_facade = FACADE_M / np.abs(ray[:, 1])
+        to_ground = np.where(ray[:, 2] < 0, EYE_M / -ray[:, 2], np.inf)
+    r = np.minimum(to_facade, to_ground)
+    seen = r < 100
+    return r[seen, None] * ray[seen] + [eye_x, 0, EYE_M]
+
+
+def pose(eye_x: float) -> NDArray[np.float64]:
+    T_map_lidar = np.eye(4)
+    T_map_lidar[:3, 3] = eye_x, 0, EYE_M
+    return T_map_lidar
+
+
+def witness(eye_x: float) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
+    image, T_lidar_map = range_images.empty_image(), np.asarray(np.linalg.inv(pose(eye_x)))
+    range_images.draw(ground_and_facades(eye_x), T_lidar_map, image)
+    return image, T_lidar_map
+
+
+STREET = [float(x) for x in range(0, 30, 2)]
+GHOST = np.column_stack([10.1 + 0.2 * np.arange(51), np.full(51, 3.1), np.full(51, 1.1)])
+"""Where somebody walked, one point in each voxel."""
+
+
+def street_map(*more: NDArray[np.float64]) -> VoxelMap:
+    table = VoxelTable(0.2, URBAN)
+    for points in (*(ground_and_facades(x) for x in STREET), *more):
+        table.add(keys_of(np.ascontiguousarray(points), 0.2))
+    return table.to_map()
+
+
+def cleared(voxels: VoxelMap, settings: ClearingSettings | None = None) -> NDArray[np.bool_]:
+    witnesses = Witnesses.of([witness(x) for x in STREET])
+    return seen_through(voxels, witnesses, settings or ClearingSettings(), MOTION)
+
+
+def test_a_trail_is_cleared_and_what_stands_stays() -> None:
+    voxels = street_map(GHOST)
+    ghost = np.isin(voxels.keys, keys_of(GHOST, 0.2))
+    assert ghost.sum() == 51
+    empty = cleared(voxels)
+    np.testing.assert_array_equal(empty, ghost)
+
+
+def test_what_was_hit_often_stays_whoever_looks_through() -> None:
+    """A fence is looked through and stands: it holds many points."""
+    voxels = street_map(*[GHOST] * 100)
+    assert not cleared(voxels).any()
+
+
+def test_too_few_witnesses_clear_nothing() -> None:
+    voxels = street_map(GHOST)
+    assert not cleared(voxels, ClearingSettings(least_through=len(STREET) + 1)).any()
+    assert not cleared(voxels, ClearingSettings(over_m=(1.6, 3.0))).any()
+
+
+@pytest.mark.parametrize("reach_m", [10.0, 40.0])
+def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> None:
+    """In a drive of kilometres most scans are far from a place: leaving them out changes nothing."""
+    rng = np.random.default_rng(0)
+    far = [float(x) for x in range(0, 2000, 20)]
+    witnesses = Witnesses(np.stack([witness(0.0)[0]] * len(far)), np.linalg.inv([pose(x) for x in far]))
+    places = rng.uniform([0, -8, 0], [2000, 8, 3], (PLACES_AT_ONCE + 5000, 3))
+    places = places[np.argsort(places[:, 0])]
+    settings = MOTION.model_copy(update={"farthest_m": reach_m})
+    assert len(witnesses.near(places[:1000], reach_m).images) < len(far) / 5
+    looks = visibility.testify(places, witnesses, settings)
+    hits, throughs = np.zeros((2, len(places)), np.int32)
+    range_images.look_at(
+        places, witnesses.images, witnesses.T_lidar_map, settings.nearest_m, reach_m,
+        settings.margin_m, settings.margin_ratio, hits, throughs,
+    )  # fmt: skip
+    np.testing.assert_array_equal(looks, [hits, throughs])
+    assert looks.any(axis=1).all()
+
+
+def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
+    voxels = street_map(GHOST)
+    ghost = np.isin(voxels.keys, keys_of(GHOST, 0.2))
+    witnesses = Witnesses.of([witness(x) for x in STREET])
+    refined, report = refine(voxels, witnesses=witnesses)
+    np.testing.assert_array_equal(refined.states == State.REMOVED, ghost)
+    assert {step.name: step.changed for step in report.steps}["seen through"] == ghost.sum()
+    for settings, asked in ((RefinementSettings(clearing="off"), witnesses), (None, None)):
+        refined, report = refine(voxels, settings, witnesses=asked)
+        assert not (refined.states == State.REMOVED).any()
+        assert next(step for step in report.steps if step.name == "seen through").skipped
+
+
+def test_witnesses_are_a_metre_or_a_second_apart() -> None:
+    """However long the drive stands or how fast it goes, they take no more memory than the map that they are for."""
+    stood = [0.0] * 20 + [0.5 * k for k in range(1, 11)]
+    along = AlongTheDrive()
+    assert along.witnesses() is None
+    for k, x in enumerate(stood):
+        along.add(0.1 * k, range_images.empty_image(), np.linalg.inv(pose(x)))
+    kept = along.witnesses()
+    assert kept is not None
+    x = np.linalg.inv(kept.T_lidar_map)[:, 0, 3]
+    np.testing.assert_allclose(x, [0, 0, 0.5, 1.5, 2.5, 3.5, 4.5], atol=1e-9)

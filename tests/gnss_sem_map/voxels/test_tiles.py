@@ -1,0 +1,155 @@
+"""What is read back is what was written, by us and by a plain Parquet reader."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
+
+URBAN, FRAME = open_label_set(), LocalFrame(49.0, 8.4, 110.0)
+
+
+def random_map(seed: int = 0, count: int = 5000, height: int = 100) -> SemanticMap:
+    rng = np.random.default_rng(seed)
+    keys = np.unique(pack(rng.integers((-1500, -1500, -height), (1500, 1500, height), (count, 3))))
+    evidence = -rng.integers(0, 10**6, (len(keys), 5)).astype(np.int32)
+    evidence[rng.random(len(keys)) < 0.5] = 0
+    hits = rng.integers(1, 1000, len(keys)).astype(np.uint32)
+    return SemanticMap.of(VoxelMap(0.2, URBAN, keys, evidence, hits))
+
+
+def test_a_map_comes_back_as_it_was(tmp_path: Path) -> None:
+    written = random_map()
+    tiles.write(written, tmp_path / "map", FRAME)
+    read = tiles.read(tmp_path / "map", URBAN)
+    for name in ("keys", "evidence", "hits"):
+        np.testing.assert_array_equal(getattr(read.voxels, name), getattr(written.voxels, name))
+    for name in ("labels", "confidence", "states"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+    about = json.loads((tmp_path / "map/map.json").read_text())
+    assert about["voxels"] == len(written)
+    assert about["utm_epsg"] == 32632
+
+
+def test_hits_of_what_moved_come_back_from_every_tile(tmp_path: Path) -> None:
+    written = random_map()
+    gone = written.voxels.hits // 2
+    tiles.write(replace(written, hits_removed=gone), tmp_path / "map", FRAME)
+    np.testing.assert_array_equal(tiles.read(tmp_path / "map", URBAN).hits_removed, gone)
+    low, high = written.voxels.centres.min(axis=0), written.voxels.centres.max(axis=0)
+    inside = tiles.read(tmp_path / "map", URBAN, (low, (low + high) / 2))
+    np.testing.assert_array_equal(inside.hits_removed, inside.voxels.hits // 2)
+
+
+def test_the_same_map_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        tiles.write(random_map(), tmp_path / name, FRAME)
+    for path in sorted((tmp_path / "a").iterdir()):
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
+
+
+def test_a_plain_reader_finds_every_voxel_where_the_name_of_its_tile_says(tmp_path: Path) -> None:
+    written = random_map()
+    tiles.write(written, tmp_path / "map", None)
+    found = []
+    for path in (tmp_path / "map").glob("*.parquet"):
+        x, y = (int(part) for part in path.stem.split("_"))
+        key = pq.read_table(path)["key"].to_numpy().astype(np.int64)
+        found.append(
+            np.stack([x * 512 + (key >> 23), y * 512 + (key >> 14 & 511), (key & 16383) - 8192], axis=1)
+        )
+    indices = np.concatenate(found)
+    np.testing.assert_array_equal(indices[np.lexsort(indices.T[::-1])], written.voxels.indices)
+
+
+def test_a_map_without_voxels_is_still_a_map(tmp_path: Path) -> None:
+    empty = random_map()
+    none = SemanticMap.of(empty.voxels[np.zeros(len(empty), bool)])
+    tiles.write(none, tmp_path / "map", FRAME)
+    assert len(tiles.read(tmp_path / "map", URBAN)) == 0
+
+
+def test_a_damaged_or_missing_tile_is_named(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    path = sorted((tmp_path / "map").glob("*.parquet"))[3]
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match=path.name):
+        tiles.read(tmp_path / "map", URBAN)
+    path.unlink()
+    with pytest.raises(DataError, match="tiles, expected"):
+        tiles.read(tmp_path / "map", URBAN)
+    with pytest.raises(DataError, match="no map here"):
+        tiles.read(tmp_path / "elsewhere", URBAN)
+
+
+def test_a_voxel_too_high_for_a_tile_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="do not fit a tile"):
+        tiles.write(random_map(height=20_000), tmp_path / "map", FRAME)
+
+
+def test_a_box_gives_the_voxels_inside_and_opens_only_its_tiles(tmp_path: Path) -> None:
+    written = random_map(count=20_000)
+    tiles.write(written, tmp_path / "map", FRAME)
+    low, high = np.array([-40.0, 10.0, -5.0]), np.array([80.0, 120.0, 15.0])
+    centres = written.voxels.centres
+    inside = ((centres >= low) & (centres <= high)).all(axis=1)
+    for path in (tmp_path / "map").glob("*.parquet"):
+        if path.name not in ("-1_0.parquet", "0_0.parquet", "-1_1.parquet", "0_1.parquet"):
+            path.write_bytes(b"must not be opened")
+    read = tiles.read(tmp_path / "map", box=(low, high))
+    assert 0 < len(read) < len(written)
+    np.testing.assert_array_equal(read.voxels.keys, written.voxels.keys[inside])
+    np.testing.assert_array_equal(read.labels, written.labels[inside])
+    with pytest.raises(DataError, match="checksum"):
+        tiles.read(tmp_path / "map")
+
+
+def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    path = sorted((tmp_path / "map").glob("*.parquet"))[2]
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=f"{path.name}: damaged tile .its checksum"):
+        tiles.read(tmp_path / "map", URBAN)
+
+
+def test_a_tile_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    about = json.loads((tmp_path / "map/map.json").read_text())
+    name, file = about["files"].popitem()
+    about["files"][f"../{name}"] = file
+    (tmp_path / "map/map.json").write_text(json.dumps(about))
+    with pytest.raises(DataError, match="expected a name like"):
+        tiles.read(tmp_path / "map", URBAN)
+
+
+def test_a_map_of_another_class_set_or_in_the_way_is_refused(tmp_path: Path) -> None:
+    tiles.write(random_map(), tmp_path / "map", FRAME)
+    with pytest.raises(DataError, match="found classes"):
+        tiles.read(tmp_path / "map", replace(URBAN, names=(*URBAN.names[:4], "water"), sources={}))
+    with pytest.raises(DataError, match="exists"):
+        tiles.write(random_map(), tmp_path / "map", FRAME)
+    assert len(tiles.read(tmp_path / "map")) == len(random_map())
+    assert tiles.read_frame(tmp_path / "map") == FRAME
+
+
+def test_the_pieces_by_tile_are_the_map(tmp_path: Path) -> None:
+    voxels = random_map().voxels
+    pieces = dict(tiles.by_tile(voxels))
+    assert list(pieces) == sorted(pieces)
+    for tile, piece in pieces.items():
+        np.testing.assert_array_equal(piece.indices[:, :2] >> 9, np.tile(tile, (len(piece), 1)))
+    keys = np.concatenate([piece.keys for piece in pieces.values()])
+    np.testing.assert_array_equal(np.sort(keys), voxels.keys)

@@ -1,0 +1,22 @@
+"""Drive logs (GNSS, IMU, LiDAR, camera) in, a clean, georeferenced, semantic 3D map out."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gnss_sem_map.config import Settings
+    from gnss_sem_map.datasets import open_drive
+    from gnss_sem_map.finished_run import Run, run
+
+__all__ = ["Run", "Settings", "open_drive", "run"]
+
+_PLACES = {"Run": "finished_run", "Settings": "config", "open_drive": "datasets", "run": "finished_run"}
+
+
+def __getattr__(name: str) -> Any:
+    # imported when first asked for: the command line must answer --help at once
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

@@ -11,10 +11,11 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from gnss_sem_map.conventions import SensorConventions
+from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.files.structured import not_finite, parse_yaml, read_yaml
 from gnss_sem_map.files.untrusted import shown
-from gnss_sem_map.refinement import RefinementSettings
+from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings
 from gnss_sem_map.scans.projection import LabellingSettings
 from gnss_sem_map.voxels.voxel_map import MappingSettings
@@ -22,19 +23,17 @@ from gnss_sem_map.voxels.voxel_map import MappingSettings
 Model = TypeVar("Model", bound=BaseModel)
 
 
-EQUATION_6: dict[str, dict[str, Any]] = {
-    "labelling": {"probability_floor": 0.01},
-    "refinement": {
-        "count_exponent": 1.0,
-        "geometry": "off",
-        "smoothing": "off",
-        "levels": "off",
-        "kerbs": "off",
-        "systematic_errors": 0.0,
-        "confidence_temperature": 1.0,
-    },
+PAPER: dict[str, float | bool] = {
+    "labelling.probability_floor": 0.01,
+    "refinement.discount.exponent": 1.0,
+    "refinement.geometric_prior.enabled": False,
+    "refinement.systematic_error.rate": 0.0,
+    "refinement.potts_mrf.enabled": False,
+    "refinement.decision.temperature": 1.0,
+    "refinement.levels.enabled": False,
+    "refinement.kerbs.enabled": False,
 }
-"""What `fusion: paper` sets. The floor is the least that keeps one look from deciding for ever."""
+"""What `fusion: paper` sets. The floor is the least that keeps one observation from deciding for ever."""
 
 
 class Settings(BaseModel):
@@ -48,8 +47,8 @@ class Settings(BaseModel):
     )
     fusion: Literal["evidence", "paper"] = Field(
         "evidence",
-        description="`paper` is eq. 6 to the letter: looks count in full, nothing but the images speaks."
-        " It sets what is not set beside it.",
+        description="`paper` is eq. 6 alone: observations count in full, without priors; what contradicts it is an"
+        " error.",
     )
     sensors: SensorConventions = Field(
         SensorConventions(),
@@ -60,8 +59,11 @@ class Settings(BaseModel):
     )
     mapping: MappingSettings = Field(MappingSettings(), description="Points to voxels.")
     labelling: LabellingSettings = Field(LabellingSettings(), description="Pixels to points.")
+    dynamics: MotionSettings = Field(
+        default_factory=MotionSettings, description="Moving objects, found before mapping."
+    )
     refinement: RefinementSettings = Field(
-        default_factory=RefinementSettings, description="Batch refinement."
+        default_factory=RefinementSettings, description="Batch refinement, step by step."
     )
 
     @model_validator(mode="before")
@@ -69,17 +71,30 @@ class Settings(BaseModel):
     def _as_in_the_paper(cls, content: Any) -> Any:
         if not isinstance(content, dict) or content.get("fusion") != "paper":
             return content
-        if any(isinstance(content.get(section, {}), BaseModel) for section in EQUATION_6):
-            return content
-        if not all(isinstance(content.get(section, {}), dict) for section in EQUATION_6):
-            return content  # refused when the sections are looked at
-        return content | {
-            section: values | content.get(section, {}) for section, values in EQUATION_6.items()
-        }
+        content = _plain(content)
+        for path, value in PAPER.items():
+            *sections, name = path.split(".")
+            section = content
+            for part in sections:
+                section = section.setdefault(part, {})
+                if not isinstance(section, dict):
+                    return content  # refused when the sections are looked at
+            if section.setdefault(name, value) != value:
+                raise ValueError(
+                    f"fusion: paper sets {path} to {value}, found {section[name]}; leave out one of them"
+                )
+        return content
 
     def to_yaml(self) -> str:
         """These settings as a file that `load` reads back."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def _plain(content: Any) -> Any:
+    """A copy in which models are what was set of them."""
+    if isinstance(content, BaseModel):
+        content = content.model_dump(exclude_unset=True)
+    return {key: _plain(value) for key, value in content.items()} if isinstance(content, dict) else content
 
 
 def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:

@@ -15,12 +15,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-
-import numpy as np
-from numpy.typing import NDArray
 
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
@@ -31,24 +27,26 @@ from gnss_sem_map.evaluation.map_sharpness import Sharpness, of_drive
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.labels.sensor_model import LabelCalibration
+from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.fusion import answers_fingerprint, build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.moving_points import find_moving
-from gnss_sem_map.mapping.surface_heights import surface_heights
-from gnss_sem_map.mapping.trajectory import estimate_trajectory, final, solve
-from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
+from gnss_sem_map.mapping.surface_heights import measure_surface_heights
+from gnss_sem_map.mapping.trajectory import estimate_trajectory, locate
 from gnss_sem_map.refinement.kerbs import Kerbs
+from gnss_sem_map.refinement.road_sidewalk import ways
+from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.steps import RefinementReport, run_steps
+from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.run_stats import Account, Progress, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.remembered import RememberedSegmenter, answers_folder
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
 
-__all__ = ["Result", "check_drive", "estimate_trajectory", "run", "solve"]
-
-MATCHED_SHARE = 0.95
-"""With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
+__all__ = ["Result", "check_drive", "estimate_trajectory", "map_drive", "refine_map", "run"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +60,14 @@ class Result:
     refined: SemanticMap
     refinement: RefinementReport
     account: Account
-    moving: Mapping[int, NDArray[np.int64]] | None = None
-    """Frame number -> places of the points of moving objects among the scan's usable ones; None: not sought."""
+    evidence: RunEvidence
+    """What is known beside the map, kept so that it can be refined again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
     """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
+    from_lidar_odometry: bool = False
+    """Whether the poses come from LiDAR odometry, so that what stands, stands still in the map."""
     kerbs: Kerbs | None = None
-    """Where points of the refined map must be told apart into road and sidewalk."""
+    """Voxels of the refined map whose points are classified one by one."""
     preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
     """What was found before any work."""
 
@@ -93,43 +93,85 @@ def run(
     """
     log = log.in_our_conventions(settings.sensors)
     account = Account(skips=list(log.skips))
-    sensor_model.opened(
-        settings.calibration, open_label_set(settings.classes)
-    )  # of other classes: refused now
+    _sensor_model(settings)  # of other classes: refused now
     page = check_drive(log, segmenter, settings, account, force)
     with account.stage("trajectory"):
         progress("trajectory", 0, 1)
-        solutions = solve(log, settings, account, progress, page.solution)
-        trajectory, solution = final(log, solutions)
+        found = locate(log, settings, account, progress, page.solution)
         progress("trajectory", 1, 1)
     with account.stage("sharpness"):
-        figures = of_drive(log, [trajectory, *(s.trajectory for s in solutions[:-1])], progress=progress)
+        trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
+        figures = of_drive(log, trajectories, progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
-    whole = Drive(log, trajectory, segmenter, settings, matched=_is_matched(log, account))
-    with _answers(whole, work, resume, labels_from) as folder:
-        drive, found = _without_moving(whole, folder, account, progress)
+    drive = Drive(log, found.trajectory, segmenter, settings, matched=found.from_lidar_odometry)
+    result = map_drive(
+        drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
+    )
+    return replace(result, solution=found.solution, sharpness=sharpness, preflight=page)
+
+
+def map_drive(
+    drive: Drive,
+    account: Account,
+    progress: Progress = silent,
+    *,
+    work: Path | None = None,
+    resume: bool = False,
+    workers: int = 1,
+    labels_from: str = "",
+) -> Result:
+    """Raw map and refined map of a drive whose trajectory is known; see `run`."""
+    with _answers(drive, work, resume, labels_from) as folder:
+        drive, found = _without_moving(drive, folder, account, progress)
         with account.stage("mapping"):
             maps = build_maps(
                 drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
             )
+    raw = SemanticMap.of(maps.static + maps.removed)
     with account.stage("refinement"):
         progress("refinement", 0, 1)
-        calibration = sensor_model.opened(settings.calibration, maps.static.label_set)
-        witnesses = found.witnesses if drive.matched else None
-        refined, refinement = refine(
-            maps.static, settings.refinement, maps.removed, found.objects, calibration, witnesses
-        )
-        refined, kerbs, levels = tell_ways(
-            refined, settings.refinement, partial(surface_heights, log, trajectory, settings)
-        )
-        refinement = replace(refinement, steps=(*refinement.steps, levels))
+        keyframes = found.witnesses if drive.matched else None
+        heights = _heights(drive, raw.voxels)
+        evidence = RunEvidence(maps.removed, drive.moving or {}, keyframes, heights)
+        state, report = refine_map(maps.static, evidence, drive.settings)
         progress("refinement", 1, 1)
+    refined = _decided(state)
     if (refined.states == State.REMOVED).all():
         account.warnings.append("everything was taken for moving: what is drawn is what was removed")
-    raw = SemanticMap.of(maps.static + maps.removed)
+    report = replace(report, tracked=found.objects)
     return Result(
-        trajectory, solution, raw, refined, refinement, account, drive.moving, sharpness, kerbs, page
-    )
+        drive.trajectory, None, raw, refined, report, account, evidence,
+        from_lidar_odometry=drive.matched, kerbs=state.kerbs,
+    )  # fmt: skip
+
+
+def refine_map(
+    static: VoxelMap, evidence: RunEvidence, settings: Settings
+) -> tuple[MapState, RefinementReport]:
+    """The map without what moved, refined with everything that is known beside it; see `refinement.steps`."""
+    beside = Evidence(evidence.moved, _sensor_model(settings), evidence.keyframes, evidence.surface_heights)
+    return run_steps(static, settings.refinement, beside)
+
+
+def _decided(state: MapState) -> SemanticMap:
+    assert state.decided is not None
+    return state.decided
+
+
+def _sensor_model(settings: Settings) -> LabelCalibration | None:
+    return sensor_model.opened(settings.calibration, open_label_set(settings.classes))
+
+
+def _heights(drive: Drive, voxels: VoxelMap) -> SurfaceHeights | None:
+    """Heights of surfaces, where a step needs them and there are labels to tell apart."""
+    steps, label_set = drive.settings.refinement, drive.label_set
+    if (
+        ways(label_set) is None
+        or not (steps.levels.enabled or steps.kerbs.enabled)
+        or not voxels.observed.any()
+    ):
+        return None
+    return measure_surface_heights(drive.log, drive.trajectory, drive.settings, voxels)
 
 
 def check_drive(
@@ -159,7 +201,7 @@ def _without_moving(
 ) -> tuple[Drive, MovingObjects]:
     """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
     log, settings = drive.log, drive.settings
-    if settings.refinement.vehicles != "evidence":
+    if not settings.dynamics.enabled:
         return drive, MovingObjects({}, ())
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
@@ -170,7 +212,3 @@ def _without_moving(
         moving = find_moving(drive, progress)
     account.counts["points of moving objects"] += sum(map(len, moving.points.values()))
     return replace(drive, moving=moving.points), moving
-
-
-def _is_matched(log: SensorLog, account: Account) -> bool:
-    return account.counts["scans matched"] >= MATCHED_SHARE * max(len(log.scans), 1)

@@ -21,7 +21,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.conventions import SensorConventions
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +195,16 @@ class SensorLog:
         """Where the files of scans and images are."""
         files = {*map(file_of, self.scans), *map(file_of, self.images)}
         return {file.parent for file in files if file is not None}
+
+    def between(self, frames: str | None) -> SensorLog:
+        """The same log with the scans A to B - 1 alone: `frames` is "A:B", "A:" or ":B". Raises ConfigError."""
+        if frames is None:
+            return self
+        first, colon, last = frames.partition(":")
+        if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):
+            raise ConfigError(f"frames: found {frames!r}, expected A:B with frame numbers")
+        low, high = int(first or 0), int(last) if last else float("inf")
+        return replace(self, scans=tuple(scan for scan in self.scans if low <= scan.number < high))
 
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
         """The same log in our axes, units and clock, once: what is chosen wins over what the drive says of itself."""

@@ -7,10 +7,11 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.special import betaincc, ndtr
 
 from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
+from gnss_sem_map.dynamics.visibility import VisibilitySettings
 
 LEAST_TRACKED_POINTS = 5
 """Smaller segments are judged on their own."""
@@ -36,17 +37,12 @@ class Motion(StrEnum):
 GONE = (Motion.MOVING, Motion.STOPPED_AND_LEFT)
 
 
-class MotionSettings(BaseModel):
+class MotionSettings(VisibilitySettings):
     """What speaks for motion, and how much of it is enough."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+    enabled: bool = Field(default=True, description="Whether moving objects are sought before mapping.")
     segment_eps_m: float = Field(default=0.7, gt=0, le=3, description="Points of a segment are this near, m.")
     gate_m: float = Field(default=1.5, gt=0, description="A track goes on this near to its prediction, m.")
-    nearest_m: float = Field(default=3.0, gt=0, description="Nearer scans do not testify, m.")
-    farthest_m: float = Field(default=40.0, gt=0, description="Farther scans do not testify, m.")
-    margin_m: float = Field(default=0.3, ge=0, description="A range within this, m,")
-    margin_ratio: float = Field(default=0.01, ge=0, description="plus this share of it, is a hit.")
     through_per_hit: float = Field(
         default=1.0,
         gt=0,

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.scans.prefetch import ahead
-
-if TYPE_CHECKING:
-    from gnss_sem_map.dynamics.motion_state import MotionSettings
 
 THREADS = min(os.cpu_count() or 1, 4)
 """More would wait for the one that reads, each with two scans in memory."""
@@ -21,6 +18,17 @@ PLACES_AT_ONCE = 1 << 14
 """Places that one thread looks at before it takes the next."""
 APART_M, APART_S = 1.0, 1.0
 """Of a whole drive those scans are kept that are so far apart, in either: they take no more memory than its map."""
+
+
+class VisibilitySettings(BaseModel):
+    """When a range that a scan measured speaks of a place."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    nearest_m: float = Field(default=3.0, gt=0, description="Scans nearer than this are no evidence, m.")
+    farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
+    margin_m: float = Field(default=0.3, ge=0, description="A range within this of a place is a hit, m,")
+    margin_ratio: float = Field(default=0.01, ge=0, description="plus this share of the range.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +73,9 @@ class AlongTheDrive:
         return Witnesses.of(self._kept) if self._kept else None
 
 
-def testify(places: NDArray[np.float64], witnesses: Witnesses, settings: MotionSettings) -> NDArray[np.int32]:
+def testify(
+    places: NDArray[np.float64], witnesses: Witnesses, settings: VisibilitySettings
+) -> NDArray[np.int32]:
     """How many witnesses hit each place (v, 3) m, and how many saw through it: (2, v); see `range_images.look_at`."""
     looks = np.zeros((2, len(places)), np.int32)
 

@@ -20,10 +20,10 @@ from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import CELLS, LabelCalibration, Street, cells_of
 from gnss_sem_map.mapping.labelled_scans import Drive, SeenScan, seen_scans
-from gnss_sem_map.refinement import weigh
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.potts_mrf import LEAST_PROBABILITY
+from gnss_sem_map.refinement.steps import run_steps
 from gnss_sem_map.refinement.systematic_error import doubted
 from gnss_sem_map.run_stats import Account, Progress, silent
 from gnss_sem_map.segmentation import open_segmenter
@@ -75,7 +75,7 @@ def measure(
     `voxels` is the map that the drive made; `truths` are its `.label` files by scan name.
     """
     tables, c = Tables.of(voxels.label_set), len(voxels.label_set.names)
-    weighed = weigh(voxels, drive.settings.refinement)
+    state, _ = run_steps(voxels, drive.settings.refinement)
     cells = cells_of(height_over_ground(voxels.centres), flatness(voxels.keys))
     answers, found = np.zeros((c, c + 1), np.int64), np.zeros((c, CELLS[0] * CELLS[1]), np.int64)
     true_classes, rows = [], []
@@ -92,8 +92,8 @@ def measure(
             f"{drive.log.name}: no point has both a pixel and a true class; is the truth of this drive?"
         )
     row = np.concatenate(rows)
-    doubts = np.full(len(true), weighed.systematic_errors, np.float32)
-    return Street(drive.log.name, answers, found.reshape(c, *CELLS)), (true, weighed.scores[row], doubts)
+    doubts = np.full(len(true), state.systematic_error, np.float32)
+    return Street(drive.log.name, answers, found.reshape(c, *CELLS)), (true, state.scores[row], doubts)
 
 
 def _points(

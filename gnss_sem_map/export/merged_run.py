@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,18 +9,14 @@ from typing import Any
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.pictures import write_perspective, write_topview
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
-from gnss_sem_map.export.raster import write_topview_geotiff
-from gnss_sem_map.export.run_folder import claimed_run
-from gnss_sem_map.export.viewer import write_viewer
+from gnss_sem_map.export.run_folder import about_map, claimed_run, write_about, write_maps
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import Laid, merge_runs
-from gnss_sem_map.refinement import refine
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.pipeline import Result, refine_map
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 
@@ -45,28 +40,30 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     settings = config.load(first / "config.yaml")
     label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
-    calibration = sensor_model.opened(settings.calibration, label_set)
-    refined, _ = refine(merged.stands, settings.refinement, merged.removed, calibration=calibration)
-    raw, frame = SemanticMap.of(merged.stands + merged.removed), merged.frame
-    driven = Trajectory.load(first / "trajectory.parquet")
+    state, report = refine_map(merged.stands, merged.evidence, settings)
+    assert state.decided is not None
+    raw, frame = SemanticMap.of(merged.stands + merged.evidence.moved), merged.frame
+    result = Result(
+        Trajectory.load(first / "trajectory.parquet"),
+        None,
+        raw,
+        state.decided,
+        report,
+        Account(),
+        merged.evidence,
+        kerbs=state.kerbs,
+    )
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
         "local_frame": asdict(frame),
-        "map": {"voxels": len(raw), "points": int(raw.voxels.hits.sum())},
+        "map": about_map(result),
         "match": _about(merged.laid),
     }
     with new_folder(out) as folder:
-        tiles.write(raw, folder / "map", frame)
-        tiles.write(refined, folder / "refined", frame)
-        write_ply(refined, folder / "map.ply", frame)
-        write_laz(refined, frame, folder / "map.laz")
-        write_topview_geotiff(refined, frame, folder / "topview_class.tif")
-        write_topview(refined, folder / "topview.png", driven, title=str(about["name"]))
-        write_perspective(refined, folder / "perspective.png", driven)
-        write_viewer(refined, driven, folder / "viewer.html", title=str(about["name"]))
-        (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        (folder / "run.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+        write_maps(folder, result, frame, result.trajectory, str(about["name"]))
+        evidence.write(merged.evidence, folder, frame)
+        write_about(folder, settings, about, {})
     return about
 
 

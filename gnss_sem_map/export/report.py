@@ -11,6 +11,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.files.ownership import amend
 
 PICTURES = {
@@ -19,12 +20,7 @@ PICTURES = {
     "trajectory.png": "The trajectory and the fixes that it was made of.",
 }
 FILES = {
-    "viewer.html": "the map to turn and to ask, in any browser, offline",
-    "map.laz": "every voxel as LAS 1.4 in UTM, with ASPRS codes, confidence and state, for QGIS and CloudCompare",
-    "map.ply": "the labelled voxels in map metres, coloured by class",
-    "topview_class.tif": "the classes from above as GeoTIFF in UTM, for QGIS",
-    "topview.png": PICTURES["topview.png"],
-    "perspective.png": PICTURES["perspective.png"],
+    **{each.file: each.what for each in FORMATS},
     "trajectory.png": PICTURES["trajectory.png"],
     "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
     "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
@@ -32,6 +28,7 @@ FILES = {
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
     "map": "the map before refinement, with all evidence, as Parquet tiles",
     "refined": "the refined map as Parquet tiles",
+    "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",
     "confidence": "the probability of each of these labels, float16",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
@@ -14,22 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS
 from gnss_sem_map.evaluation.preflight.findings import Preflight
-from gnss_sem_map.export.pictures import write_perspective, write_topview
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
-from gnss_sem_map.export.raster import write_topview_geotiff
+from gnss_sem_map.export.formats import Exported, write_exports
 from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
-from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
+from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.pipeline import Result
-from gnss_sem_map.refinement import RefinementReport
+from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import Account
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -63,48 +65,92 @@ def write_run(
     settings: Settings,
     write_labels: bool,
     segmenter: str | None = None,
+    frames: str | None = None,
 ) -> dict[str, Any]:
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
+    inputs = {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
     with claimed_run(out, [drive]), new_folder(out) as folder:
         with result.account.stage("export"):
             _write_trajectory(folder, log, result.trajectory, result.solution)
-            tiles.write(result.raw, folder / "map", log.frame)
-            tiles.write(result.refined, folder / "refined", log.frame)
-            _write_exports(folder, log, result)
+            driven = _while_mapping(result.trajectory, log)
+            write_maps(folder, result, log.frame, driven, log.name)
+            evidence.write(result.evidence, folder, log.frame)
             if write_labels:
                 write_point_labels(folder, log, result, settings)
-        (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, result.account) | {
-            "inputs": {"drive": str(drive.resolve()), "segmenter": _absolute(segmenter)},
+            "inputs": inputs,
+            "scans_s": [log.scans[0].stamp, log.scans[-1].stamp],
             "preflight": result.preflight.as_dict(),
             "trajectory": _about_solution(result.solution),
-            "map": _about_map(result),
+            "from_lidar_odometry": result.from_lidar_odometry,
+            "map": about_map(result),
         }
-        metrics: dict[str, Any] = {
-            "sharpness": {name: figures.as_dict() for name, figures in result.sharpness.items()}
-        }
-        _write_json(folder / "run.json", about)
-        _write_json(folder / "metrics.json", metrics)
-        write_report(folder, about, metrics)
+        metrics = {"sharpness": {name: figures.as_dict() for name, figures in result.sharpness.items()}}
+        write_about(folder, settings, about, metrics)
     return about
 
 
-def _write_exports(folder: Path, log: SensorLog, result: Result) -> None:
-    """The refined map for everybody's own tools."""
-    semantic_map, trajectory = result.refined, result.trajectory
-    write_ply(semantic_map, folder / "map.ply", log.frame)
-    write_laz(semantic_map, log.frame, folder / "map.laz")
-    if log.frame is not None:
-        write_topview_geotiff(semantic_map, log.frame, folder / "topview_class.tif")
-    driven = _while_mapping(trajectory, log)
-    write_topview(semantic_map, folder / "topview.png", driven, title=log.name)
-    write_perspective(semantic_map, folder / "perspective.png", driven)
-    write_viewer(semantic_map, driven, folder / "viewer.html", title=log.name)
+def write_again(
+    out: Path,
+    source: Path,
+    result: Result,
+    settings: Settings,
+    log: SensorLog | None,
+    changed: dict[str, Any],
+    tracked: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Write a finished run once more, with another map of the same drive; returns the content of run.json.
+
+    What stays is copied from `source`, which may be `out`; scores of the map before do not. Point labels are written
+    where there is a `log`. `changed` is what run.json says anew, `tracked` what it said of moving objects, where they
+    were not sought again.
+    """
+    about, metrics = read_run(source), read_json(source / "metrics.json")
+    first, last = about["scans_s"]
+    with claimed_run(out, [source] if source.resolve() != out.resolve() else []), new_folder(out) as folder:
+        for file in source.glob("trajectory*"):
+            shutil.copyfile(file, folder / file.name)
+        frame = tiles.read_frame(source / "map")
+        driven = between(result.trajectory, first, last)
+        with result.account.stage("export"):
+            write_maps(folder, result, frame, driven, str(about["name"]))
+            evidence.write(result.evidence, folder, frame)
+            if log is not None:
+                write_point_labels(folder, log, result, settings)
+        about |= changed | {
+            "seconds": about["seconds"] | _seconds(result.account),
+            "counts": about["counts"] | dict(sorted(result.account.counts.items())),
+            "warnings": list(dict.fromkeys([*about["warnings"], *result.account.warnings])),
+            "map": about_map(result),
+        }
+        if tracked is not None:
+            about["map"]["refinement"] |= {name: tracked[name] for name in ("tracked", "specks")}
+        write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
+    return about
+
+
+def write_maps(
+    folder: Path, result: Result, frame: LocalFrame | None, driven: Trajectory, title: str
+) -> None:
+    tiles.write(result.raw, folder / "map", frame)
+    tiles.write(result.refined, folder / "refined", frame)
+    write_exports(Exported(result.refined, frame, driven, title), folder)
+
+
+def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:
+    """What a run says of itself, for programs and for people."""
+    (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
+    _write_json(folder / "run.json", about)
+    _write_json(folder / "metrics.json", metrics)
+    write_report(folder, about, metrics)
 
 
 def _while_mapping(trajectory: Trajectory, log: SensorLog) -> Trajectory:
     """The part of the trajectory that was driven while there were scans: what a picture of the map shows."""
-    first, last = log.scans[0].stamp, log.scans[-1].stamp
+    return between(trajectory, log.scans[0].stamp, log.scans[-1].stamp)
+
+
+def between(trajectory: Trajectory, first: float, last: float) -> Trajectory:
     inside = (trajectory.stamps >= first - 0.1) & (trajectory.stamps <= last + 0.1)
     return Trajectory(trajectory.stamps[inside], trajectory.T_map_imu[inside]) if inside.any() else trajectory
 
@@ -170,7 +216,7 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
     ids = np.append(known_ids, 0).astype("<u4")  # the label -1 finds the last
     maps = (result.raw, result.refined)
     for scan, (raw, refined) in label_points(
-        log, result.trajectory, maps, settings, result.moving, result.kerbs
+        log, result.trajectory, maps, settings, result.evidence.moving, result.kerbs
     ):
         ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
         ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
@@ -197,12 +243,16 @@ def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
             "frames": dict(sorted(frames.items())),
             "listed": [asdict(skip) for skip in skips],
         },
-        "seconds": {name: round(value, 3) for name, value in account.seconds.items()},
+        "seconds": _seconds(account),
         "peak_memory_mb": {name: round(value) for name, value in account.peak_memory_mb.items()},
     }
 
 
-def _about_map(result: Result) -> dict[str, Any]:
+def _seconds(account: Account) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in account.seconds.items()}
+
+
+def about_map(result: Result) -> dict[str, Any]:
     names = result.raw.voxels.label_set.names
     return {
         "voxels": len(result.raw),
@@ -217,6 +267,7 @@ def _about_map(result: Result) -> dict[str, Any]:
 
 
 def _about_refinement(report: RefinementReport) -> dict[str, Any]:
+    """Steps and objects, for run.json; objects of a few points are only counted."""
     followed = [thing for thing in report.tracked if thing.points >= LEAST_TRACKED_POINTS]
     return {
         "steps": [
@@ -246,7 +297,7 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
     }
 
 
-def _absolute(segmenter: str | None) -> str | None:
+def absolute(segmenter: str | None) -> str | None:
     """The segmenter's description, good in any working directory."""
     kind, colon, rest = (segmenter or "").partition(":")
     place, mark, options = rest.partition("?")

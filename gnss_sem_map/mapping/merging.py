@@ -15,9 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.dynamics.visibility import Witnesses
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
+from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HITS_LIMIT
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
@@ -43,8 +47,8 @@ class MergedRuns:
     """Two runs as one."""
 
     stands: VoxelMap
-    removed: VoxelMap
-    """What moved."""
+    """Everything but what moved."""
+    evidence: RunEvidence
     frame: LocalFrame
     """Of the first run, and now of both."""
     laid: Laid
@@ -73,21 +77,56 @@ def merge_runs(
     The second is laid onto the first where the two `match`. Raises DataError for a folder without maps, a damaged one,
     and maps that do not fit together.
     """
+    label_set = label_set or tiles.read(first / "map").voxels.label_set
     frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
-    static, removed = zip(*(_parted(run, label_set) for run in (first, second)), strict=True)
+    known = [evidence.read(run, label_set) for run in (first, second)]
+    static = [_without(run, label_set, one.moved) for run, one in zip((first, second), known, strict=True)]
     laid = lay_onto(static[0], static[1], frames[0], frames[1], match)
     T = laid.match.T_target_source if laid.match else None
-    stands, gone_too = (merge(a, b, frames[0], frames[1], T) for a, b in (static, removed))
-    return MergedRuns(stands, gone_too, frames[0], laid)
+    stands = merge(static[0], static[1], frames[0], frames[1], T)
+    return MergedRuns(stands, _merged_evidence(known[0], known[1], frames[0], frames[1], T), frames[0], laid)
 
 
-def _parted(run: Path, label_set: LabelSet | None) -> tuple[VoxelMap, VoxelMap]:
-    """What stands in a run, and what moved: map/ holds all evidence, refined/ says what of it stands."""
-    everything, stands = tiles.read(run / "map", label_set), tiles.read(run / "refined", label_set).standing
+def _without(run: Path, label_set: LabelSet, moved: VoxelMap) -> VoxelMap:
     try:
-        return stands, everything.voxels - stands
+        return tiles.read(run / "map", label_set).voxels - moved
     except DataError:
-        raise DataError(f"{run}: map/ and refined/ are not of one run; make the run again") from None
+        raise DataError(f"{run}: map/ and evidence/ are not of one run; make the run again") from None
+
+
+def _merged_evidence(
+    first: RunEvidence,
+    second: RunEvidence,
+    first_frame: LocalFrame,
+    second_frame: LocalFrame,
+    T: NDArray[np.float64] | None,
+) -> RunEvidence:
+    """What both runs know beside their maps, in the frame of the first; frame numbers are of one drive only."""
+    moved = merge(first.moved, second.moved, first_frame, second_frame, T)
+    T_first_second = _rigid(second_frame, first_frame, np.eye(4) if T is None else T)
+    keyframes = [one.keyframes for one in (first, second)]
+    both: Witnesses | None = None
+    if keyframes[0] is not None and keyframes[1] is not None:
+        later = keyframes[1].T_lidar_map @ np.linalg.inv(T_first_second)
+        both = Witnesses(
+            np.concatenate([keyframes[0].images, keyframes[1].images]),
+            np.concatenate([keyframes[0].T_lidar_map, later]),
+        )
+    heights = [one.surface_heights for one in (first, second)]
+    of_both: SurfaceHeights | None = None
+    if heights[0] is not None and heights[1] is not None:
+        of_both = heights[0] + heights[1].moved(T_first_second, first.moved.voxel_size_m)
+    return RunEvidence(moved, {}, both, of_both)
+
+
+def _rigid(source: LocalFrame, target: LocalFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_target_source of two local frames, then moved by `T`: both are tangent planes of one ellipsoid."""
+    if source == target:
+        return T
+    corners = target.to_map(*source.to_geodetic(np.vstack([np.zeros(3), np.eye(3)])))
+    T_target_source = np.eye(4)
+    T_target_source[:3, :3], T_target_source[:3, 3] = (corners[1:] - corners[0]).T, corners[0]
+    return np.asarray(T @ T_target_source)
 
 
 def lay_onto(

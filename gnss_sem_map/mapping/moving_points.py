@@ -23,7 +23,7 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
 
     What no image shows is followed too, but is only said to have moved when it was seen to go elsewhere.
     """
-    detector = MovingObjectDetector(drive.settings.refinement.motion, drive.matched)
+    detector = MovingObjectDetector(drive.settings.dynamics, drive.matched)
     along = AlongTheDrive()
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []
@@ -59,5 +59,5 @@ def _observed(seen: SeenScan) -> Observation:
     T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
     return observe(
         scan.number, scan.stamp, seen.p_map, T_map_lidar, *told(seen.labels, drive.label_set.names),
-        drive.settings.refinement.motion,
+        drive.settings.dynamics,
     )  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
@@ -11,45 +13,58 @@ from gnss_sem_map.run_stats import Account, Progress, silent
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings, match_scans
 from gnss_sem_map.sensor_log import SensorLog
 
+MATCHED_SHARE = 0.95
+"""With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
+
+
+@dataclass(frozen=True, eq=False)
+class DriveTrajectory:
+    """The trajectory of a drive, and how it was found."""
+
+    trajectory: Trajectory
+    solution: Solution | None = None
+    """How the smoother came to it; None: the poses came with the drive."""
+    without_lidar: Trajectory | None = None
+    """What GNSS and IMU alone say; None where LiDAR odometry had no part in it."""
+    from_lidar_odometry: bool = False
+    """Whether nearly all scans were matched, so that what stands, stands still in the map."""
+
 
 def estimate_trajectory(
     log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
 ) -> tuple[Trajectory, Solution | None]:
-    """The poses that came with the drive, or GNSS and IMU smoothed, bound by LiDAR odometry where there are scans."""
-    return final(log, solve(log, settings, account, progress))
+    """The trajectory of a drive and its solution; see `locate`."""
+    found = locate(log, settings, account, progress)
+    return found.trajectory, found.solution
 
 
-def final(log: SensorLog, solutions: tuple[Solution, ...]) -> tuple[Trajectory, Solution | None]:
-    """The last of the solutions, or the poses that came with the drive."""
-    if log.given is not None:
-        return log.given, None
-    return solutions[-1].trajectory, solutions[-1]
-
-
-def solve(
+def locate(
     log: SensorLog,
     settings: Settings,
     account: Account,
     progress: Progress = silent,
     first: Solution | None = None,
-) -> tuple[Solution, ...]:
-    """GNSS and IMU smoothed, and then once more bound by the sweeps matched with that; none where poses are given.
+) -> DriveTrajectory:
+    """The poses that came with the drive, or GNSS and IMU smoothed, then once more with the sweeps matched by that.
 
     `first` is what `smooth_log` makes of this log, where somebody has it already.
     """
     if log.given is not None:
-        return ()
+        return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
-    solutions = [first if first is not None else smooth_log(log, settings.trajectory)]
+    found = first if first is not None else smooth_log(log, settings.trajectory)
+    is_matched, without_lidar = False, None
     if settings.trajectory.lidar_odometry and log.scans:
-        matches = match_scans(log, solutions[0].trajectory, settings.trajectory.scan_matching, progress)
+        matches = match_scans(log, found.trajectory, settings.trajectory.scan_matching, progress)
         account.counts.update(matches.counts)
         # a scan that cannot be used at all is reported when the map is built
         account.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
+        is_matched = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
         if len(matches.relative_poses):
-            solutions.append(smooth_log(log, settings.trajectory, matches.relative_poses))
-    account.warnings.extend(solutions[-1].notes)
-    return tuple(solutions)
+            without_lidar = found.trajectory
+            found = smooth_log(log, settings.trajectory, matches.relative_poses)
+    account.warnings.extend(found.notes)
+    return DriveTrajectory(found.trajectory, found, without_lidar, is_matched)
 
 
 def smooth_log(

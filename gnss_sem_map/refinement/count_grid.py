@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numba import int64, njit
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.special import gammaln
 
+from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings, classes_of
 from gnss_sem_map.scans.prefetch import ahead
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
@@ -23,11 +26,12 @@ LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
 """A map's own word on its errors is believed within these: to agree with itself is not to be right."""
 
 
-class CountGridSettings(BaseModel):
+class CountGridSettings(StepSettings):
     """How the voxels above and below speak for building or vegetation."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+    method: Literal["evidence", "paper"] = Field(
+        default="evidence", description="Weigh a column's labels, or overwrite them as section 3.3.1 does."
+    )
     cell_m: float = Field(
         default=1.0, gt=0, le=20, description="Edge of a cell of the count grid, m (the paper: one voxel)."
     )
@@ -52,6 +56,24 @@ class CountGridSettings(BaseModel):
         lt=0.5,
         description="Mode `paper`: share of building and vegetation voxels that are labelled wrongly.",
     )
+
+
+def reach_m(settings: CountGridSettings, voxel_size_m: float) -> float:
+    """A cell wide; the paper's columns have no end in height, and evidence needs the map's own error rate."""
+    return WHOLE_MAP
+
+
+def apply(state: MapState, settings: CountGridSettings) -> MapState:
+    """Building against vegetation, column by column (eq. 8 to 11)."""
+    voxels, scores, labels = state.voxels, state.scores, state.labels
+    first, second = classes_of(voxels.label_set, "building", "vegetation")
+    if settings.method == "paper":
+        log_odds = paper_log_odds(voxels.keys, labels, (first, second), settings)
+    else:
+        own = scores[:, first] - scores[:, second]
+        log_odds = evidence_log_odds(voxels.keys, labels, own, (first, second), settings, voxels.voxel_size_m)
+    undecided = np.isin(labels, (first, second))
+    return replace(state, scores=decide(scores, undecided, (first, second), log_odds))
 
 
 def count_grid(

@@ -7,21 +7,20 @@ followed, never in an image, too close to a wall to be told from it. What stands
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from gnss_sem_map.dynamics.motion_state import MotionSettings
-from gnss_sem_map.dynamics.visibility import Witnesses, testify
+from gnss_sem_map.dynamics.visibility import VisibilitySettings, Witnesses, testify
+from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
-class ClearingSettings(BaseModel):
+class FreeSpaceSettings(VisibilitySettings, StepSettings):
     """How often a voxel is seen through before it is empty; witnesses are scans 1 m or 1 s apart."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     least_through: int = Field(default=6, ge=1, description="So many witnesses saw through it,")
     through_per_hit: float = Field(default=3.0, gt=0, description="so many times as often as hit it,")
@@ -38,9 +37,21 @@ class ClearingSettings(BaseModel):
     )
 
 
-def seen_through(
-    voxels: VoxelMap, witnesses: Witnesses, settings: ClearingSettings, motion: MotionSettings
-) -> NDArray[np.bool_]:
+def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
+    """What a voxel stands over; keyframes are asked from wherever they are."""
+    return settings.over_m[1] + voxel_size_m
+
+
+def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
+    """Remove the voxels that keyframe scans repeatedly look through; see `seen_through`."""
+    if state.beside.keyframes is None:
+        raise NotApplicable("no keyframe scans with poses from LiDAR odometry")
+    return replace(
+        state, removed=state.removed | seen_through(state.voxels, state.beside.keyframes, settings)
+    )
+
+
+def seen_through(voxels: VoxelMap, witnesses: Witnesses, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
     """Which voxels (v,) are empty, by what the witnesses say of their centres.
 
     Only with poses that scan matching has made sharp: who stands half a metre off looks through walls. The ground is
@@ -49,8 +60,7 @@ def seen_through(
     high = np.flatnonzero(
         _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in settings.over_m])
     )
-    asked = motion.model_copy(update={"farthest_m": settings.farthest_m})
-    hits, throughs = testify(voxels.centres[high], witnesses, asked)
+    hits, throughs = testify(voxels.centres[high], witnesses, settings)
     empty = throughs >= settings.least_through
     empty &= throughs > settings.through_per_hit * hits
     empty &= voxels.hits[high] < settings.points_per_through * throughs

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.refinement.height_above_ground import REACH_M
+from gnss_sem_map.refinement.normals import flatness
+from gnss_sem_map.refinement.state import MapState, StepSettings
 
 
-class GeometrySettings(BaseModel):
+class GeometricPriorSettings(StepSettings):
     """At which heights over the ground, and on which surfaces, a class is unlikely."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     against_nat: float = Field(
         default=2.3, ge=0, description="What a broken rule counts against a class, nat."
@@ -38,11 +41,27 @@ class GeometrySettings(BaseModel):
     )
 
 
+def reach_m(settings: GeometricPriorSettings, voxel_size_m: float) -> float:
+    """The ground is made in blocks."""
+    return REACH_M
+
+
+def apply(state: MapState, settings: GeometricPriorSettings) -> MapState:
+    """Add log-likelihoods of height and flatness: those that a calibration found, or rules."""
+    voxels, model = state.voxels, state.beside.sensor_model
+    lie = flatness(voxels.keys, voxels.observed)
+    if model is None:
+        of_geometry = against(state.heights, lie, voxels.label_set, settings)
+    else:
+        of_geometry = model.of_geometry(state.heights, lie)
+    return replace(state, scores=state.scores + of_geometry)
+
+
 def against(
     heights: NDArray[np.float32],
     flatness: NDArray[np.float32],
     label_set: LabelSet,
-    settings: GeometrySettings,
+    settings: GeometricPriorSettings,
 ) -> NDArray[np.float32]:
     """What heights (v,) m over ground and flatness (v,) add to the log scores: (v, c), zero or negative, nat.
 

@@ -8,6 +8,8 @@ from scipy import ndimage
 
 CELL_M = 1.0
 BLOCK_M, MARGIN_M = 256.0, 32.0
+REACH_M = BLOCK_M + MARGIN_M
+"""Voxels farther away change nothing."""
 QUANTILE = 0.05
 """A cell's ground is this quantile of its heights: the lowest returns are often reflections from below."""
 OPENING_CELLS = 7

@@ -6,16 +6,25 @@ they stand on the right level all the same, and on the right side of where the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy.special import expit
 
 from gnss_sem_map.labels.label_set import UNLABELLED
-from gnss_sem_map.refinement.levels import StepSettings
-from gnss_sem_map.refinement.road_sidewalk import ROAD, around, meeting, on_ways, ways
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.refinement.road_sidewalk import (
+    ROAD,
+    RoadEdgeSettings,
+    around,
+    heights_of,
+    meeting,
+    on_ways,
+    ways,
+)
+from gnss_sem_map.refinement.state import MapState
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State
 
 REACH = 3
 """Levels of road and sidewalk are those within so many voxels to each side of a kerb."""
@@ -23,11 +32,19 @@ SUREST = 0.98
 """No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
 
 
+class KerbSettings(RoadEdgeSettings):
+    """How sharply the heights of points tell road from sidewalk."""
+
+    point_stddev_m: float = Field(
+        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Kerbs:
     """The e voxels of a map where road and sidewalk meet at a step, in order."""
 
-    settings: StepSettings
+    settings: KerbSettings
     voxel_size_m: float
     classes: tuple[int, int]
     """Road and sidewalk."""
@@ -74,8 +91,23 @@ class Kerbs:
         return np.asarray(step * (turning - z) / self.settings.point_stddev_m**2)
 
 
+def reach_m(settings: KerbSettings, voxel_size_m: float) -> float:
+    """A kerb is found among its neighbours, and its levels in the voxels near it."""
+    return (REACH + 2) * voxel_size_m
+
+
+def apply(state: MapState, settings: KerbSettings) -> MapState:
+    """Find the voxels whose points are classified one by one in `labels/`; the map marks them as SPLIT."""
+    assert state.decided is not None
+    kerbs = find_kerbs(state.decided, heights_of(state), settings)
+    if kerbs is None:
+        return state
+    states = np.where(kerbs.rows >= 0, np.uint8(State.SPLIT), state.decided.states)
+    return replace(state, kerbs=kerbs, decided=replace(state.decided, states=states))
+
+
 def find_kerbs(
-    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: StepSettings
+    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: KerbSettings
 ) -> Kerbs | None:
     """Where road and sidewalk of a map meet at a step, and how high both lie; None where they never do.
 

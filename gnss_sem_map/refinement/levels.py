@@ -12,11 +12,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.special import entr, expit, logit
 
 from gnss_sem_map.labels.label_set import UNLABELLED
-from gnss_sem_map.refinement.road_sidewalk import ROAD, SIDEWALK, around, meeting, on_ways, ways
+from gnss_sem_map.refinement.road_sidewalk import (
+    ROAD,
+    SIDEWALK,
+    RoadEdgeSettings,
+    around,
+    heights_of,
+    meeting,
+    on_ways,
+    ways,
+)
+from gnss_sem_map.refinement.state import MapState
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of
 
 CELL_M = 2.0
@@ -33,35 +43,30 @@ X, Y, ON_SIDEWALK, Z = 1, 2, 3, 4
 """Of the terms of a fit; the first is one."""
 
 
-class StepSettings(BaseModel):
-    """How high the step from road to sidewalk is, and how sharply it is measured."""
+class LevelSettings(RoadEdgeSettings):
+    """How sharply the heights of voxels tell road from sidewalk."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    least_m: float = Field(
-        default=0.06,
-        gt=0,
-        description="What is lower is no step: the images are all that is known there.",
-    )
-    face_begins: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="Share of the step, from the road up, where what lies there is as likely the kerb's face, so"
-        " sidewalk.",
-    )
     voxel_stddev_m: float = Field(
         default=0.03,
         gt=0,
         description="Surfaces of voxels lie at least so far over or under the plane that they belong to, m.",
     )
-    point_stddev_m: float = Field(
-        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
-    )
 
 
-def tell_levels(
-    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: StepSettings
+def reach_m(settings: LevelSettings, voxel_size_m: float) -> float:
+    """In every round of the fit a class hears planes, and a plane the classes of its surroundings."""
+    return (ROUNDS + 1) * (REACH[0] + 1) * CELL_M
+
+
+def apply(state: MapState, settings: LevelSettings) -> MapState:
+    """Height as evidence between road and sidewalk; see `split_levels`."""
+    assert state.decided is not None
+    heights = heights_of(state)
+    return replace(state, decided=split_levels(state.decided, heights, settings))
+
+
+def split_levels(
+    semantic_map: SemanticMap, heights: NDArray[np.float64], settings: LevelSettings
 ) -> SemanticMap:
     """The map with road and sidewalk told apart by height as well, where the two lie on clearly two levels.
 
@@ -156,13 +161,13 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
     return _Planes(z0, np.asarray(slopes), variance)
 
 
-def _are_two(planes: _Planes, settings: StepSettings) -> NDArray[np.bool_]:
+def _are_two(planes: _Planes, settings: LevelSettings) -> NDArray[np.bool_]:
     """Around which cells (k,) the planes are clearly two."""
     step, stddev = planes.slopes[:, 2], np.sqrt(_variance(planes, settings))
     return (step >= settings.least_m) & (step >= CLEARLY_TWO * stddev)
 
 
-def _log_odds(planes: _Planes, ground: _Ground, settings: StepSettings) -> NDArray[np.float64]:
+def _log_odds(planes: _Planes, ground: _Ground, settings: LevelSettings) -> NDArray[np.float64]:
     """What height says for the sidewalk (g,): the planes are two normal distributions; 0 where it is silent."""
     of_road = planes.z0[ground.cell] + (planes.slopes[ground.cell, :2] * ground.p[:, :2]).sum(axis=1)
     step = np.maximum(planes.slopes[ground.cell, 2], settings.least_m)  # no lower one is believed in
@@ -171,7 +176,7 @@ def _log_odds(planes: _Planes, ground: _Ground, settings: StepSettings) -> NDArr
     return np.where((up > -1) & (up < 2), odds, 0.0)  # what lies a whole step off both is neither
 
 
-def _variance(planes: _Planes, settings: StepSettings) -> NDArray[np.float64]:
+def _variance(planes: _Planes, settings: LevelSettings) -> NDArray[np.float64]:
     return np.maximum(planes.variance, settings.voxel_stddev_m**2)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import softmax
 
@@ -24,10 +27,8 @@ HALF_STENCIL = np.array(
 """Key offsets of 13 of the 26 neighbours; the others see the pair from their side."""
 
 
-class SmoothingSettings(BaseModel):
+class PottsSettings(StepSettings):
     """How much the neighbours of a voxel have to say."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     temper: float = Field(
         default=0.5,
@@ -41,12 +42,20 @@ class SmoothingSettings(BaseModel):
     iterations: int = Field(default=5, ge=1, le=100, description="Mean-field updates, all voxels at once.")
 
 
+def reach_m(settings: PottsSettings, voxel_size_m: float) -> float:
+    """One voxel per iteration."""
+    return settings.iterations * voxel_size_m
+
+
+def apply(state: MapState, settings: PottsSettings) -> MapState:
+    """Neighbours as evidence for each other; see `mean_field`."""
+    voxels = state.voxels
+    return replace(state, scores=mean_field(voxels.keys, state.scores, voxels.observed, settings))
+
+
 def mean_field(
-    keys: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    observed: NDArray[np.bool_],
-    settings: SmoothingSettings,
-) -> NDArray[np.float32]:
+    keys: NDArray[np.int64], scores: Scores, observed: NDArray[np.bool_], settings: PottsSettings
+) -> Scores:
     """Log probabilities (v, c) in which every voxel has heard its 26 neighbours.
 
     `keys` (v,) sorted packed voxels, `scores` (v, c) log scores; what no camera `observed` (v,) has no say and stays as
@@ -60,38 +69,15 @@ def mean_field(
     q = softmax(own)
     for _ in range(settings.iterations):
         heard = np.zeros_like(q)
-        _hear(keys[seen], q, HALF_STENCIL, heard)
+        sum_of_neighbours(keys[seen], q, HALF_STENCIL, heard)
         q = softmax(own + np.float32(settings.coupling_nat) * heard)
     result = scores.copy()
     result[seen] = np.log(np.maximum(q, LEAST_PROBABILITY))
     return result
 
 
-def infer(
-    keys: NDArray[np.int64],
-    scores: NDArray[np.float32],
-    observed: NDArray[np.bool_],
-    settings: SmoothingSettings,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Log scores (v, c) in which voxels without an observation repeat what their 26 neighbours say, and which (v,) do.
-
-    Each of the `iterations` reaches one voxel farther; a voxel hears observed ones first and only then inferred ones.
-    """
-    scores, known = scores.copy(), observed.copy()
-    for _ in range(settings.iterations):
-        q = np.where(known[:, None], softmax(scores), np.float32(0))
-        heard = np.zeros_like(q)
-        _hear(keys, q, HALF_STENCIL, heard)
-        reached = ~known & heard.any(axis=1)
-        if not reached.any():
-            break
-        scores[reached] = np.float32(settings.coupling_nat) * heard[reached]
-        known |= reached
-    return scores, known & ~observed
-
-
 @njit(cache=True, nogil=True)
-def _hear(keys, q, stencil, heard):
+def sum_of_neighbours(keys, q, stencil, heard):
     """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""
     for offset in stencil:
         j = 0

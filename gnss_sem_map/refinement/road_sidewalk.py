@@ -7,14 +7,33 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 ROAD, SIDEWALK = 0, 1
 """Which of the two `ways` is which."""
+
+
+class RoadEdgeSettings(StepSettings):
+    """How high the step from road to sidewalk is."""
+
+    least_m: float = Field(
+        default=0.06,
+        gt=0,
+        description="What is lower is no step: the images are all that is known there.",
+    )
+    face_begins: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="Share of the step, from the road up, where what lies there is as likely the kerb's face, so"
+        " sidewalk.",
+    )
 
 
 def ways(label_set: LabelSet) -> tuple[int, int] | None:
@@ -30,6 +49,16 @@ def on_ways(semantic_map: SemanticMap) -> NDArray[np.bool_]:
     if classes is None or not all((shown == one).any() for one in classes):
         return np.zeros(len(shown), np.bool_)
     return np.isin(shown, classes)
+
+
+def heights_of(state: MapState) -> NDArray[np.float64]:
+    """Mean height of the points in every voxel (v,) m, NaN where unknown. Raises NotApplicable."""
+    heights = state.beside.surface_heights
+    if heights is None:
+        raise NotApplicable("heights of surfaces were not measured")
+    if state.decided is None or not on_ways(state.decided).any():
+        raise NotApplicable("the map has no road, or no sidewalk")
+    return heights.of(state.decided.voxels)
 
 
 def around(

@@ -2,11 +2,48 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
+
+from gnss_sem_map.refinement.potts_mrf import PottsSettings, mean_field
+from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings
 
 MOST = 0.5
 """A map that is wrong more often than right cannot tell."""
+NEIGHBOURS = PottsSettings()
+
+
+class SystematicErrorSettings(StepSettings):
+    """How often images err in all views alike."""
+
+    rate: float | None = Field(
+        default=None,
+        ge=0,
+        le=0.5,
+        description="Share of observations that are wrong in all views alike, so that looking again makes no voxel"
+        " surer; default: estimated from the map itself, by how often geometry and neighbours overrule the images.",
+    )
+
+
+def reach_m(settings: SystematicErrorSettings, voxel_size_m: float) -> float:
+    """One figure for the whole map."""
+    return WHOLE_MAP
+
+
+def apply(state: MapState, settings: SystematicErrorSettings) -> MapState:
+    """What is set, or what geometry and neighbours, each for itself, say of the images."""
+    if settings.rate is not None:
+        return replace(state, systematic_error=settings.rate)
+    voxels, seen = state.voxels, state.voxels.observed
+    with_neighbours = mean_field(voxels.keys, state.images, seen, NEIGHBOURS)
+    called, by_geometry, by_neighbours = (
+        scores[seen].argmax(axis=1) for scores in (state.images, state.scores, with_neighbours)
+    )
+    first, second = by_geometry != called, by_neighbours != called
+    return replace(state, systematic_error=systematic_errors(first, second, state.observations[seen]))
 
 
 def systematic_errors(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial import cKDTree
 
 from gnss_sem_map.dynamics.motion_state import Motion
+from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, NotApplicable, StepSettings, classes_of
 from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
 from gnss_sem_map.voxels.voxel_map import pack, unpack
 
@@ -17,11 +19,12 @@ COLUMN = np.array([1, 1, 0], np.int32)
 """Times a voxel, its column."""
 
 
-class VehicleSettings(BaseModel):
+class VehicleSettings(StepSettings):
     """What a vehicle looks like in the map."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+    method: Literal["evidence", "paper"] = Field(
+        default="evidence", description="Support by road object by object, or eq. 12 and 13 of the paper."
+    )
     eps_m: float = Field(
         default=0.5, gt=0, le=3, description="Voxels of one vehicle are at most this far apart, m (DBSCAN)."
     )
@@ -47,6 +50,26 @@ class VehicleSettings(BaseModel):
     longest_parked_m: float = Field(
         default=6.0, gt=0, description="Mode `paper`: a group this long moved, m (eta_L of eq. 13)."
     )
+
+
+def reach_m(settings: VehicleSettings, voxel_size_m: float) -> float:
+    """A group of voxels is judged whole, however long it is."""
+    return WHOLE_MAP
+
+
+def apply(state: MapState, settings: VehicleSettings) -> MapState:
+    """Which voxels are vehicles, and, with `method: paper`, which of those moved (section 3.3.2)."""
+    voxels, labels = state.voxels, state.labels
+    vehicle, road = classes_of(voxels.label_set, "vehicle", "road")
+    if settings.method == "paper":
+        found = paper(voxels.indices, labels, vehicle, road, settings, voxels.voxel_size_m)
+        return replace(state, removed=state.removed | found.moving | found.rejected, vehicles=found.objects)
+    if not (labels == road).any():  # nothing is known of any vehicle: a camera that looks aside sees no road
+        raise NotApplicable("the map has no road to stand on")
+    found = supported(voxels.indices, labels, state.heights, vehicle, road, settings, voxels.voxel_size_m)
+    scores = state.scores.copy()
+    scores[found.rejected, vehicle] -= np.float32(settings.rejected_nat)
+    return replace(state, scores=scores, vehicles=found.objects)
 
 
 @dataclass(frozen=True, eq=False)

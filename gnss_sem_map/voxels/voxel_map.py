@@ -65,6 +65,8 @@ class State(IntEnum):
     """Refinement changed the label that the images gave."""
     REMOVED = 4
     """Part of something that moved: kept as a layer, not shown in the map."""
+    SPLIT = 5
+    """Road meets sidewalk here: its points are classified one by one in `labels/`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,212 @@
+"""A finished run is an object: look at its map, refine it again, label it anew, export it, without starting over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import DriveFormat, open_drive
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.export import run_folder
+from gnss_sem_map.export.formats import FORMATS, Exported, Format
+from gnss_sem_map.files.output_folder import refuse_inputs
+from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.files.run_json import inputs_of, read_run
+from gnss_sem_map.files.untrusted import is_folder, shown
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
+from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.voxel_map import SemanticMap
+
+
+def run(
+    drive: Path | str,
+    out: Path | str,
+    segmenter: str = "none",
+    settings: Settings | None = None,
+    *,
+    frames: str | None = None,
+    drive_format: DriveFormat | None = None,
+    device: str = "auto",
+    workers: int = 1,
+    resume: bool = False,
+    write_labels: bool = False,
+    force: bool = False,
+    progress: Progress = silent,
+) -> Run:
+    """Map one drive into a run folder, as `gnss-sem-map run` does.
+
+    `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only; `frames` is `A:B`. Raises
+    PreflightError where the drive looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
+    """
+    drive, out, settings = Path(drive), Path(out), settings or Settings()
+    place = segmenter.partition(":")[2].partition("?")[0] or None
+    classes = settings.classes if Path(settings.classes).suffix else None
+    with run_folder.claimed_run(out, [drive, place, settings.calibration, classes]) as claim:
+        log = open_drive(drive, drive_format).between(frames)
+        refuse_inputs(claim.out, sorted(log.folders))
+        network = None
+        if segmenter != "none":
+            label_set = open_label_set(settings.classes)
+            network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
+        result = pipeline.run(
+            log, network, settings, progress,
+            work=claim.work, resume=resume, workers=workers, labels_from=segmenter, force=force,
+        )  # fmt: skip
+        run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter, frames)
+    return Run(out)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The folder of a finished run; `Run.open(OUT)` checks that it is one."""
+
+    folder: Path
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Run:
+        """Raises DataError for a folder that holds no finished map."""
+        folder = Path(folder)
+        if "merged" in read_run(folder) or not is_folder(folder / "refined"):
+            raise DataError(
+                f"{shown(folder)}: found no map of one drive in it; expected the -o of `gnss-sem-map run`"
+            )
+        return cls(folder)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The content of run.json."""
+        return read_run(self.folder)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What the run was made with."""
+        return config.load(self.folder / "config.yaml")
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of the IMU in the map, with covariances."""
+        return Trajectory.load(self.folder / "trajectory.parquet")
+
+    @cached_property
+    def frame(self) -> LocalFrame | None:
+        """Where the map's origin is; None for a map in its drive's own poses."""
+        return tiles.read_frame(self.folder / "map")
+
+    @cached_property
+    def label_set(self) -> LabelSet:
+        """The classes of the map."""
+        return open_label_set(self.settings.classes)
+
+    def map(self, box: tuple[ArrayLike, ArrayLike] | None = None, *, refined: bool = True) -> SemanticMap:
+        """The map, or what of it lies in a box (low, high), each (3,) m: only its tiles are read."""
+        return tiles.read(self.folder / ("refined" if refined else "map"), self.label_set, box)
+
+    def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
+        """Refine the map again with other settings, in place or into `out`; no scan is matched, no network is asked.
+
+        Scans are read only where the run has point labels. Raises ConfigError where more than the refinement changes.
+        """
+        _check_same_map(self.settings, settings)
+        found, raw, account = evidence.read(self.folder, self.label_set), self.map(refined=False), Account()
+        with account.stage("refinement"):
+            state, report = pipeline.refine_map(raw.voxels - found.moved, found, settings)
+        assert state.decided is not None
+        result = pipeline.Result(
+            self.trajectory, None, raw, state.decided, report, account, found, kerbs=state.kerbs
+        )
+        log = self.drive() if is_folder(self.folder / "labels") else None
+        return self._written(out, result, settings, log, {})
+
+    def relabel(
+        self,
+        segmenter: str,
+        out: Path | str | None = None,
+        *,
+        device: str = "auto",
+        progress: Progress = silent,
+    ) -> Run:
+        """Map the drive again along the same trajectory with the labels of another segmenter."""
+        log, settings = self.drive(), self.settings
+        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
+        is_sharp = bool(self.about.get("from_lidar_odometry"))
+        drive = Drive(log, self.trajectory, network, settings, matched=is_sharp)
+        result = pipeline.map_drive(drive, Account(), progress, labels_from=segmenter)
+        inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
+        with_labels = log if is_folder(self.folder / "labels") else None
+        return self._written(out, result, settings, with_labels, {"inputs": inputs})
+
+    def export(self, formats: Iterable[str], to: Path | str | None = None) -> list[Path]:
+        """Write the map in formats (`laz`, `ply`, ...; see `export.formats`), into the run or the folder `to`."""
+        known = {each.name: each for each in FORMATS}
+        chosen = list(formats)
+        if unknown := [name for name in chosen if name not in known]:
+            raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
+        exported = Exported(self.map(), self.frame, self._driven, str(self.about["name"]))
+        if to is None:
+            return [self._amended(known[name], exported) for name in chosen]
+        files = [Path(to) / known[name].file for name in chosen]
+        if there := [file for file in files if file.exists()]:
+            raise DataError(f"{shown(there[0])}: exists; move it away or choose another folder")
+        Path(to).mkdir(parents=True, exist_ok=True)
+        for name, file in zip(chosen, files, strict=True):
+            known[name].write(exported, file)
+        return files
+
+    def _amended(self, format_: Format, exported: Exported) -> Path:
+        with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+            file = Path(folder) / format_.file
+            format_.write(exported, file)
+            amend(self.folder, format_.file, file.read_bytes())
+        return self.folder / format_.file
+
+    def drive(self) -> SensorLog:
+        """The log that the run was made of; raises DataError where it is no longer there."""
+        inputs = inputs_of(self.folder)
+        if "drive" not in inputs:
+            raise DataError(f"{shown(self.folder)}: its run.json names no drive")
+        log = open_drive(Path(inputs["drive"])).between(inputs.get("frames"))
+        return log.in_our_conventions(self.settings.sensors)
+
+    @property
+    def _driven(self) -> Trajectory:
+        first, last = self.about["scans_s"]
+        return run_folder.between(self.trajectory, first, last)
+
+    def _written(
+        self,
+        out: Path | str | None,
+        result: pipeline.Result,
+        settings: Settings,
+        log: SensorLog | None,
+        changed: dict[str, Any],
+    ) -> Run:
+        place = self.folder if out is None else Path(out)
+        tracked = self.about["map"]["refinement"] if not result.refinement.tracked else None
+        run_folder.write_again(place, self.folder, result, settings, log, changed, tracked)
+        return Run(place)
+
+
+def _check_same_map(before: Settings, after: Settings) -> None:
+    """Raise ConfigError where more than the refinement differs."""
+    same = after.model_copy(update={"refinement": before.refinement})
+    if same == before:
+        return
+    differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
+    raise ConfigError(
+        f"refine: {', '.join(differ)} differ from those of the run, and only refinement may; run the drive again"
+    )

@@ -1,0 +1,121 @@
+"""What a run knows beside its map, kept with it: so a finished run is refined again without its scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.archives import Archive, open_archive
+from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.refinement.surface_heights import SurfaceHeights
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
+
+FOLDER = "evidence"
+MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (
+    "moved",
+    "moving_points.npz",
+    "keyframes.npz",
+    "surface_heights.npz",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RunEvidence:
+    """The part of a run that its tiles do not hold."""
+
+    moved: VoxelMap
+    """The points of moving objects, which are not in the map that is refined."""
+    moving: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)
+    """Frame number -> places of those points among the scan's usable ones."""
+    keyframes: Witnesses | None = None
+    """Scans that say which space is free; None where poses do not come from LiDAR odometry."""
+    surface_heights: SurfaceHeights | None = None
+    """None where no step asked for them."""
+
+
+def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
+    """Write the folder `evidence/` of a run folder."""
+    folder = run / FOLDER
+    folder.mkdir()
+    tiles.write(SemanticMap.of(evidence.moved), folder / MOVED, frame)
+    frames = sorted(evidence.moving)
+    places = [evidence.moving[number] for number in frames]
+    np.savez_compressed(
+        folder / MOVING_POINTS,
+        frames=np.array(frames, np.int64),
+        counts=np.array([len(some) for some in places], np.int64),
+        places=np.concatenate([*places, np.empty(0, np.int64)]).astype(np.int32),
+    )
+    if evidence.keyframes is not None:
+        scans = evidence.keyframes
+        np.savez_compressed(folder / KEYFRAMES, images=scans.images, T_lidar_map=scans.T_lidar_map)
+    if evidence.surface_heights is not None:
+        heights = evidence.surface_heights
+        np.savez_compressed(folder / HEIGHTS, keys=heights.keys, sums=heights.sums, counts=heights.counts)
+
+
+def read(run: Path, label_set: LabelSet) -> RunEvidence:
+    """Read it again; raises DataError where something is missing or damaged."""
+    folder = run / FOLDER
+    if not is_file(folder / MOVING_POINTS):
+        raise DataError(
+            f"{shown(run)}: found no {FOLDER}/ in it, which a run keeps to be refined again; make the run again"
+        )
+    return RunEvidence(
+        tiles.read(folder / MOVED, label_set).voxels,
+        _moving_points(folder / MOVING_POINTS),
+        _keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
+        _heights(folder / HEIGHTS) if is_file(folder / HEIGHTS) else None,
+    )
+
+
+def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
+    with open_archive(path) as archive:
+        frames, counts, places = (
+            _array(archive, path, name, "iu", 1) for name in ("frames", "counts", "places")
+        )
+    if len(frames) != len(counts) or (counts < 0).any() or counts.sum() != len(places):
+        raise DataError(
+            f"{shown(path)}: found counts that do not fit its {len(places)} points; make the run again"
+        )
+    parts = np.split(places.astype(np.int64), np.cumsum(counts)[:-1]) if len(frames) else []
+    return dict(zip(frames.tolist(), parts, strict=True))
+
+
+def _keyframes(path: Path) -> Witnesses:
+    with open_archive(path) as archive:
+        images, T = _array(archive, path, "images", "u", 3), _array(archive, path, "T_lidar_map", "f", 3)
+    if (
+        len(images) != len(T)
+        or T.shape[1:] != (4, 4)
+        or images.dtype != np.uint16
+        or not np.isfinite(T).all()
+    ):
+        raise DataError(f"{shown(path)}: found {len(images)} images and {T.shape} poses; make the run again")
+    return Witnesses(images, T.astype(np.float64))
+
+
+def _heights(path: Path) -> SurfaceHeights:
+    with open_archive(path) as archive:
+        keys, counts = (_array(archive, path, name, "i", 1) for name in ("keys", "counts"))
+        sums = _array(archive, path, "sums", "f", 1)
+    if not len(keys) == len(sums) == len(counts) or (np.diff(keys) <= 0).any() or (counts < 1).any():
+        raise DataError(f"{shown(path)}: found voxels out of order, or without points; make the run again")
+    return SurfaceHeights(keys.astype(np.int64), sums.astype(np.float64), counts.astype(np.int64))
+
+
+def _array(archive: Archive, path: Path, name: str, kinds: str, dimensions: int) -> NDArray[Any]:
+    found = archive.array(name).read()
+    if found.dtype.kind not in kinds or found.ndim != dimensions:
+        raise DataError(f"{shown(path)}: {name} is {found.dtype} {found.shape}; make the run again")
+    return found

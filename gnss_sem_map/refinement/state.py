@@ -1,0 +1,124 @@
+"""What goes through the refinement, step by step: the map, the evidence beside it, and what is decided so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.labels.sensor_model import LabelCalibration
+from gnss_sem_map.refinement.height_above_ground import height_over_ground
+from gnss_sem_map.refinement.surface_heights import SurfaceHeights
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
+from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
+
+if TYPE_CHECKING:
+    from gnss_sem_map.refinement.kerbs import Kerbs
+    from gnss_sem_map.refinement.vehicles import VehicleObject
+
+Scores = NDArray[np.float32]
+"""(v, c) log scores; their softmax is the class distribution."""
+
+NAT_PER_LOOK = 1.3
+"""Between a look that says nothing (1) and one that is sure (1.6 for five classes and a floor of 5 %)."""
+WHOLE_MAP = float("inf")
+"""The reach of a step that reads the whole map."""
+
+
+class StepSettings(BaseModel):
+    """What the settings of every step have."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    enabled: bool = Field(default=True, description="Whether this step is done.")
+
+
+class NotApplicable(Exception):
+    """A step has nothing to work on in this map; its message says what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known beside the map itself; None for what is not."""
+
+    moved: VoxelMap | None = None
+    """The points of moving objects, which were kept out of the map."""
+    sensor_model: LabelCalibration | None = None
+    """Where the classes were found to stand, in place of rules, and a temperature."""
+    keyframes: Witnesses | None = None
+    """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
+    surface_heights: SurfaceHeights | None = None
+    """How high the surface in a voxel lies, finer than the voxel."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapState:
+    """A map between two steps of the refinement."""
+
+    voxels: VoxelMap
+    beside: Evidence
+    images: Scores
+    """What the images alone say."""
+    scores: Scores
+    """What everything so far says."""
+    removed: NDArray[np.bool_]
+    """(v,) part of something that moved."""
+    inferred: NDArray[np.bool_]
+    """(v,) labelled from its surroundings: no camera saw it."""
+    systematic_error: float = 0.0
+    """Share of observations that are wrong in all views alike."""
+    vehicles: tuple[VehicleObject, ...] = ()
+    """Groups of vehicle voxels, and what was decided about each."""
+    kerbs: Kerbs | None = None
+    """Voxels whose points are classified one by one."""
+    decided: SemanticMap | None = None
+    """The map with its decisions, once they are made; later steps change those."""
+
+    @classmethod
+    def of(cls, voxels: VoxelMap, beside: Evidence) -> MapState:
+        """The state before the first step: eq. 6, every observation counted in full."""
+        scores = voxels.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
+        nothing = np.zeros(len(voxels), np.bool_)
+        return cls(voxels, beside, scores, scores, nothing, nothing)
+
+    @property
+    def labels(self) -> NDArray[np.int8]:
+        """The class of every voxel (v,), -1 where nothing is known."""
+        if self.decided is not None:
+            return self.decided.labels
+        known = self.voxels.observed | self.inferred
+        return np.where(known, self.scores.argmax(axis=1), UNLABELLED).astype(np.int8)
+
+    @property
+    def is_removed(self) -> NDArray[np.bool_]:
+        """Which voxels (v,) are part of something that moved."""
+        return self.removed if self.decided is None else self.decided.states == State.REMOVED
+
+    @cached_property
+    def heights(self) -> NDArray[np.float32]:
+        """Height of every voxel over the ground (v,) m."""
+        return height_over_ground(self.voxels.centres)
+
+    @cached_property
+    def observations(self) -> NDArray[np.float32]:
+        """How often every voxel was observed (v,), about, and at least once.
+
+        A row does not say (hits count the points of scans that no image shows, too), but every observation lowers the
+        sum over the c classes by at least c ln c, and by little more than half as much again.
+        """
+        count = len(self.voxels.label_set.names)
+        nats = -self.voxels.evidence.sum(axis=1, dtype=np.float32) / np.float32(UNITS_PER_NAT)
+        return np.asarray(np.maximum(nats / np.float32(NAT_PER_LOOK * count * np.log(count)), 1), np.float32)
+
+
+def classes_of(label_set: LabelSet, *names: str) -> tuple[int, ...]:
+    """The classes of these names; raises NotApplicable where the set lacks one."""
+    if missing := [name for name in names if name not in label_set.names]:
+        raise NotApplicable(f"the class set has no {missing[0]}")
+    return tuple(label_set.index(name) for name in names)

@@ -1,0 +1,54 @@
+"""Voxels that no camera saw, labelled from their neighbours and marked as inferred."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gnss_sem_map.refinement.potts_mrf import HALF_STENCIL, sum_of_neighbours
+from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
+from gnss_sem_map.voxels.voxel_map import softmax
+
+
+class UnobservedSettings(StepSettings):
+    """How far labels spread to what no camera saw."""
+
+    enabled: bool = Field(default=False, description="Whether this step is done.")
+    coupling_nat: float = Field(
+        default=0.3, ge=0, description="What a neighbour that is sure of a class says for it, nat."
+    )
+    iterations: int = Field(default=5, ge=1, le=100, description="Each reaches one voxel farther.")
+
+
+def reach_m(settings: UnobservedSettings, voxel_size_m: float) -> float:
+    """One voxel per iteration."""
+    return settings.iterations * voxel_size_m
+
+
+def apply(state: MapState, settings: UnobservedSettings) -> MapState:
+    """Repeat what the 26 neighbours say, observed ones first."""
+    scores, inferred = infer(state.voxels.keys, state.scores, state.voxels.observed, settings)
+    return replace(state, scores=scores, inferred=inferred)
+
+
+def infer(
+    keys: NDArray[np.int64], scores: Scores, observed: NDArray[np.bool_], settings: UnobservedSettings
+) -> tuple[Scores, NDArray[np.bool_]]:
+    """Log scores (v, c) in which voxels without an observation repeat what their 26 neighbours say, and which (v,) do.
+
+    A voxel hears observed ones first and only then inferred ones.
+    """
+    scores, known = scores.copy(), observed.copy()
+    for _ in range(settings.iterations):
+        q = np.where(known[:, None], softmax(scores), np.float32(0))
+        heard = np.zeros_like(q)
+        sum_of_neighbours(keys, q, HALF_STENCIL, heard)
+        reached = ~known & heard.any(axis=1)
+        if not reached.any():
+            break
+        scores[reached] = np.float32(settings.coupling_nat) * heard[reached]
+        known |= reached
+    return scores, known & ~observed

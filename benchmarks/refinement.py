@@ -36,9 +36,10 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
 from gnss_sem_map.mapping.moving_points import find_moving
-from gnss_sem_map.pipeline import solve
-from gnss_sem_map.refinement import RefinementSettings, refine
+from gnss_sem_map.pipeline import estimate_trajectory
 from gnss_sem_map.refinement.count_grid import count_grid
+from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.run_stats import Account
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.dbscan import dbscan
@@ -54,8 +55,14 @@ PARTS = ["kernels", "raw", "semantics", "simulated"]
 Figures = dict[str, Any]
 REPEATS = 7
 Points = Mapping[int, NDArray[np.int64]]
-PAPER = RefinementSettings(
-    vehicles="paper", building_vegetation="paper", geometry="off", smoothing="off", count_exponent=1.0
+PAPER = RefinementSettings.model_validate(
+    {
+        "vehicles": {"method": "paper"},
+        "count_grid": {"method": "paper"},
+        "geometric_prior": {"enabled": False},
+        "potts_mrf": {"enabled": False},
+        "discount": {"exponent": 1.0},
+    }
 )
 
 
@@ -183,7 +190,7 @@ def by_the_paper(drive: Drive) -> Points:
 def removed_in_all(drive: Drive, found: MovingObjects) -> Points:
     """The points of what moved and, as in a run, those in voxels that witnesses look through."""
     maps = build_maps(replace(drive, moving=found.points), Account())
-    refined, _ = refine(maps.static, witnesses=found.witnesses if drive.matched else None)
+    refined, _ = refine(maps.static, beside=Evidence(keyframes=found.witnesses if drive.matched else None))
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last
     points = {}
     for seen in seen_scans(replace(drive, segmenter=None)):
@@ -217,9 +224,9 @@ def on_raw_drive(data: Path) -> Figures:
     )
     figures: Figures = {}
     for name, trajectory in (
-        (AS_IT_RUNS, solve(log, Settings(), Account())[-1].trajectory),
+        (AS_IT_RUNS, estimate_trajectory(log, Settings(), Account())[0]),
         ("the unit's own poses", log.reference),
-        ("GNSS and IMU alone", solve(log, alone, Account())[-1].trajectory),
+        ("GNSS and IMU alone", estimate_trajectory(log, alone, Account())[0]),
     ):
         drive = Drive(log, trajectory, segmenter, Settings(), matched=name == AS_IT_RUNS)
         found, cost = timed_find_moving(drive)
@@ -239,7 +246,7 @@ def perfectly_seen(folder: Path) -> Drive:
     """A simulated drive with the poses that a run finds, and perfect class images."""
     log = open_drive(folder)
     segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
-    return Drive(log, solve(log, Settings(), Account())[-1].trajectory, segmenter, Settings(), matched=True)
+    return Drive(log, estimate_trajectory(log, Settings(), Account())[0], segmenter, Settings(), matched=True)
 
 
 def on_simulated_drive(folder: Path) -> Figures:
@@ -320,7 +327,7 @@ def strict_counts(
     raw = maps.static + maps.removed
     stages = {
         "fused (eq. 6)": SemanticMap.of(raw),
-        "refined": refine(maps.static, removed=maps.removed)[0],
+        "refined": refine(maps.static, beside=Evidence(moved=maps.removed))[0],
         "paper": refine(raw, PAPER)[0],
     }
     counts = {

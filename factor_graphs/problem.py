@@ -133,7 +133,7 @@ def pose_problem(
     if intervals.blind.any():
         silent = np.diff(intervals.keyframes)[intervals.blind].sum()
         notes.append(f"the IMU is silent for {silent:.2f} s: bridged as an unseen vehicle")
-    noise = noise_as_sampled(imu, settings.imu_noise)
+    noise = noise_as_sampled(imu, settings.imu_noise or ImuNoise())
     guess = first_guess(intervals, kept, p_imu_antenna, attitude)
     unknown = np.array([*[settings.start_tilt_stddev_rad] * 2, settings.start_heading_stddev_rad])
     attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown)

@@ -10,7 +10,10 @@ class SmootherSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    imu_noise: ImuNoise = Field(ImuNoise(), description="What the IMU's data sheet promises.")
+    imu_noise: ImuNoise | None = Field(
+        None,
+        description="What the IMU's data sheet promises; default: what the log says, or a consumer unit's.",
+    )
     inflate_imu_noise: bool = Field(
         True, description="Multiply the IMU noise until the residuals fit their standard deviations."
     )

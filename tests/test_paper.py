@@ -22,8 +22,8 @@ def test_the_paper_s_settings_do_what_the_paper_does_and_no_more(small_drive: St
     result = pipeline.run(log, segmenter, settings)
     assert "scans matched" not in result.account.counts
     assert set(result.sharpness) == {"map"}  # nothing to compare with: GNSS and IMU alone made the map
-    assert result.moving is None  # the paper looks for what moved in the map, not beside it
-    assert settings.refinement.smoothing == "off"
+    assert not result.evidence.moving  # the paper looks for what moved in the map, not beside it
+    assert not settings.refinement.potts_mrf.enabled
     known = result.refined.labels[result.refined.labels >= 0]
     assert len(known) > 1000
     assert len(np.unique(known)) > 2

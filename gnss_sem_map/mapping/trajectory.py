@@ -77,7 +77,7 @@ def smooth_log(
     if log.imu is None or log.gnss is None or log.frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")
     smoother = settings
-    if log.imu_noise is not None and "imu_noise" not in settings.model_fields_set:
+    if settings.imu_noise is None:
         smoother = settings.model_copy(update={"imu_noise": log.imu_noise})
     lever = log.calibration.p_imu_antenna
     return smooth(log.imu, log.gnss, log.frame, smoother, lever, log.initial_attitude, relative_poses)

@@ -232,6 +232,17 @@ class SemanticMap:
     def __len__(self) -> int:
         return len(self.voxels)
 
+    def __getitem__(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> SemanticMap:
+        """The voxels where a boolean mask holds, or those at increasing places."""
+        return SemanticMap(
+            self.voxels[chosen],
+            self.labels[chosen],
+            self.confidence[chosen],
+            self.states[chosen],
+            None if self.entropy is None else self.entropy[chosen],
+            None if self.hits_removed is None else self.hits_removed[chosen],
+        )
+
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
         """(v,) voxels with a label that belong to the map: all but the removed ones."""

@@ -23,12 +23,12 @@ def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     assert (settings.mapping.voxel_size_m, settings.mapping.farthest_m) == (0.25, 60)
 
 
-def test_off_is_a_word_and_true_a_truth_value(tmp_path: Path) -> None:
-    settings = config.load(overrides=["refinement.vehicles=off", "trajectory.robust=false"])
-    assert settings.refinement.vehicles == "off"
+def test_off_and_false_switch_off(tmp_path: Path) -> None:
+    settings = config.load(overrides=["refinement.vehicles.enabled=off", "trajectory.robust=false"])
+    assert settings.refinement.vehicles.enabled is False
     assert settings.trajectory.robust is False
-    (tmp_path / "config.yaml").write_text("refinement: {vehicles: off}\n")
-    assert config.load(tmp_path / "config.yaml").refinement.vehicles == "off"
+    (tmp_path / "config.yaml").write_text("refinement: {vehicles: {enabled: off}}\n")
+    assert config.load(tmp_path / "config.yaml").refinement.vehicles.enabled is False
 
 
 def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     if sample.diagnosis is not None:
         yield _clock(sample.diagnosis)
     smoother: SmootherSettings = sample.settings.trajectory
-    if log.imu_noise is not None and "imu_noise" not in smoother.model_fields_set:
+    if smoother.imu_noise is None:
         smoother = smoother.model_copy(update={"imu_noise": log.imu_noise})
     lever = log.calibration.p_imu_antenna
     yield from check_lever_arm(lever, sample.diagnosis, found.usable, log.frame, smoother)

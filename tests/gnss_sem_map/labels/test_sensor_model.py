@@ -11,6 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from gnss_sem_map.config import Settings, load
 from gnss_sem_map.errors import ConfigError
@@ -25,6 +26,8 @@ from gnss_sem_map.labels.sensor_model import (
     read,
 )
 from gnss_sem_map.refinement.normals import flatness
+from gnss_sem_map.refinement.potts_mrf import PottsSettings
+from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels.voxel_map import pack
 
 URBAN = open_label_set()
@@ -169,16 +172,24 @@ def test_flatness_is_that_of_the_covariance_of_the_occupied_neighbours() -> None
             np.testing.assert_allclose(found[i], np.abs(axes[2, 0]), atol=1e-5)
 
 
-def test_eq_6_to_the_letter_is_one_setting_that_others_beside_it_overrule() -> None:
+def test_eq_6_alone_is_one_setting_and_what_contradicts_it_is_refused() -> None:
     paper = load(None, ["fusion=paper"])
     assert paper.labelling.probability_floor == 0.01
-    assert paper.refinement.count_exponent == paper.refinement.confidence_temperature == 1
-    assert paper.refinement.systematic_errors == 0
-    assert paper.refinement.geometry == paper.refinement.smoothing == "off"
+    assert paper.refinement.discount.exponent == paper.refinement.decision.temperature == 1
+    assert paper.refinement.systematic_error.rate == 0
+    assert not paper.refinement.geometric_prior.enabled
+    assert not paper.refinement.potts_mrf.enabled
     assert paper.refinement.vehicles == Settings().refinement.vehicles
-    both = load(None, ["refinement.smoothing=mean_field", "fusion=paper", "labelling.abstain=true"])
-    assert both.refinement.smoothing == "mean_field"
-    assert both.refinement.geometry == "off"
+    both = load(None, ["refinement.count_grid.method=paper", "fusion=paper", "labelling.abstain=true"])
+    assert both.refinement.count_grid.method == "paper"
+    assert not both.refinement.geometric_prior.enabled
     assert both.labelling.abstain
     assert both.labelling.probability_floor == 0.01
     assert Settings.model_validate(yaml.safe_load(paper.to_yaml())) == paper
+    said = r"fusion: paper sets refinement\.potts_mrf\.enabled to False, found True"
+    with pytest.raises(ConfigError, match=said):
+        load(None, ["refinement.potts_mrf.enabled=true", "fusion=paper"])
+    from_python = RefinementSettings(potts_mrf=PottsSettings(enabled=True))
+    with pytest.raises(ValidationError, match=said):
+        Settings(fusion="paper", refinement=from_python)
+    assert Settings(fusion="paper", refinement=RefinementSettings()) == paper

@@ -193,20 +193,22 @@ def test_tiles_come_from_the_chunks_one_by_one(
 MAP = """
 import sys
 from pathlib import Path
-from gnss_sem_map import labels, mapping
-from gnss_sem_map.account import Account
+from gnss_sem_map.mapping import fusion
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.config import Settings
-from gnss_sem_map.io import open_drive
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.segmentation import open_segmenter
 
 if __name__ == "__main__":
     drive, probabilities, work = map(Path, sys.argv[1:])
     log = open_drive(drive)
-    segmenter = open_segmenter(f"labels:{probabilities}", labels.label_set(), expected_size=log.calibration.image_size)
-    job = mapping.Drive(log, log.reference, segmenter, Settings(mapping={"scans_per_chunk": 1}))
-    mapping.fuse_scans(job, log.scans[:1], Account())  # compiled code is loaded: the kills fall into the mapping
+    segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
+    job = Drive(log, log.reference, segmenter, Settings(mapping={"scans_per_chunk": 1}))
+    fusion.fuse_scans(job, log.scans[:1], Account())  # compiled code is loaded: the kills fall into the mapping
     print("ready", flush=True)
-    mapping.map_chunks(job, work, Account(), resume=True)
+    fusion.map_chunks(job, work, Account(), resume=True)
     print("done", flush=True)
 """
 
@@ -404,11 +406,12 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from gnss_sem_map.errors import DataError
 from test_tiles import random_map, FRAME
-from gnss_sem_map import chunks, tiles
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.mapping import checkpoints
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.labels.label_set import open_label_set
 
 folder, written = Path(sys.argv[2]), random_map(count=200_000)
-store = chunks.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
+store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),
@@ -424,7 +427,7 @@ for attempt in (
 def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     """No file may grow beyond 20 kB, as if the disk were full there."""
     done = subprocess.run(
-        [sys.executable, "-c", FILL, str(Path(__file__).parent), str(tmp_path)],
+        [sys.executable, "-c", FILL, str(Path(__file__).parents[1] / "voxels"), str(tmp_path)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     first, second = done.stdout.splitlines()

@@ -12,8 +12,11 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.merging import into_frame, lay_onto, merge, merge_runs
-from gnss_sem_map.refinement import refine
+from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.refinement.steps import refine
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
 
@@ -55,21 +58,21 @@ def test_one_frame_is_added_exactly() -> None:
 
 
 def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
-    """Folders as a run writes them: `map` is everything, `refined` says what of it moved."""
+    """Folders as a run writes them: `map` is everything, `evidence` says what of it moved."""
     for name, frame, seed in (("a", HERE, 0), ("b", THERE, 1)):
         voxels = street(frame, seed)
         moved = voxels.labels == URBAN.index("building")
-        refined, _ = refine(voxels[~moved], removed=voxels[moved])
+        refined, _ = refine(voxels[~moved], beside=Evidence(moved=voxels[moved]))
         assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
         tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
-        tiles.write(refined, tmp_path / name / "refined", frame)
+        evidence.write(RunEvidence(voxels[moved]), tmp_path / name, frame)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    stands, removed = runs.stands, runs.removed
+    stands, removed = runs.stands, runs.evidence.moved
     assert runs.frame == HERE
     assert stands.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
     assert URBAN.index("building") not in stands.labels
-    again, _ = refine(stands, removed=removed)
+    again, _ = refine(stands, beside=Evidence(moved=removed))
     assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
         stands.places(removed.keys) < 0
     )
@@ -78,13 +81,11 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
 def test_merged_runs_keep_what_moved_through_standing_voxels_apart(tmp_path: Path) -> None:
     """Twice the same run: twice the evidence of what stands, and twice that of what moved, in the voxels of both."""
     stands, moved = street(HERE, 0), street(HERE, 1)
-    refined, _ = refine(stands, removed=moved)
-    assert refined.hits_removed is not None
     for name in ("a", "b"):
         tiles.write(SemanticMap.of(stands + moved), tmp_path / name / "map", HERE)
-        tiles.write(refined, tmp_path / name / "refined", HERE)
+        evidence.write(RunEvidence(moved), tmp_path / name, HERE)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    for found, once in ((runs.stands, stands), (runs.removed, moved)):
+    for found, once in ((runs.stands, stands), (runs.evidence.moved, moved)):
         np.testing.assert_array_equal(found.keys, once.keys)
         np.testing.assert_array_equal(found.hits, 2 * once.hits)
         np.testing.assert_array_equal(found.evidence, 2 * once.evidence)
@@ -92,7 +93,7 @@ def test_merged_runs_keep_what_moved_through_standing_voxels_apart(tmp_path: Pat
 
 def test_maps_of_different_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
     tiles.write(SemanticMap.of(street(HERE, 0)), tmp_path / "a" / "map", HERE)
-    tiles.write(SemanticMap.of(street(HERE, 1)), tmp_path / "a" / "refined", HERE)
+    evidence.write(RunEvidence(street(HERE, 1)), tmp_path / "a", HERE)
     with pytest.raises(DataError, match="not of one run"):
         merge_runs(tmp_path / "a", tmp_path / "a")
 

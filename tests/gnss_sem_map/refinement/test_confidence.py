@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement import RefinementSettings, refine
+from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.voxels.voxel_map import State, VoxelMap, entropy_of, pack
 
 URBAN = open_label_set("urban")
@@ -25,8 +25,8 @@ def random_map(seed, unseen=0.2):
 @given(seed=st.integers(0, 2**32 - 1), cooler=st.floats(0.2, 5), warmer=st.floats(1.01, 4))
 def test_the_temperature_changes_no_label_and_a_higher_one_makes_no_voxel_surer(seed, cooler, warmer):
     voxels = random_map(seed)
-    a, _ = refine(voxels, RefinementSettings(confidence_temperature=cooler))
-    b, _ = refine(voxels, RefinementSettings(confidence_temperature=cooler * warmer))
+    a, _ = refine(voxels, RefinementSettings(decision={"temperature": cooler}))
+    b, _ = refine(voxels, RefinementSettings(decision={"temperature": cooler * warmer}))
     np.testing.assert_array_equal(a.labels, b.labels)
     np.testing.assert_array_equal(a.states, b.states)
     assert (b.confidence <= a.confidence + 1e-6).all()
@@ -45,20 +45,20 @@ def test_unseen_voxels_know_nothing_unless_asked_to_infer():
     assert unseen.sum() > 100
     assert (refined.labels[unseen] == -1).all()
     np.testing.assert_allclose(refined.entropy[unseen], np.log(5), rtol=1e-6)
-    assert {step.name: step.skipped for step in report.steps}["inferred"] == "switched off"
+    assert {step.name: step.skipped for step in report.steps}["unobserved"] == "switched off"
 
 
 def test_inferred_voxels_are_marked_and_leave_observed_ones_as_they_were():
     voxels = random_map(4)
     plain, _ = refine(voxels)
-    refined, report = refine(voxels, RefinementSettings(infer_unobserved=True))
+    refined, report = refine(voxels, RefinementSettings(unobserved={"enabled": True}))
     seen, inferred = voxels.observed, refined.states == State.INFERRED
     np.testing.assert_array_equal(refined.labels[seen], plain.labels[seen])
     np.testing.assert_array_equal(refined.confidence[seen], plain.confidence[seen])
     assert inferred.sum() > 100
     assert (refined.labels[inferred] >= 0).all()
     assert not (inferred & seen).any()
-    assert {step.name: step.changed for step in report.steps}["inferred"] == inferred.sum()
+    assert {step.name: step.changed for step in report.steps}["unobserved"] == inferred.sum()
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
@@ -70,7 +70,9 @@ def test_labels_spread_one_voxel_per_pass_and_no_farther(iterations):
     evidence[0, BUILDING] = -1
     voxels = VoxelMap(0.2, URBAN, keys, evidence, np.ones(13, np.uint32))
     asked = RefinementSettings(
-        infer_unobserved=True, neighbours={"iterations": iterations}, geometry="off", vehicles="off"
+        unobserved={"enabled": True, "iterations": iterations},
+        geometric_prior={"enabled": False},
+        vehicles={"enabled": False},
     )
     refined, _ = refine(voxels, asked)
     expected = [BUILDING] * (1 + iterations) + [-1] * (12 - iterations)

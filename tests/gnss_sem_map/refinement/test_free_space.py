@@ -10,8 +10,9 @@ from gnss_sem_map.dynamics import range_images, visibility
 from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.dynamics.visibility import PLACES_AT_ONCE, AlongTheDrive, Witnesses
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement import RefinementSettings, refine
-from gnss_sem_map.refinement.free_space import ClearingSettings, seen_through
+from gnss_sem_map.refinement.free_space import FreeSpaceSettings, seen_through
+from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.voxels.voxel_map import State, VoxelMap, VoxelTable, keys_of
 
 URBAN, MOTION = open_label_set(), MotionSettings()
@@ -58,9 +59,9 @@ def street_map(*more: NDArray[np.float64]) -> VoxelMap:
     return table.to_map()
 
 
-def cleared(voxels: VoxelMap, settings: ClearingSettings | None = None) -> NDArray[np.bool_]:
+def cleared(voxels: VoxelMap, settings: FreeSpaceSettings | None = None) -> NDArray[np.bool_]:
     witnesses = Witnesses.of([witness(x) for x in STREET])
-    return seen_through(voxels, witnesses, settings or ClearingSettings(), MOTION)
+    return seen_through(voxels, witnesses, settings or FreeSpaceSettings())
 
 
 def test_a_trail_is_cleared_and_what_stands_stays() -> None:
@@ -79,8 +80,8 @@ def test_what_was_hit_often_stays_whoever_looks_through() -> None:
 
 def test_too_few_witnesses_clear_nothing() -> None:
     voxels = street_map(GHOST)
-    assert not cleared(voxels, ClearingSettings(least_through=len(STREET) + 1)).any()
-    assert not cleared(voxels, ClearingSettings(over_m=(1.6, 3.0))).any()
+    assert not cleared(voxels, FreeSpaceSettings(least_through=len(STREET) + 1)).any()
+    assert not cleared(voxels, FreeSpaceSettings(over_m=(1.6, 3.0))).any()
 
 
 @pytest.mark.parametrize("reach_m", [10.0, 40.0])
@@ -107,13 +108,13 @@ def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
     voxels = street_map(GHOST)
     ghost = np.isin(voxels.keys, keys_of(GHOST, 0.2))
     witnesses = Witnesses.of([witness(x) for x in STREET])
-    refined, report = refine(voxels, witnesses=witnesses)
+    refined, report = refine(voxels, beside=Evidence(keyframes=witnesses))
     np.testing.assert_array_equal(refined.states == State.REMOVED, ghost)
-    assert {step.name: step.changed for step in report.steps}["seen through"] == ghost.sum()
-    for settings, asked in ((RefinementSettings(clearing="off"), witnesses), (None, None)):
-        refined, report = refine(voxels, settings, witnesses=asked)
+    assert {step.name: step.changed for step in report.steps}["free_space"] == ghost.sum()
+    for settings, asked in ((RefinementSettings(free_space={"enabled": False}), witnesses), (None, None)):
+        refined, report = refine(voxels, settings, Evidence(keyframes=asked))
         assert not (refined.states == State.REMOVED).any()
-        assert next(step for step in report.steps if step.name == "seen through").skipped
+        assert next(step for step in report.steps if step.name == "free_space").skipped
 
 
 def test_witnesses_are_a_metre_or_a_second_apart() -> None:

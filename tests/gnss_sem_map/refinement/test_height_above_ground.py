@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.geometric_prior import GeometrySettings, against
+from gnss_sem_map.refinement.geometric_prior import GeometricPriorSettings, against
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 
 URBAN = open_label_set("urban")
@@ -52,7 +52,7 @@ def test_no_voxels_have_no_heights():
 
 
 def test_each_rule_counts_against_its_class_alone():
-    settings = GeometrySettings(against_nat=2.0)
+    settings = GeometricPriorSettings(against_nat=2.0)
     road, sidewalk, vehicle, building, vegetation = range(5)
     unknown, level, steep = np.nan, 1.0, 0.5
     for height, lie, expected in (

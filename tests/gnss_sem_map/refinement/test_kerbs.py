@@ -18,8 +18,7 @@ from gnss_sem_map.datasets.label_files import read_labels
 from gnss_sem_map.evaluation.metrics import Tables, confusion
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.point_labels import PointLabels, label_points
-from gnss_sem_map.refinement.kerbs import Kerbs, find_kerbs
-from gnss_sem_map.refinement.levels import StepSettings
+from gnss_sem_map.refinement.kerbs import Kerbs, KerbSettings, find_kerbs
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
@@ -45,8 +44,8 @@ class Scene:
     def heights(self) -> NDArray[np.float64]:
         return np.bincount(self.places, self.p_map[:, 2]) / np.bincount(self.places)
 
-    def kerbs(self, settings: StepSettings | None = None) -> Kerbs:
-        found = find_kerbs(self.semantic_map, self.heights, settings or StepSettings())
+    def kerbs(self, settings: KerbSettings | None = None) -> Kerbs:
+        found = find_kerbs(self.semantic_map, self.heights, settings or KerbSettings())
         assert found is not None
         return found
 
@@ -90,9 +89,9 @@ def test_points_of_a_kerb_are_told_apart_better_than_any_labels_of_voxels_could(
 
 def test_a_line_on_level_ground_is_no_kerb_and_the_voxels_stand() -> None:
     flat = scene(step_m=0.0)
-    assert find_kerbs(flat.semantic_map, flat.heights, StepSettings()) is None
+    assert find_kerbs(flat.semantic_map, flat.heights, KerbSettings()) is None
     sunk = scene(step_m=-0.12)  # a sidewalk below the road is none that these heights know
-    assert find_kerbs(sunk.semantic_map, sunk.heights, StepSettings()) is None
+    assert find_kerbs(sunk.semantic_map, sunk.heights, KerbSettings()) is None
 
 
 def test_where_no_two_meet_there_is_no_kerb() -> None:
@@ -101,14 +100,14 @@ def test_where_no_two_meet_there_is_no_kerb() -> None:
     removed = np.full_like(street.semantic_map.states, State.REMOVED)
     beside_a_wall = np.where(street.semantic_map.labels == SIDEWALK, BUILDING, ROAD).astype(np.int8)
     for other in ({"labels": one}, {"states": removed}, {"labels": beside_a_wall}):
-        assert find_kerbs(replace(street.semantic_map, **other), street.heights, StepSettings()) is None
+        assert find_kerbs(replace(street.semantic_map, **other), street.heights, KerbSettings()) is None
 
 
 def test_the_odds_are_those_of_scipy() -> None:
     """Place: a bilinear interpolation of probabilities between voxel centres; height: two normal distributions."""
     low, confidence, stddev = 0.04, 0.9, 0.08
     street = scene(low_m=low, confidence=confidence, heading=0.0)
-    settings = StepSettings(point_stddev_m=stddev, face_begins=0.5)
+    settings = KerbSettings(point_stddev_m=stddev, face_begins=0.5)
     inside, chosen, probability = street.kerbs(settings).decide(street.places, street.p_map)
     x, y = (np.arange(n) * SIZE_M for n in (50, 20))
     grid = np.where(street.semantic_map.labels.reshape(50, 20) == ROAD, confidence, 1 - confidence)
@@ -154,8 +153,10 @@ def told(street: Path) -> Told:
     result = pipeline.run(log, segmenter, config.Settings())
     maps = (result.raw, result.refined)
     found = {
-        "on": label_points(log, result.trajectory, maps, config.Settings(), result.moving, result.kerbs),
-        "off": label_points(log, result.trajectory, maps, config.Settings(), result.moving),
+        "on": label_points(
+            log, result.trajectory, maps, config.Settings(), result.evidence.moving, result.kerbs
+        ),
+        "off": label_points(log, result.trajectory, maps, config.Settings(), result.evidence.moving),
     }
     return {name: {scan.name: both for scan, both in scans} for name, scans in found.items()}
 

@@ -11,8 +11,10 @@ from scipy.stats import norm
 from sklearn.linear_model import LinearRegression
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement import RefinementSettings, levels, tell_ways
-from gnss_sem_map.refinement.levels import StepSettings, tell_levels
+from gnss_sem_map.refinement import kerbs, levels
+from gnss_sem_map.refinement.levels import LevelSettings, split_levels
+from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable
+from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
 
 URBAN = open_label_set()
@@ -59,7 +61,7 @@ def with_mistakes(p: Floats, truth: Labels) -> Labels:
 def mistakes(p: Floats, truth: Labels, called: Labels) -> tuple[int, int]:
     """Of the voxels before and after."""
     before, heights, place = mapped(p, called)
-    after = tell_levels(before, heights, StepSettings())
+    after = split_levels(before, heights, LevelSettings())
     return int((before.labels[place] != truth).sum()), int((after.labels[place] != truth).sum())
 
 
@@ -77,9 +79,9 @@ def test_where_the_map_s_origin_lies_changes_nothing(offset_m: tuple[float, floa
     p, truth = street()
     called = with_mistakes(p, truth)
     semantic_map, heights, _ = mapped(p + offset_m, called)
-    told = tell_levels(semantic_map, heights, StepSettings())
+    told = split_levels(semantic_map, heights, LevelSettings())
     known, known_heights, _ = mapped(p, called)
-    expected = tell_levels(known, known_heights, StepSettings())
+    expected = split_levels(known, known_heights, LevelSettings())
     np.testing.assert_array_equal(told.labels, expected.labels)
     np.testing.assert_allclose(told.confidence, expected.confidence, atol=1e-3)
 
@@ -92,7 +94,7 @@ def test_where_the_map_s_origin_lies_changes_nothing(offset_m: tuple[float, floa
 def test_where_there_are_not_clearly_two_levels_the_map_stands(step_m: float, roughness_m: float) -> None:
     p, truth = street(step_m, roughness_m)
     before, heights, _ = mapped(p, with_mistakes(p, truth))
-    after = tell_levels(before, heights, StepSettings())
+    after = split_levels(before, heights, LevelSettings())
     np.testing.assert_array_equal(after.labels, before.labels)
     np.testing.assert_array_equal(after.confidence, before.confidence)
 
@@ -114,7 +116,7 @@ def test_only_shown_road_and_sidewalk_of_known_height_are_told() -> None:
     states = np.where(kind == 1, State.REMOVED, before.states).astype(np.uint8)
     heights = np.where(kind == 2, np.nan, heights)
     before = replace(before, labels=called, states=states, entropy=np.full(len(before), 0.5, np.float32))
-    after = tell_levels(before, heights, StepSettings())
+    after = split_levels(before, heights, LevelSettings())
     assert before.entropy is not None
     assert after.entropy is not None
     for name in ("labels", "states", "confidence", "entropy"):
@@ -140,7 +142,7 @@ def test_the_planes_are_those_of_scikit_learn_and_the_odds_those_of_scipy() -> N
     left_over = p[:, 2] - oracle.predict(terms)
     np.testing.assert_allclose(planes.variance, (left_over**2).sum() / (900 - 4), rtol=1e-5)
 
-    settings = StepSettings(voxel_stddev_m=0.04, face_begins=0.5)
+    settings = LevelSettings(voxel_stddev_m=0.04, face_begins=0.5)
     log_odds = levels._log_odds(planes, ground, settings)
     road = oracle.predict(np.column_stack([p[:, :2], np.zeros(900)]))
     expected = norm.logpdf(p[:, 2], road + oracle.coef_[2], 0.04) - norm.logpdf(p[:, 2], road, 0.04)
@@ -156,7 +158,7 @@ def test_confidence_keeps_its_word(step_m: float) -> None:
     wrong = np.random.default_rng(2).random((30, 18))[column, row] < 0.1
     called = np.where(wrong, ROAD + SIDEWALK - truth, truth).astype(np.int8)
     before, heights, place = mapped(p, called, confidence=0.9)
-    after = tell_levels(before, heights, StepSettings(face_begins=0.5))
+    after = split_levels(before, heights, LevelSettings(face_begins=0.5))
     is_right = np.empty(len(after), np.bool_)
     is_right[place] = after.labels[place] == truth
     told = after.confidence != before.confidence
@@ -170,7 +172,7 @@ def test_what_lies_a_whole_step_off_both_levels_stays_what_it_was() -> None:
     ramp = np.abs(p[:, 0] - 15) < 1
     p[ramp, 2] += 0.5
     before, heights, place = mapped(p, truth, confidence=0.4)
-    after = tell_levels(before, heights, StepSettings())
+    after = split_levels(before, heights, LevelSettings())
     np.testing.assert_array_equal(after.labels[place[ramp]], before.labels[place[ramp]])
     np.testing.assert_array_equal(after.confidence[place[ramp]], before.confidence[place[ramp]])
 
@@ -182,40 +184,47 @@ def test_states_say_where_a_label_comes_from() -> None:
     called = of_images.labels.copy()
     called[place] = wrong
     states = np.where(called == of_images.labels, State.OBSERVED, State.REFINED).astype(np.uint8)
-    after = tell_levels(replace(of_images, labels=called, states=states), heights, StepSettings())
+    after = split_levels(replace(of_images, labels=called, states=states), heights, LevelSettings())
     differ = after.labels != called
     assert differ.sum() > 250
     expected = np.where(after.labels == of_images.labels, State.OBSERVED, State.REFINED)
     np.testing.assert_array_equal(after.states, expected)
     inferred = replace(of_images, labels=called, states=np.full_like(states, State.INFERRED))
-    assert (tell_levels(inferred, heights, StepSettings()).states == State.INFERRED).all()
+    assert (split_levels(inferred, heights, LevelSettings()).states == State.INFERRED).all()
 
 
-@pytest.mark.parametrize(
-    ("told", "kerbs"), [("evidence", "evidence"), ("evidence", "off"), ("off", "evidence")]
-)
-def test_each_use_of_heights_has_its_switch(told: str, kerbs: str) -> None:
+def state_of(semantic_map: SemanticMap, heights: Floats) -> MapState:
+    """The map as the steps before left it."""
+    known = np.isfinite(heights)
+    keys, counts = semantic_map.voxels.keys[known], np.ones(known.sum(), np.int64)
+    beside = Evidence(surface_heights=SurfaceHeights(keys, heights[known], counts))
+    return replace(MapState.of(semantic_map.voxels, beside), decided=semantic_map)
+
+
+def test_steps_change_the_decision_and_mark_where_points_are_told_apart() -> None:
     p, truth = street()
     before, heights, _ = mapped(p, with_mistakes(p, truth))
-    settings = RefinementSettings.model_validate({"levels": told, "kerbs": kerbs})
-    after, found, step = tell_ways(before, settings, lambda _, wanted: np.where(wanted, heights, np.nan))
-    assert (step.changed > 0) == (told == "evidence") == (not step.skipped)
-    assert step.changed == (after.labels != before.labels).sum()
-    assert (found is not None) == (kerbs == "evidence")
+    state = state_of(before, heights)
+    after = levels.apply(state, LevelSettings())
+    assert after.decided is not None
+    assert (after.decided.labels != before.labels).sum() > 100
+    found = kerbs.apply(after, kerbs.KerbSettings())
+    assert found.kerbs is not None
+    assert found.decided is not None
+    np.testing.assert_array_equal(found.decided.states == State.SPLIT, found.kerbs.rows >= 0)
+    for name in ("labels", "confidence"):
+        np.testing.assert_array_equal(getattr(found.decided, name), getattr(after.decided, name))
 
 
-def test_nothing_is_measured_where_nothing_is_to_be_told() -> None:
-    def never(semantic_map: SemanticMap, wanted: Bools) -> Floats:
-        raise AssertionError("scans were read for nothing")
-
+def test_maps_without_road_sidewalk_or_heights_are_left_as_they_are() -> None:
     p, truth = street()
-    whole, _, _ = mapped(p, truth)
-    off = RefinementSettings(levels="off", kerbs="off")
-    assert tell_ways(whole, off, never)[0] is whole
+    whole, heights, _ = mapped(p, truth)
     only_road = replace(whole, labels=np.full_like(whole.labels, ROAD))
     removed = replace(whole, states=np.full_like(whole.states, State.REMOVED))
     for one in (only_road, removed):
-        same, found, step = tell_ways(one, RefinementSettings(), never)
-        assert same is one
-        assert found is None
-        assert step.skipped == "the map has no road, or no sidewalk"
+        for step, settings in ((levels, LevelSettings()), (kerbs, kerbs.KerbSettings())):
+            with pytest.raises(NotApplicable, match="no road, or no sidewalk"):
+                step.apply(state_of(one, heights), settings)
+    unmeasured = replace(MapState.of(whole.voxels, Evidence()), decided=whole)
+    with pytest.raises(NotApplicable, match="not measured"):
+        levels.apply(unmeasured, LevelSettings())

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnss_sem_map.refinement.potts_mrf import SmoothingSettings, mean_field
+from gnss_sem_map.refinement.potts_mrf import PottsSettings, mean_field
 from gnss_sem_map.voxels.voxel_map import pack
 
 
@@ -48,7 +48,7 @@ def test_every_voxel_hears_its_26_neighbours_and_no_other(seed, temper, coupling
     indices = np.unique(rng.integers(-3, 3, (80, 3)), axis=0)
     scores = rng.normal(0, 3, (len(indices), 4)).astype(np.float32)
     observed = rng.random(len(indices)) < 0.8
-    numbers = SmoothingSettings(temper=temper, coupling_nat=coupling, iterations=iterations)
+    numbers = PottsSettings(temper=temper, coupling_nat=coupling, iterations=iterations)
     refined = mean_field(pack(indices), scores, observed, numbers)
     for i, q in by_hand(indices, scores, observed, numbers).items():
         np.testing.assert_allclose(np.exp(refined[i]), q, atol=1e-4)
@@ -59,12 +59,12 @@ def test_a_lone_wrong_voxel_in_a_wall_gives_in_and_a_sure_one_does_not():
     wall = np.array([(x, 0, z) for x in range(9) for z in range(9)])
     scores = np.tile(np.array([0.0, -4.0], np.float32), (81, 1))
     scores[40] = -2.0, 0.0
-    assert (mean_field(pack(wall), scores, np.ones(81, bool), SmoothingSettings()).argmax(1) == 0).all()
+    assert (mean_field(pack(wall), scores, np.ones(81, bool), PottsSettings()).argmax(1) == 0).all()
     scores[40] = -20.0, 0.0
-    assert mean_field(pack(wall), scores, np.ones(81, bool), SmoothingSettings())[40].argmax() == 1
+    assert mean_field(pack(wall), scores, np.ones(81, bool), PottsSettings())[40].argmax() == 1
 
 
 def test_a_map_that_no_camera_saw_stays_as_it_is():
     scores = np.zeros((2, 3), np.float32)
     keys = pack(np.array([(0, 0, 0), (0, 0, 1)]))
-    assert mean_field(keys, scores, np.zeros(2, bool), SmoothingSettings()) is scores
+    assert mean_field(keys, scores, np.zeros(2, bool), PottsSettings()) is scores

@@ -6,9 +6,12 @@ from pydantic import ValidationError
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement import RefinementSettings, refine, with_removed
+from gnss_sem_map.refinement.removed_layer import with_removed
+from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, pack
 
+OFF = {"enabled": False}
 URBAN = open_label_set("urban")
 ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION = range(5)
 
@@ -54,7 +57,7 @@ def test_wrong_voxels_of_a_facade_become_building_and_the_report_counts_them():
     assert (refined.states[changed] == State.REFINED).all()
     assert (refined.states[~changed] == State.OBSERVED).all()
     assert sum(step.changed for step in report.steps) >= changed.sum() > 0
-    columns = {step.name: step for step in report.steps}["building and vegetation"]
+    columns = {step.name: step for step in report.steps}["count_grid"]
     assert columns.changes[("vegetation", "building")] > 100
 
 
@@ -63,7 +66,7 @@ def test_nothing_is_deleted_and_what_no_camera_saw_stays_unlabelled(mode):
     rng = np.random.default_rng(1)
     indices = np.unique(rng.integers(-20, 20, (3000, 3)), axis=0)
     voxels = voxel_map(indices, rng.integers(-1, 5, len(indices)))
-    refined, _ = refine(voxels, RefinementSettings(vehicles=mode, building_vegetation=mode))
+    refined, _ = refine(voxels, RefinementSettings(vehicles={"method": mode}, count_grid={"method": mode}))
     assert refined.voxels is voxels
     unseen = ~voxels.observed
     assert (refined.labels[unseen] == -1).all()
@@ -76,11 +79,12 @@ def test_nothing_is_deleted_and_what_no_camera_saw_stays_unlabelled(mode):
 def test_refinement_with_everything_off_is_the_map_as_fusion_left_it():
     voxels, _ = street(np.random.default_rng(2))
     off = RefinementSettings(
-        geometry="off",
-        building_vegetation="off",
-        vehicles="off",
-        smoothing="off",
-        count_exponent=1.0,
+        geometric_prior=OFF,
+        count_grid=OFF,
+        vehicles=OFF,
+        potts_mrf=OFF,
+        systematic_error=OFF,
+        discount={"exponent": 1.0},
     )
     refined, report = refine(voxels, off)
     plain = SemanticMap.of(voxels)
@@ -94,7 +98,9 @@ def test_refinement_with_everything_off_is_the_map_as_fusion_left_it():
 def test_the_papers_rule_removes_a_parked_car_that_stands_beside_the_road_and_evidence_keeps_it():
     voxels, truth = street(np.random.default_rng(3))
     cars = truth == VEHICLE
-    paper, report = refine(voxels, RefinementSettings(vehicles="paper", geometry="off", smoothing="off"))
+    paper, report = refine(
+        voxels, RefinementSettings(vehicles={"method": "paper"}, geometric_prior=OFF, potts_mrf=OFF)
+    )
     assert (paper.states[cars] == State.REMOVED).all()
     assert (paper.labels[cars] == VEHICLE).all()
     assert not paper.shown[cars].any()
@@ -109,10 +115,10 @@ def test_the_papers_rule_removes_a_parked_car_that_stands_beside_the_road_and_ev
 def test_without_any_road_evidence_keeps_the_cars_and_says_why():
     voxels, truth = street(np.random.default_rng(3))
     voxels, truth = voxels[truth != ROAD], truth[truth != ROAD]
-    evidence, report = refine(voxels, RefinementSettings(geometry="off"))
+    evidence, report = refine(voxels, RefinementSettings(geometric_prior=OFF))
     assert (evidence.labels[truth == VEHICLE] == VEHICLE).all()
     assert {step.name: step.skipped for step in report.steps}["vehicles"] == "the map has no road to stand on"
-    paper, _ = refine(voxels, RefinementSettings(vehicles="paper"))
+    paper, _ = refine(voxels, RefinementSettings(vehicles={"method": "paper"}))
     assert not paper.shown[truth == VEHICLE].any(), "eq. 12 asks for road in the column"
     assert evidence.shown.all()
 
@@ -120,9 +126,12 @@ def test_without_any_road_evidence_keeps_the_cars_and_says_why():
 def test_removed_voxels_come_back_as_a_layer_only_where_nothing_else_stands():
     static = voxel_map([(0, 0, 0), (1, 0, 0)], [ROAD, -1])
     moving = voxel_map([(1, 0, 0), (2, 0, 0), (3, 0, 0)], [VEHICLE, VEHICLE, -1])
-    off = RefinementSettings(geometry="off", smoothing="off")
-    refined, report = refine(static, off, removed=moving)
-    assert report.steps[-1].changes == {("vehicle", "removed"): 1, ("unlabelled", "removed"): 1}
+    off = RefinementSettings(geometric_prior=OFF, potts_mrf=OFF)
+    refined, report = refine(static, off, Evidence(moved=moving))
+    assert {step.name: step.changes for step in report.steps}["removed_layer"] == {
+        ("vehicle", "removed"): 1,
+        ("unlabelled", "removed"): 1,
+    }
     np.testing.assert_array_equal(refined.voxels.indices[:, 0], [0, 1, 2, 3])
     np.testing.assert_array_equal(refined.labels, [ROAD, -1, VEHICLE, VEHICLE])
     np.testing.assert_array_equal(
@@ -137,8 +146,8 @@ def test_removed_voxels_come_back_as_a_layer_only_where_nothing_else_stands():
 def test_what_moved_through_standing_voxels_is_counted_there_and_changes_nothing_else():
     static = voxel_map([(0, 0, 0), (1, 0, 0)], [ROAD, ROAD], hits=4)
     moving = voxel_map([(1, 0, 0), (2, 0, 0)], [VEHICLE, VEHICLE], hits=3)
-    off = RefinementSettings(geometry="off", smoothing="off")
-    refined, alone = refine(static, off, removed=moving)[0], refine(static, off)[0]
+    off = RefinementSettings(geometric_prior=OFF, potts_mrf=OFF)
+    refined, alone = refine(static, off, Evidence(moved=moving))[0], refine(static, off)[0]
     np.testing.assert_array_equal(refined.voxels.hits, [4, 7, 3])
     np.testing.assert_array_equal(refined.removed_hits, [0, 3, 3])
     np.testing.assert_array_equal(refined.standing.hits, static.hits)
@@ -148,9 +157,9 @@ def test_what_moved_through_standing_voxels_is_counted_there_and_changes_nothing
     np.testing.assert_array_equal((static + moving - refined.standing).evidence, moving.evidence)
 
 
-@pytest.mark.parametrize("mode", ["evidence", "paper", "off"])
+@pytest.mark.parametrize("mode", [{"method": "evidence"}, {"method": "paper"}, OFF])
 def test_empty_maps_and_maps_of_one_class_are_refined_without_error(mode):
-    settings = RefinementSettings(vehicles=mode, building_vegetation=mode)
+    settings = RefinementSettings(vehicles=mode, count_grid=mode)
     empty, _ = refine(VoxelTable(0.2, URBAN).to_map(), settings)
     assert len(empty) == 0
     grid = np.stack(np.meshgrid(range(8), range(8), range(8)), -1).reshape(-1, 3)
@@ -170,11 +179,11 @@ def test_a_class_set_without_buildings_skips_that_step_and_says_so(tmp_path):
     refined, report = refine(voxel_map(grid, [0, 1], names=open_label_set(file)))
     assert refined.labels.tolist() == [0, 1]
     skipped = {step.name: step.skipped for step in report.steps}
-    assert "lacks" in skipped["building and vegetation"]
-    assert "lacks" in skipped["vehicles"]
+    assert skipped["count_grid"] == "the class set has no building"
+    assert skipped["vehicles"] == "the class set has no vehicle"
 
 
 def test_an_unknown_setting_is_refused():
     with pytest.raises(ValidationError, match="vehicels"):
-        RefinementSettings.model_validate({"vehicels": "paper"})
-    assert RefinementSettings.model_validate({"vehicles": "paper"}).vehicles == "paper"
+        RefinementSettings.model_validate({"vehicels": OFF})
+    assert not RefinementSettings.model_validate({"vehicles": OFF}).vehicles.enabled

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement import RefinementSettings, refine
+from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.refinement.systematic_error import MOST, doubted, systematic_errors
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -69,7 +69,7 @@ def test_a_map_finds_its_systematic_errors_and_is_never_surer_than_they_allow():
     refined, report = refine(voxels)
     share = report.systematic_errors
     assert share == pytest.approx((called == BUILDING).mean(), rel=0.2)
-    certain, report = refine(voxels, RefinementSettings(systematic_errors=0.0))
+    certain, report = refine(voxels, RefinementSettings(systematic_error={"rate": 0.0}))
     assert report.systematic_errors == 0
     np.testing.assert_array_equal(refined.labels, certain.labels)
     np.testing.assert_allclose(refined.confidence, (1 - share) * certain.confidence + share / 5, rtol=1e-5)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from gnss_sem_map.refinement.vehicles import Motion, VehicleSettings, paper, supported
+from gnss_sem_map.dynamics.motion_state import Motion
+from gnss_sem_map.refinement.vehicles import VehicleSettings, paper, supported
 
 ROAD, VEHICLE, BUILDING = 0, 2, 3
 

@@ -1,0 +1,124 @@
+"""A finished run is an object: its map is read by box, refined again, labelled anew and exported."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from street import Street
+
+from gnss_sem_map import Run, Settings, run
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.refinement.steps import RefinementSettings
+
+MADE_ANEW = {"run.json", "report.html", ".gnss-sem-map.json"}
+"""They say how long it took."""
+
+
+@pytest.fixture(scope="module")
+def finished(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    out = tmp_path_factory.mktemp("finished") / "out"
+    return run(small_drive.drive, out, f"labels:{small_drive.labels}", write_labels=True, force=True)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name not in MADE_ANEW)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def with_refinement(settings: Settings, **sections: dict[str, object]) -> Settings:
+    changed = settings.refinement.model_dump() | {
+        name: settings.refinement.model_dump()[name] | values for name, values in sections.items()
+    }
+    return settings.model_copy(update={"refinement": RefinementSettings.model_validate(changed)})
+
+
+def test_refined_again_with_the_same_settings_it_is_the_same_to_the_byte(
+    finished: Run, tmp_path: Path
+) -> None:
+    again = Run.open(finished.folder).refine(finished.settings, tmp_path / "again")
+    assert files(again.folder) == files(finished.folder)
+    about, before = again.about, finished.about
+    assert about["map"] == before["map"]
+    assert about["inputs"] == before["inputs"]
+
+
+def test_refined_with_another_setting_it_is_what_a_run_with_that_setting_makes(
+    finished: Run, small_drive: Street, tmp_path: Path
+) -> None:
+    other = with_refinement(finished.settings, potts_mrf={"enabled": False}, kerbs={"enabled": False})
+    again = finished.refine(other, tmp_path / "again")
+    anew = run(
+        small_drive.drive,
+        tmp_path / "anew",
+        f"labels:{small_drive.labels}",
+        other,
+        write_labels=True,
+        force=True,
+    )
+    assert files(again.folder / "refined") == files(anew.folder / "refined")
+    assert files(again.folder / "labels") == files(anew.folder / "labels")
+    assert files(again.folder / "refined") != files(finished.folder / "refined")
+
+
+def test_refining_needs_no_drive_where_there_are_no_point_labels_and_works_in_place(
+    finished: Run, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    finished.refine(finished.settings, folder)
+    alone = Run.open(folder)
+    for name in ("labels", "labels_raw", "confidence", "removed"):
+        shutil.rmtree(folder / name)
+    other = with_refinement(alone.settings, count_grid={"enabled": False})
+    again = alone.refine(other)
+    assert again.folder == folder
+    assert again.settings == other
+    assert not (folder / "labels").exists()
+
+
+def test_what_is_more_than_refinement_is_refused(finished: Run) -> None:
+    other = finished.settings.model_copy(
+        update={"mapping": finished.settings.mapping.model_copy(update={"voxel_size_m": 0.4})}
+    )
+    with pytest.raises(ConfigError, match="mapping"):
+        finished.refine(other)
+
+
+def test_a_box_holds_what_lies_in_it(finished: Run) -> None:
+    whole = finished.map()
+    low, high = np.array([0.0, -3.0, -5.0]), np.array([8.0, 6.0, 5.0])
+    part = finished.map(box=(low, high))
+    inside = ((whole.voxels.centres >= low) & (whole.voxels.centres <= high)).all(axis=1)
+    assert 0 < inside.sum() < len(whole)
+    np.testing.assert_array_equal(part.voxels.keys, whole.voxels.keys[inside])
+    np.testing.assert_array_equal(whole[inside].labels, part.labels)
+
+
+def test_relabelled_it_is_what_a_run_with_those_labels_makes(
+    finished: Run, small_drive: Street, tmp_path: Path
+) -> None:
+    bare = run(small_drive.drive, tmp_path / "bare", write_labels=True, force=True)
+    again = bare.relabel(f"labels:{small_drive.labels}", tmp_path / "again")
+    for name in ("map", "refined", "labels", "removed", "evidence/moved"):
+        assert files(again.folder / name) == files(finished.folder / name), name
+    assert again.about["inputs"]["segmenter"] == finished.about["inputs"]["segmenter"]
+
+
+def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Run, tmp_path: Path) -> None:
+    [laz] = finished.export(["laz"], tmp_path / "files")
+    assert len(laspy.read(laz).points) == len(laspy.read(finished.folder / "map.laz").points)
+    with pytest.raises(DataError, match="exists"):
+        finished.export(["laz"], tmp_path / "files")
+    with pytest.raises(ConfigError, match="viewer"):
+        finished.export(["las"], tmp_path / "files")
+    before = (finished.folder / "map.ply").read_bytes()
+    [ply] = finished.export(["ply"])
+    assert ply.read_bytes() == before
+
+
+def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no run folder"):
+        Run.open(tmp_path)

@@ -4,3 +4,33 @@ Knows no map and no scans. Read in this order: `measurements` and `geodesy` (wha
 (the graph), `trajectory` (what comes out), `accuracy` (how good it is), `simulation` (exact truth to test
 against), `streaming` (fix by fix) and `kalman` (the baseline).
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from factor_graphs.csv_log import read_csv
+    from factor_graphs.geodesy import LocalFrame
+    from factor_graphs.measurements import GnssFixes, ImuSamples
+    from factor_graphs.smoothing import smooth
+    from factor_graphs.trajectory import Trajectory
+
+__all__ = ["GnssFixes", "ImuSamples", "LocalFrame", "Trajectory", "read_csv", "smooth"]
+
+_PLACES = {
+    "GnssFixes": "measurements",
+    "ImuSamples": "measurements",
+    "LocalFrame": "geodesy",
+    "Trajectory": "trajectory",
+    "read_csv": "csv_log",
+    "smooth": "smoothing",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # imported when first asked for: gtsam takes a third of a second
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

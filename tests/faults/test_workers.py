@@ -23,9 +23,9 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from faults.killing import street_drive
-from gnss_sem_map.account import Account
+from gnss_sem_map.run_stats import Account
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import build_maps
+from gnss_sem_map.mapping.fusion import build_maps
 
 try:
     build_maps(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), Account(), work=Path(sys.argv[4]), workers=2)

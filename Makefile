@@ -8,7 +8,7 @@ PYTEST := $(BIN)/pytest -n auto --dist loadfile
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 
-.PHONY: test test-slow test-faults check demo notebooks clean
+.PHONY: test test-unit test-slow test-faults check demo notebooks clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -23,6 +23,10 @@ $(TOOLS): $(PACKAGE)
 
 test: $(TOOLS)
 	$(PYTEST) -m 'not slow and not faults'
+
+# What every change should pass at once: no process is started, no drive simulated, no real data read.
+test-unit: $(TOOLS)
+	$(PYTEST) -m 'not slow and not faults and not integration'
 
 notebooks: $(TOOLS)
 	$(PYTEST) --nbmake --nbmake-timeout=600 examples

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -86,8 +87,8 @@ class Settings(BaseModel):
         return content
 
     def to_yaml(self) -> str:
-        """These settings as a file that `load` reads back."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        """These settings as a file that `load` reads back, each under its description."""
+        return "".join(f"{line}\n" for line in _described(self))
 
 
 def _plain(content: Any) -> Any:
@@ -117,6 +118,19 @@ def parse(
         return model.model_validate(content)
     except ValidationError as error:
         raise ConfigError(_explain(error, model, where)) from None
+
+
+def _described(section: BaseModel) -> Iterator[str]:
+    """The lines of a section: every setting under its description as a comment, inner sections indented."""
+    plain = section.model_dump(mode="json")
+    for name, field in type(section).model_fields.items():
+        yield from textwrap.wrap(field.description or "", 100, initial_indent="# ", subsequent_indent="# ")
+        value = getattr(section, name)
+        if isinstance(value, BaseModel):
+            yield f"{name}:"
+            yield from (f"  {line}" for line in _described(value))
+        else:
+            yield from yaml.safe_dump({name: plain[name]}, sort_keys=False).splitlines()
 
 
 def _read(file: Path) -> dict[str, Any]:

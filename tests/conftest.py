@@ -1,12 +1,72 @@
-"""What several tests share: the small street, and where the real data are."""
+"""What several tests share: the small street, where the real data are, and which tests make the unit tier."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+from collections.abc import Callable, Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 import street
+from declared import DATA, absent
+
+from gnss_sem_map.simulation import Simulation
+
+TESTS = Path(__file__).parent
+NOT_UNIT = ("integration", "slow", "faults")
+INTEGRATION_FILES = tuple(
+    TESTS / name
+    for name in (
+        "faults",
+        "gnss_sem_map/evaluation/preflight",
+        "gnss_sem_map/mapping/test_surface_heights.py",
+        "gnss_sem_map/scans/test_lidar_odometry.py",
+        "gnss_sem_map/segmentation/test_checkpoints.py",
+        "gnss_sem_map/segmentation/test_demo_network.py",
+        "gnss_sem_map/segmentation/test_huggingface.py",
+        "gnss_sem_map/segmentation/test_onnx_file.py",
+        "gnss_sem_map/segmentation/test_refinenet.py",
+        "gnss_sem_map/segmentation/test_training.py",
+        "gnss_sem_map/simulation/test_town.py",
+        "gnss_sem_map/test_run_again.py",
+    )
+)
+"""Tests of several stages, whole drives or networks; those of the command line stand in this folder itself."""
+INTEGRATION_FIXTURES = {"real_data", "browser", "simulation", "town_drive", "whole_drive"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is no unit test by where it stands and what it uses; single tests carry the mark themselves."""
+    lost = [str(path) for path in INTEGRATION_FILES if not path.exists()]
+    if lost:
+        raise pytest.UsageError(f"tests/conftest.py: found no {', '.join(lost)}; change INTEGRATION_FILES")
+    for item in items:
+        is_listed = item.path.parent == TESTS or any(map(item.path.is_relative_to, INTEGRATION_FILES))
+        if is_listed or INTEGRATION_FIXTURES.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.integration)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """A unit test, and what is set up for it, fails when it starts a process or simulates a drive."""
+    if any(map(item.get_closest_marker, NOT_UNIT)):
+        return (yield)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subprocess.Popen, "__init__", _refused("starts a process"))
+        patch.setattr(BaseProcess, "start", _refused("starts a process"))
+        patch.setattr(os, "fork", _refused("starts a process"))
+        patch.setattr(Simulation, "__init__", _refused("simulates a drive"))
+        return (yield)
+
+
+def _refused(what: str) -> Callable[..., NoReturn]:
+    def refuse(*_: object, **__: object) -> NoReturn:
+        pytest.fail(f"a unit test {what}; mark it as `integration`")
+
+    return refuse
 
 
 @pytest.fixture(scope="session")
@@ -18,7 +78,7 @@ def small_drive(tmp_path_factory: pytest.TempPathFactory) -> street.Street:
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The real KITTI excerpts; their licence keeps them out of this repository."""
-    folder = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = Path(os.environ.get(DATA) or TESTS.parents[1] / "shared" / "data")
     if not (folder / "kitti_raw").is_dir():
-        pytest.skip(f"no real data at {folder}; set GNSS_SEM_MAP_DATA")
+        absent(DATA, f"no real data at {folder}; set {DATA}")
     return folder

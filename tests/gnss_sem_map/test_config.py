@@ -1,11 +1,21 @@
 """One set of settings, in a file or on the command line; nothing unknown passes."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 from gnss_sem_map import config
 from gnss_sem_map.errors import ConfigError
+
+
+def sections(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    """A model and those of all sections in it."""
+    yield model
+    for field in model.model_fields.values():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from sections(field.annotation)
 
 
 def test_what_is_printed_reads_back_as_the_same_settings(tmp_path: Path) -> None:
@@ -14,6 +24,37 @@ def test_what_is_printed_reads_back_as_the_same_settings(tmp_path: Path) -> None
     file.write_text(settings.to_yaml())
     assert config.load(file) == settings
     assert settings.mapping.voxel_size_m == 0.3
+
+
+@pytest.mark.parametrize(
+    "classes", ["urban", 'a: #b\'s "c".yaml', "x" * 200 + " y" * 100, "two\n\nlines ", "\u0085é"]
+)
+def test_any_text_reads_back(classes: str, tmp_path: Path) -> None:
+    file = tmp_path / "config.yaml"
+    file.write_text(config.Settings(classes=classes).to_yaml(), "utf-8")
+    assert config.load(file).classes == classes
+
+
+def test_every_setting_is_printed_under_its_description(tmp_path: Path) -> None:
+    printed = config.load().to_yaml()
+    (tmp_path / "config.yaml").write_text(printed, "utf-8")
+    assert config.load(tmp_path / "config.yaml") == config.load()
+    lines, above = [line.strip() for line in printed.splitlines()], {}
+    comment: list[str] = []
+    for line in lines:
+        if line.startswith("# "):
+            comment.append(line.removeprefix("# "))
+        else:
+            name, colon, _ = line.partition(":")
+            if colon:
+                above.setdefault(name, []).append(" ".join(comment))
+            comment = []
+    count = 0
+    for model in sections(config.Settings):
+        for name, field in model.model_fields.items():
+            assert " ".join(str(field.description).split()) in above[name], f"{model.__name__}.{name}"
+            count += 1
+    assert sum(len(found) for found in above.values()) == count
 
 
 def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
@@ -66,15 +107,10 @@ def test_a_file_that_is_no_settings_is_refused(tmp_path: Path) -> None:
 
 
 def test_every_setting_says_what_it_is() -> None:
-    from pydantic import BaseModel
-
-    def undescribed(model: type[BaseModel], place: str) -> list[str]:
-        found = []
-        for name, field in model.model_fields.items():
-            if not field.description:
-                found.append(f"{place}.{name}")
-            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-                found += undescribed(field.annotation, f"{place}.{name}")
-        return found
-
-    assert undescribed(config.Settings, "settings") == []
+    undescribed = [
+        f"{model.__name__}.{name}"
+        for model in sections(config.Settings)
+        for name, field in model.model_fields.items()
+        if not field.description
+    ]
+    assert undescribed == []

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
-import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +25,93 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
 
 
-def run_of(small_drive: Street, out: Path, *more: str) -> list[str | Path]:
-    return ["run", small_drive.drive, "--segmenter", f"labels:{small_drive.labels}", "-o", out, *more]
+def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None) -> list[str | Path]:
+    return [
+        "run",
+        small_drive.drive,
+        "--segmenter",
+        labels or f"labels:{small_drive.labels}",
+        "-o",
+        out,
+        *more,
+    ]
+
+
+KILLED = 137
+LIVE = ("--set", "mapping.scans_per_chunk=4", "--write-labels")
+COMMAND = """
+import os, sys
+
+def look(event, details):
+    if event == "os.rename" and (name := os.path.basename(os.fsdecode(details[1]))).isdecimal():
+        if name == os.environ.get("die_before_chunk"):
+            os._exit(137)
+        with open("chunks", "a") as file:
+            print(name, os.getpid(), file=file)
+
+sys.addaudithook(look)  # in the processes that map too: they run this file when they start
+if __name__ == "__main__":
+    from gnss_sem_map.cli import main
+    main()
+"""
+NETWORK = """
+import hashlib, os
+from pathlib import Path
+import numpy as np
+
+SHADES = np.array([90, 150, 40, 200, 120, 230])
+answered = 0
+
+def look(pixels):
+    global answered
+    answered += 1
+    if str(answered) == os.environ.get("die_at_question"):
+        os._exit(137)
+    with open("asked", "a") as file:
+        print(hashlib.sha256(pixels.tobytes()).hexdigest(), file=file)
+    classes = np.abs(pixels[:, :, :1].astype(int) - SHADES).argmin(axis=2)
+    return np.where(np.arange(6) == classes[:, :, None], 0.85, 0.03).astype(np.float32)
+
+look.class_names = ["road", "sidewalk", "vehicle", "building", "vegetation", "other"]
+"""
+
+
+@dataclass(frozen=True)
+class Watched:
+    """How a command ended, and what it did on the way."""
+
+    code: int
+    err: str
+    chunks: list[int]
+    """Numbers of the chunks of scans that it mapped and put away."""
+    processes: list[int]
+    """The process that mapped each."""
+    asked: list[str]
+    """A checksum of every image that the network answered."""
+
+
+def watched(folder: Path, words: Sequence[str | Path], **dies: int) -> Watched:
+    """Run a command that may ask the network `python:network:look`, and that dies when `dies` says."""
+    folder.mkdir()
+    (folder / "command.py").write_text(COMMAND)
+    (folder / "network.py").write_text(NETWORK)
+    done = subprocess.run(
+        [sys.executable, "command.py", *map(str, words)], cwd=folder, capture_output=True, text=True, check=False,
+        env=os.environ | {name: str(number) for name, number in dies.items()},
+    )  # fmt: skip
+    lines = {
+        name: path.read_text().split() if (path := folder / name).exists() else []
+        for name in ("chunks", "asked")
+    }
+    numbers = list(map(int, lines["chunks"]))
+    return Watched(done.returncode, done.stderr, numbers[::2], numbers[1::2], lines["asked"])
+
+
+def results_of(out: Path) -> dict[str, bytes]:
+    """What a run must give again, byte for byte."""
+    folders = ("map", "refined", "labels", "labels_raw", "removed", "confidence")
+    files = [path for name in folders for path in (out / name).rglob("*") if path.is_file()]
+    return {str(path.relative_to(out)): path.read_bytes() for path in [*files, *out.glob("trajectory*")]}
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +131,49 @@ def assert_same_maps(a: Path, b: Path) -> None:
             assert (a / name / file).read_bytes() == (b / name / file).read_bytes(), file
 
 
-@pytest.mark.slow
-def test_a_run_killed_at_several_moments_and_resumed_gives_the_same_bytes(
+def test_a_killed_run_is_resumed_by_two_processes_and_keeps_what_it_had(
     small_drive: Street, whole: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "out"
-    for seconds in (1.0, 2.0, 3.0, 4.0):
-        with subprocess.Popen(command(*run_of(small_drive, out, "--resume"))) as process:
-            time.sleep(seconds)
-            process.kill()
-        if out.exists():  # the machine was quick: then everything is there, for it appears at once
-            assert_same_maps(out, whole)
-    done = run(*run_of(small_drive, out, "--resume", "--workers", "2"))
-    assert done.returncode == 0, done.stderr
+    out, chunks = tmp_path / "out", ("--set", "mapping.scans_per_chunk=2")
+    died = watched(tmp_path / "first", run_of(small_drive, out, *chunks), die_before_chunk=1)
+    assert died.code == KILLED
+    assert died.chunks == [0]
+    assert not out.exists()
+    resumed = watched(tmp_path / "second", run_of(small_drive, out, *chunks, "--resume", "--workers", "2"))
+    assert resumed.code == 0, resumed.err
+    assert sorted(resumed.chunks) == [1, 2, 3, 4, 5], "the chunk that was there is mapped again"
+    assert len(set(resumed.processes)) == 2
     assert_same_maps(out, whole)
+
+
+@pytest.fixture(scope="module")
+def live(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run that asks a network of its own."""
+    out = tmp_path_factory.mktemp("live") / "out"
+    done = watched(out.with_name("trial"), run_of(small_drive, out, *LIVE, labels="python:network:look"))
+    assert done.code == 0, done.err
+    assert len(done.asked) == len(set(done.asked)) == len(small_drive.frames)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("moment", "before"),
+    [({"die_at_question": 7}, 6), ({"die_before_chunk": 1}, 12)],
+    ids=["asking", "mapping"],
+)
+def test_a_resumed_run_asks_the_network_for_no_image_twice(
+    moment: dict[str, int], before: int, small_drive: Street, live: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = run_of(small_drive, out, *LIVE, labels="python:network:look")
+    died = watched(tmp_path / "first", words, **moment)
+    assert died.code == KILLED
+    assert len(died.asked) == before
+    resumed = watched(tmp_path / "second", [*words, "--resume"])
+    assert resumed.code == 0, resumed.err
+    asked = died.asked + resumed.asked
+    assert len(asked) == len(set(asked)) == len(small_drive.frames)
+    assert results_of(out) == results_of(live)
 
 
 def test_two_halves_of_a_drive_merge_into_the_whole(small_drive: Street, whole: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from declared import BROWSER, absent
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
@@ -179,7 +180,7 @@ class Browser:
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     driver = shutil.which("chromedriver")
     if driver is None or not (shutil.which("chromium") or shutil.which("google-chrome")):
-        pytest.skip("needs chromium and chromedriver")
+        absent(BROWSER, "needs chromium and chromedriver")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -205,7 +206,7 @@ def started(base: str, profile: Path) -> Browser:
     try:
         return Browser(base, profile)
     except urllib.error.URLError as error:
-        pytest.skip(f"the installed browser does not start: {error}")
+        absent(BROWSER, f"the installed browser does not start: {error}")
 
 
 def count(image: np.ndarray, colour: np.ndarray) -> int:

@@ -164,7 +164,9 @@ def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_
         build_maps(replace(drive, segmenter=nowhere), Account())
 
 
-@pytest.mark.parametrize(("chunk", "workers"), [(1, 1), (5, 1), (100, 1), (5, 2)])
+@pytest.mark.parametrize(
+    ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
+)
 def test_chunks_and_processes_give_the_same_map_and_account(
     drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, chunk: int, workers: int
 ) -> None:
@@ -252,6 +254,7 @@ def resumed_after_kills(
     return done
 
 
+@pytest.mark.integration
 def test_a_killed_run_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
 ) -> None:
@@ -424,6 +427,7 @@ for attempt in (
 """
 
 
+@pytest.mark.integration
 def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     """No file may grow beyond 20 kB, as if the disk were full there."""
     done = subprocess.run(

@@ -161,6 +161,7 @@ def told(street: Path) -> Told:
     return {name: {scan.name: both for scan, both in scans} for name, scans in found.items()}
 
 
+@pytest.mark.integration
 def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(told: Told) -> None:
     for name, on in told["on"].items():
         off = told["off"][name]
@@ -172,6 +173,7 @@ def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(told: Tol
         assert (on[1].confidence[differ] >= 0.5).all()
 
 
+@pytest.mark.integration
 def test_on_a_simulated_street_two_of_five_points_on_the_wrong_side_of_a_kerb_come_right(
     told: Told, street: Path
 ) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.accuracy import anees_band, nees
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
@@ -72,14 +73,48 @@ def test_every_sweep_is_matched_with_the_one_before_and_the_tenth_before() -> No
     assert matched().counts["local maps"] == 1
 
 
-def test_covariances_are_honest() -> None:
-    found = matched().relative_poses
-    off = errors(found, street()[1])
-    squares = np.einsum("ki,kij,kj->k", off, np.linalg.inv(found.covariances), off)
-    assert squares.mean() < 6
-    stddevs = np.sqrt(np.einsum("kii->ki", found.covariances))
-    assert stddevs[:, 3:].max() < 0.05
-    assert stddevs[:, :3].max() < 2e-3
+def whole_sweep_errors(seed: int, settings: ScanMatchingSettings) -> SensorLog:
+    """The street, where every sweep lies a little off as a whole: between two of them, by what the settings say."""
+    log, _ = street()
+    rng = np.random.default_rng(seed)
+
+    def moved(points: Points) -> Points:
+        turn, shift = (
+            rng.normal(0, stddev / np.sqrt(2), 3)
+            for stddev in (settings.rotation_stddev_rad, settings.translation_stddev_m)
+        )
+        xyz = points.xyz @ Rotation.from_rotvec(turn).as_matrix().T + shift
+        return replace(points, xyz=xyz.astype(np.float32))
+
+    points = {scan.number: moved(scan.read()) for scan in log.scans}
+    return replace(log, scans=tuple(replace(s, read=partial(points.get, s.number)) for s in log.scans))
+
+
+@cache
+def of_shifted_sweeps() -> list[RelativePoses]:
+    """What is found in six drives with errors of whole sweeps."""
+    settings = ScanMatchingSettings()
+    return [match_scans(whole_sweep_errors(seed, settings), street()[1]).relative_poses for seed in range(6)]
+
+
+@pytest.mark.parametrize(("step", "count"), [(1, SWEEPS // 2), (10, SWEEPS - 10)])
+def test_covariances_are_honest(step: int, count: int) -> None:
+    """Only pairs that share no sweep: they are independent, and their mean NEES has known bounds."""
+    squares = []
+    for pairs in of_shifted_sweeps():
+        first, second = np.round(pairs.stamps / scenes.SWEEP_S - 0.5).astype(int).T
+        rows = (second - first == step) & ((step > 1) | (first % 2 == 0))
+        squares.append(nees(errors(pairs, street()[1]), pairs.covariances)[rows])
+    assert [len(of_drive) for of_drive in squares] == [count] * 6
+    low, high = anees_band(6, 6 * count)
+    assert low < np.mean(squares) < high
+
+
+def test_covariances_are_small_in_a_street_and_not_below_the_floor() -> None:
+    stddevs = np.sqrt(np.einsum("kii->ki", matched().relative_poses.covariances))
+    floor = ScanMatchingSettings()
+    assert floor.translation_stddev_m <= stddevs[:, 3:].min() <= stddevs[:, 3:].max() < 0.05
+    assert floor.rotation_stddev_rad <= stddevs[:, :3].min() <= stddevs[:, :3].max() < 2e-3
 
 
 def test_a_wrong_first_guess_is_corrected() -> None:

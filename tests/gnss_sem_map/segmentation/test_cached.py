@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from gnss_sem_map.sensor_log import Image
 
 URBAN = open_label_set("urban")
 NAMES = (*URBAN.names, "other")
-DATA = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
 
 
 def frame(number: int) -> Image:
@@ -258,9 +256,8 @@ def test_a_class_that_the_map_does_not_know_is_refused_on_opening(tmp_path: Path
         open_segmenter(f"labels:{tmp_path}", URBAN)
 
 
-@pytest.mark.skipif(not (DATA / "labels").is_dir(), reason=f"no real labels at {DATA / 'labels'}")
-def test_real_probabilities_and_real_train_ids_tell_the_same_story() -> None:
-    folder = DATA / "labels" / "kitti_raw_0005"
+def test_real_probabilities_and_real_train_ids_tell_the_same_story(real_data: Path) -> None:
+    folder = real_data / "labels" / "kitti_raw_0005"
     soft = open_segmenter(f"labels:{folder / 'probabilities'}", URBAN, expected_size=(1242, 375))
     hard = open_segmenter(f"labels:{folder / 'trainids'}", URBAN, expected_size=(1242, 375))
     assert soft.class_names == hard.class_names == NAMES

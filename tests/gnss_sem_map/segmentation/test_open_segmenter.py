@@ -28,6 +28,7 @@ except ConfigError as error:
 """
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("spec", "absent", "extra"),
     [

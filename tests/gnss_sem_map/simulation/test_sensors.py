@@ -28,6 +28,7 @@ def test_the_time_of_a_point_follows_from_its_azimuth(simulation: Simulation) ->
     assert scan.fractions[azimuth > 3.0].max() < 0.05  # behind on the left: the start
 
 
+@pytest.mark.integration
 def test_the_unit_is_an_hdl_64e() -> None:
     lidar = prepare(0.3, 0).lidar
     assert len(lidar.elevations) == 64

@@ -1,0 +1,94 @@
+"""The list of all commands, and how each of them ends: exit codes and one line for every error."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import warnings
+
+import typer
+
+from gnss_sem_map.cli import evaluation, mapping, segmentation, settings, simulation
+from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
+
+COMMANDS = (
+    mapping.run,
+    mapping.merge,
+    mapping.trajectory,
+    segmentation.segment,
+    segmentation.train,
+    evaluation.evaluate,
+    evaluation.calibrate,
+    evaluation.check,
+    simulation.simulate,
+    simulation.demo,
+    settings.config,
+)
+"""In the order of `--help`. The name of the function is the name of the command, its docstring the help."""
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A drive log (GNSS, IMU, LiDAR, camera) in, a clean, georeferenced, semantic 3D map out.",
+    epilog="Example: gnss-sem-map run 2011_09_26/2011_09_26_drive_0005_sync --segmenter labels:probabilities -o out",
+)
+for _command in COMMANDS:
+    app.command()(_command)
+
+
+def main() -> None:
+    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours.
+
+    A signal ends it as orderly, with 128 and its number.
+    """
+    from factor_graphs.errors import FactorGraphError
+    from gnss_sem_map.errors import SemMapError
+
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # those of other packages; ours are printed as such
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
+    try:
+        stop_on_signals()
+        code = app(prog_name="gnss-sem-map", standalone_mode=False)
+        sys.stdout.flush()
+    except Stopped as stopped:
+        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped.number)
+    except typer.TyperException as error:
+        code = _wrong_usage(error)
+    except (SemMapError, FactorGraphError) as error:
+        code = _say(str(error), 1)
+    except MemoryError as error:
+        code = _say(
+            f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive", 1
+        )
+    except OSError as error:  # what the system refused, and nobody explained better
+        code = _say(f"{error.filename or 'output'}: {error.strerror or error}", 1)
+        _close_stdout()
+    except (UnicodeError, RecursionError) as error:
+        code = _say(f"{type(error).__name__} {error}", 1)
+    sys.exit(code)
+
+
+def _say(message: str, code: int) -> int:
+    """One line on stderr; returns the exit code."""
+    ignore_signals()  # we are ending already
+    typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
+    return code
+
+
+def _close_stdout() -> None:
+    """What could not be printed will not be tried again at the end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _wrong_usage(error: typer.TyperException) -> int:
+    """Say in one line what was typed wrongly and where to read how; returns the exit code."""
+    message = " ".join(error.format_message().split())
+    context: typer.Context | None = getattr(error, "ctx", None)
+    command = "gnss-sem-map" if context is None else context.command_path
+    if message:  # no command at all: its help has been shown
+        typer.echo(f"gnss-sem-map: {message.rstrip('.')}; see {command} --help", err=True)
+    return error.exit_code

@@ -1,0 +1,88 @@
+"""The options that several commands share, and what they name: the settings, the drive, its inputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast, get_args
+
+import typer
+
+if TYPE_CHECKING:
+    from gnss_sem_map.config import Settings
+    from gnss_sem_map.sensor_log import SensorLog
+
+
+Drive = Annotated[
+    Path, typer.Argument(help="Folder of the drive: KITTI raw, KITTI odometry, or a table log.")
+]
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write; an earlier run there is replaced.")]
+Config = Annotated[Path | None, typer.Option("--config", help="YAML file of settings (see `config`).")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", help="One setting, as section.name=value; repeatable.")
+]
+Format = Annotated[
+    str | None, typer.Option("--format", help="kitti-raw, kitti-odometry or table; default: what is there.")
+]
+Frames = Annotated[
+    str | None,
+    typer.Option(
+        "--frames",
+        help="Only frames A to B - 1, as A:B, by frame number; LiDAR odometry sees only these too, GNSS and IMU all"
+        " of the drive.",
+    ),
+]
+Segmenter = Annotated[
+    str | None,
+    typer.Option(
+        help="Where class probabilities come from: labels:DIR, refinenet:FILE, hf:MODEL, onnx:FILE,"
+        " python:MODULE:CALLABLE; none: geometry only."
+    ),
+]
+Device = Annotated[str, typer.Option(help="Where a network runs: auto, cpu, cuda.")]
+Force = Annotated[bool, typer.Option("--force", help="Go on where the pre-flight (see `check`) is red.")]
+Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
+
+
+def settings_of(file: Path | None, overrides: list[str] | None) -> Settings:
+    """The settings of `--config` and `--set`; raises ConfigError."""
+    from gnss_sem_map import config
+
+    return config.load(file, overrides or ())
+
+
+def inputs_of(
+    drive: Path, config: Path | None, settings: Settings, segmenter: str | None = None
+) -> list[Path | str | None]:
+    """Every place that a run reads, as far as it is known before the drive is opened."""
+    place = (segmenter or "").partition(":")[2].partition("?")[0]
+    classes = settings.classes if Path(settings.classes).suffix else None
+    return [drive, config, place or None, settings.calibration, classes]
+
+
+def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
+    """The drive, with the scans that `--frames` names; raises DataError, and BadParameter for a wrong option."""
+    from dataclasses import replace
+
+    from gnss_sem_map.datasets import DriveFormat, open_drive
+
+    if drive_format is not None and drive_format not in get_args(DriveFormat):
+        raise typer.BadParameter(
+            f"found {drive_format!r}, expected one of {get_args(DriveFormat)}", param_hint="--format"
+        )
+    log = open_drive(drive, cast("DriveFormat | None", drive_format))
+    if frames is None:
+        return log
+    first, last = _frame_range(frames)
+    return replace(log, scans=tuple(scan for scan in log.scans if first <= scan.number < last))
+
+
+def _frame_range(frames: str) -> tuple[int, float]:
+    first, colon, last = frames.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return int(first or 0), int(last) if last else float("inf")
+    except ValueError:
+        raise typer.BadParameter(
+            f"found {frames!r}, expected A:B with frame numbers", param_hint="--frames"
+        ) from None

@@ -1,0 +1,53 @@
+"""Commands that simulate: `simulate`, `demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from gnss_sem_map.cli.console import print_metrics, print_run, progress_bars, warn
+from gnss_sem_map.cli.options import Out
+
+
+def simulate(
+    out: Out,
+    seconds: Annotated[float, typer.Option(min=0.3, help="Length of the drive, s.")] = 30.0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Town, traffic and noise; the same seed gives the same bytes.")
+    ] = 0,
+) -> None:
+    """Write a simulated drive in KITTI raw format, with the exact truth beside it."""
+    from gnss_sem_map.simulation import simulate as write_drive
+
+    with progress_bars() as progress:
+        drive = write_drive(out, seconds, seed, lambda done, total: progress("simulate", done, total))
+    typer.echo(f"drive in {drive}")
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder of the results; the drive goes into OUT_drive.")
+    ] = Path("demo"),
+    seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
+    seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
+    labels: Annotated[
+        Literal["network", "corrupted"],
+        typer.Option(
+            help="Class probabilities: from the small network made for this simulator, or the true class images,"
+            " corrupted as a network would."
+        ),
+    ] = "network",
+) -> None:
+    """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
+    from gnss_sem_map.cli.demo import LABELS, demonstrate
+
+    with progress_bars() as progress:
+        done = demonstrate(out, seconds, seed, labels, progress)
+    warn(done.about["warnings"])
+    print_run(done.about, out, as_json=False)
+    print_metrics(done.metrics)
+    typer.echo(f"labels          {LABELS[labels]}")
+    for picture in done.pictures:
+        typer.echo(f"look at         {picture}")

@@ -38,7 +38,7 @@ from gnss_sem_map.mapping.surface_heights import surface_heights
 from gnss_sem_map.mapping.trajectory import estimate_trajectory, final, solve
 from gnss_sem_map.refinement import RefinementReport, refine, tell_ways
 from gnss_sem_map.refinement.kerbs import Kerbs
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.remembered import RememberedSegmenter, answers_folder
@@ -61,7 +61,7 @@ class Result:
     raw: SemanticMap
     refined: SemanticMap
     refinement: RefinementReport
-    account: Account
+    account: RunStats
     moving: Mapping[int, NDArray[np.int64]] | None = None
     """Frame number -> places of the points of moving objects among the scan's usable ones; None: not sought."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
@@ -92,7 +92,7 @@ def run(
     EstimationError from the smoother.
     """
     log = log.in_our_conventions(settings.sensors)
-    account = Account(skips=list(log.skips))
+    account = RunStats(skips=list(log.skips))
     sensor_model.opened(
         settings.calibration, open_label_set(settings.classes)
     )  # of other classes: refused now
@@ -115,7 +115,7 @@ def run(
     with account.stage("refinement"):
         progress("refinement", 0, 1)
         calibration = sensor_model.opened(settings.calibration, maps.static.label_set)
-        witnesses = found.witnesses if drive.matched else None
+        witnesses = found.keyframes if drive.matched else None
         refined, refinement = refine(
             maps.static, settings.refinement, maps.removed, found.objects, calibration, witnesses
         )
@@ -133,7 +133,7 @@ def run(
 
 
 def check_drive(
-    log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account, force: bool = False
+    log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: RunStats, force: bool = False
 ) -> Preflight:
     """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
     with account.stage("preflight"):
@@ -155,7 +155,7 @@ def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) ->
 
 
 def _without_moving(
-    drive: Drive, folder: Path, account: Account, progress: Progress
+    drive: Drive, folder: Path, account: RunStats, progress: Progress
 ) -> tuple[Drive, MovingObjects]:
     """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
     log, settings = drive.log, drive.settings
@@ -172,5 +172,5 @@ def _without_moving(
     return replace(drive, moving=moving.points), moving
 
 
-def _is_matched(log: SensorLog, account: Account) -> bool:
+def _is_matched(log: SensorLog, account: RunStats) -> bool:
     return account.counts["scans matched"] >= MATCHED_SHARE * max(len(log.scans), 1)

@@ -20,7 +20,7 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @dataclass
-class Account:
+class RunStats:
     """What a run did: counts, skips, and the cost of every stage."""
 
     counts: Counter[str] = field(default_factory=Counter)

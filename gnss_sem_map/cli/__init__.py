@@ -150,12 +150,12 @@ def trajectory(
     """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
     from gnss_sem_map import pipeline
     from gnss_sem_map.export import run_folder
-    from gnss_sem_map.run_stats import Account
+    from gnss_sem_map.run_stats import RunStats
 
     settings = _settings(config, set_)
     with run_folder.claimed_run(out, _inputs(drive, config, settings)):
         log = _open(drive, drive_format, None)
-        account = Account(skips=list(log.skips))
+        account = RunStats(skips=list(log.skips))
         page = pipeline.check_drive(log, None, settings, account, force)
         with progress_bars() as progress, account.stage("trajectory"):
             estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)

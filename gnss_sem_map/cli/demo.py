@@ -16,7 +16,7 @@ from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.run_folder import claimed_run, write_run
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
@@ -64,7 +64,7 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
     network = open_segmenter("demo", label_set) if source == "network" else None
     settings = config.load(overrides=[f"calibration={DEMO_CALIBRATION}"] if network else [])
 
-    account = Account()
+    account = RunStats()
     with new_folder(world) as folder:
         with account.stage("simulate"):
             drive = simulate(folder, seconds, seed, lambda done, total: progress("simulate", done, total))

@@ -19,13 +19,13 @@ from gnss_sem_map.files.run_json import inputs_of
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import CELLS, LabelCalibration, Street, cells_of
-from gnss_sem_map.mapping.labelled_scans import Drive, SeenScan, seen_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
 from gnss_sem_map.refinement import weigh
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.potts_mrf import LEAST_PROBABILITY
 from gnss_sem_map.refinement.systematic_error import doubted
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of, softmax
@@ -79,7 +79,7 @@ def measure(
     cells = cells_of(height_over_ground(voxels.centres), flatness(voxels.keys))
     answers, found = np.zeros((c, c + 1), np.int64), np.zeros((c, CELLS[0] * CELLS[1]), np.int64)
     true_classes, rows = [], []
-    for done, seen in enumerate(seen_scans(drive, Account())):
+    for done, seen in enumerate(labelled_scans(drive, RunStats())):
         true, answer, row = _points(drive, seen, voxels, truths, tables)
         np.add.at(answers, (true, answer), 1)
         np.add.at(found, (true, cells[row]), 1)
@@ -97,7 +97,7 @@ def measure(
 
 
 def _points(
-    drive: Drive, seen: SeenScan, voxels: VoxelMap, truths: Mapping[str, Path], tables: Tables
+    drive: Drive, seen: LabelledScan, voxels: VoxelMap, truths: Mapping[str, Path], tables: Tables
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """True class, the network's answer, and voxel of every point of a scan that has all three."""
     if seen.scan.name not in truths:
@@ -109,7 +109,7 @@ def _points(
             " are they of the same scan?"
         )
     true = tables.truth[entries[seen.valid] & 0xFFFF].astype(np.int64)
-    row = voxels.places(keys_of(seen.p_map, drive.settings.mapping.voxel_size_m))
+    row = voxels.indices_of(keys_of(seen.p_map, drive.settings.mapping.voxel_size_m))
     use = (true >= 0) & (seen.pixels >= 0) & (row >= 0)
     use[use] = seen.classes[seen.pixels[use]].any(axis=1)  # a void pixel is no answer
     return true[use], seen.labels[use].astype(np.int64), row[use]

@@ -20,7 +20,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.voxel_map import keys_of
@@ -111,7 +111,7 @@ def of_drive(
     def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
         return _clouds(numbered_scan[1], trajectories, log.calibration.T_imu_lidar, settings)
 
-    for done, ((n, scan), clouds) in enumerate(ahead(clouds_of, numbered), 1):
+    for done, ((n, scan), clouds) in enumerate(prefetch(clouds_of, numbered), 1):
         if clouds is not None:
             stamps[n].append(scan.stamp)
             for of_one, cloud in zip(gathered, clouds, strict=True):

@@ -30,7 +30,7 @@ from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement import RefinementReport
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
@@ -115,7 +115,7 @@ def write_trajectory_run(
     log: SensorLog,
     trajectory: Trajectory,
     solution: Solution | None,
-    account: Account,
+    account: RunStats,
     settings: Settings,
     page: Preflight,
 ) -> dict[str, Any]:
@@ -178,7 +178,7 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
         refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
 
 
-def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
+def about_run(drive: Path, log: SensorLog, account: RunStats) -> dict[str, Any]:
     """What went in, what was left out and why, and what it cost."""
     skips = sorted(set(account.skips), key=astuple)
     frames: Counter[str] = Counter()

@@ -117,7 +117,7 @@ def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
     """Share of the points (n, 3) that lie in a voxel of the map."""
     if not len(p_map):
         return 0.0
-    return float((voxels.places(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
+    return float((voxels.indices_of(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
 
 
 def _known(frame: LocalFrame | None) -> LocalFrame:

@@ -7,13 +7,13 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings, match_scans
 from gnss_sem_map.sensor_log import SensorLog
 
 
 def estimate_trajectory(
-    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
+    log: SensorLog, settings: Settings, account: RunStats, progress: Progress = silent
 ) -> tuple[Trajectory, Solution | None]:
     """The poses that came with the drive, or GNSS and IMU smoothed, bound by LiDAR odometry where there are scans."""
     return final(log, solve(log, settings, account, progress))
@@ -29,7 +29,7 @@ def final(log: SensorLog, solutions: tuple[Solution, ...]) -> tuple[Trajectory, 
 def solve(
     log: SensorLog,
     settings: Settings,
-    account: Account,
+    account: RunStats,
     progress: Progress = silent,
     first: Solution | None = None,
 ) -> tuple[Solution, ...]:

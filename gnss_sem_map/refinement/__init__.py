@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics.motion_state import MotionSettings, TrackedObject
-from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement import count_grid, vehicles
@@ -155,7 +155,7 @@ def refine(
     removed: VoxelMap | None = None,
     tracked: tuple[TrackedObject, ...] = (),
     calibration: LabelCalibration | None = None,
-    witnesses: Witnesses | None = None,
+    witnesses: KeyframeScans | None = None,
 ) -> tuple[SemanticMap, RefinementReport]:
     """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled.
 
@@ -227,7 +227,7 @@ def weigh(
 
 
 def _with_layer(static: SemanticMap, removed: VoxelMap) -> tuple[SemanticMap, Step]:
-    alone = removed[static.voxels.places(removed.keys) < 0]
+    alone = removed[static.voxels.indices_of(removed.keys) < 0]
     gone = np.ones(len(alone), np.bool_)
     changes = _changes(alone.label_set, alone.labels, alone.labels, gone)
     return with_removed(static, removed), Step("moving objects", changes)
@@ -372,7 +372,7 @@ def _infer(
 
 
 def _clear(
-    voxels: VoxelMap, weighed: Weighed, settings: RefinementSettings, witnesses: Witnesses | None
+    voxels: VoxelMap, weighed: Weighed, settings: RefinementSettings, witnesses: KeyframeScans | None
 ) -> tuple[NDArray[np.bool_], Step]:
     """What moved (v,): as weighed, and what witnesses look through."""
     name = "seen through"
@@ -410,9 +410,9 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     Where something stands, its evidence and its decision stay, and the hits of what moved through are counted beside
     its own, in `hits_removed`: no point is lost. Raises DataError for another voxel size or class set.
     """
-    alone = removed[static.voxels.places(removed.keys) < 0]
+    alone = removed[static.voxels.indices_of(removed.keys) < 0]
     voxels = static.voxels + alone
-    kept, added = voxels.places(static.voxels.keys), voxels.places(alone.keys)
+    kept, added = voxels.indices_of(static.voxels.keys), voxels.indices_of(alone.keys)
     vehicle = _classes(voxels.label_set, "vehicle")
     labels, confidence = np.full(len(voxels), UNLABELLED, np.int8), np.zeros(len(voxels), np.float32)
     states = np.full(len(voxels), State.REMOVED, np.uint8)
@@ -430,8 +430,8 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
 def _with_hits(refined: SemanticMap, static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     """The same voxels; those of `static` that things moved through have their hits as well."""
     hits, gone = refined.voxels.hits.copy(), refined.removed_hits.copy()
-    through = removed[static.voxels.places(removed.keys) >= 0]
-    places = refined.voxels.places(through.keys)
+    through = removed[static.voxels.indices_of(removed.keys) >= 0]
+    places = refined.voxels.indices_of(through.keys)
     hits[places] += through.hits
     gone[places] += through.hits
     return replace(refined, voxels=replace(refined.voxels, hits=hits), hits_removed=gone)

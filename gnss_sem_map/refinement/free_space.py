@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics.motion_state import MotionSettings
-from gnss_sem_map.dynamics.visibility import Witnesses, testify
+from gnss_sem_map.dynamics.visibility import KeyframeScans, hits_and_misses
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
@@ -31,7 +31,7 @@ class ClearingSettings(BaseModel):
     farthest_m: float = Field(
         default=80.0,
         gt=0,
-        description="Farther scans do not testify, m: a voxel needs no outline, as objects do.",
+        description="Farther scans do not hits_and_misses, m: a voxel needs no outline, as objects do.",
     )
     over_m: tuple[float, float] = Field(
         default=(0.4, 3.0), description="Only what stands over something, so far at least and at most, m."
@@ -39,7 +39,7 @@ class ClearingSettings(BaseModel):
 
 
 def seen_through(
-    voxels: VoxelMap, witnesses: Witnesses, settings: ClearingSettings, motion: MotionSettings
+    voxels: VoxelMap, witnesses: KeyframeScans, settings: ClearingSettings, motion: MotionSettings
 ) -> NDArray[np.bool_]:
     """Which voxels (v,) are empty, by what the witnesses say of their centres.
 
@@ -50,7 +50,7 @@ def seen_through(
         _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in settings.over_m])
     )
     asked = motion.model_copy(update={"farthest_m": settings.farthest_m})
-    hits, throughs = testify(voxels.centres[high], witnesses, asked)
+    hits, throughs = hits_and_misses(voxels.centres[high], witnesses, asked)
     empty = throughs >= settings.least_through
     empty &= throughs > settings.through_per_hit * hits
     empty &= voxels.hits[high] < settings.points_per_through * throughs

@@ -21,7 +21,7 @@ from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
 
@@ -112,7 +112,7 @@ def _write_all(
         return [_write(_file(folder, image), each, label_set) for image, each in small], lost
 
     batches = (waiting[i : i + batch_size] for i in range(0, len(waiting), batch_size))
-    for _, (written, lost) in ahead(make, batches, threads, under_way=threads):
+    for _, (written, lost) in prefetch(make, batches, threads, under_way=threads):
         sizes += written
         skips += lost
         progress("segmenting", kept + len(sizes) + len(skips), len(images))

@@ -8,12 +8,12 @@ import numpy.typing as npt
 
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
 from gnss_sem_map.simulation.ground import FAR, to_town
-from gnss_sem_map.simulation.hits import surface_at
+from gnss_sem_map.simulation.id_buffer import pixel_ray, see
 from gnss_sem_map.simulation.noise import gaussian, value_noise
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray
+from gnss_sem_map.simulation.surface_at import surface_at
 from gnss_sem_map.simulation.surfaces import TRAIN_IDS
 from gnss_sem_map.simulation.textures import ground_colour, thing_colour
-from gnss_sem_map.simulation.view import pixel_ray, see
 from gnss_sem_map.simulation.world import World
 
 _NEAR_M = 12.0

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
 from gnss_sem_map.simulation.fan import SECTOR, Sweep, Work, list_near, look, room_for
 from gnss_sem_map.simulation.ground import FAR
-from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, uniform
 from gnss_sem_map.simulation.raycast import Scene
+from gnss_sem_map.simulation.surface_at import surface_at
 from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
 from gnss_sem_map.simulation.textures import window_at
 from gnss_sem_map.simulation.world import World

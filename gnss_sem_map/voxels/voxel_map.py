@@ -137,7 +137,7 @@ class VoxelMap:
 
     def __sub__(self, part: VoxelMap) -> VoxelMap:
         """What is left of this map without a part that was added to it; raises DataError for what is no part of it."""
-        places = self.places(part.keys)
+        places = self.indices_of(part.keys)
         is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
         if not is_part or (places < 0).any() or (self.hits[places] < part.hits).any():
             raise DataError("cannot take one map out of another that does not hold it; were both of one run?")
@@ -181,7 +181,7 @@ class VoxelMap:
         """(v, c) class probabilities (eq. 6, normalised); even where no camera saw the voxel."""
         return softmax(self.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT))
 
-    def places(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    def indices_of(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Row of each of these keys in the map, or -1."""
         found = np.empty(len(keys), np.int64)
         kernels.find(self.keys, keys, found)

@@ -25,7 +25,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration, read
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.sensor_log import Image
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -69,7 +69,7 @@ def confused(small_drive: Street) -> Drive:
 
 
 def mapped(drive: Drive) -> VoxelMap:
-    return build_maps(drive, Account()).static
+    return build_maps(drive, RunStats()).static
 
 
 @pytest.fixture(scope="module")

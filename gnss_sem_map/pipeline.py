@@ -41,7 +41,7 @@ from gnss_sem_map.refinement.kerbs import Kerbs
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.segmentation.remembered import RememberedSegmenter, answers_folder
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, answers_folder
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State
 
@@ -164,7 +164,7 @@ def _without_moving(
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
         label_set = open_label_set(settings.classes)
-        remembered = RememberedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
+        remembered = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
         drive = replace(drive, segmenter=remembered)
     with account.stage("motion"):
         moving = find_moving(drive, progress)

@@ -34,7 +34,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
-PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
+PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
 
 RUN_FILES = re.compile(

@@ -1,4 +1,4 @@
-"""LiDAR odometry: every deskewed sweep is registered to a local map of the sweeps before -> relative poses, covariances.
+"""LiDAR odometry: every deskewed sweep is registered to a local map of earlier sweeps -> relative poses, covariances.
 
 The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP). This module adds an initial
 guess from the trajectory, a covariance that is large in degenerate directions, and a check of every match. The factor

@@ -45,8 +45,8 @@ class LabellingSettings(BaseModel):
     )
     occlusion_m: float = Field(0.3, ge=0, description="plus this distance.")
     abstain: bool = Field(
-        False, description="Ignore pixels whose most probable class is `other`; by default the map's classes are
-        renormalised.",
+        False,
+        description="Ignore pixels that are most probably `other`; by default the other classes share their vote.",
     )
     image_within_s: float = Field(
         0.06, gt=0, description="Largest time difference between a scan and its image."

@@ -21,7 +21,7 @@ def has_converged(result: small_gicp.RegistrationResult) -> bool:
 
 
 def information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
-    """Information matrix (6, 6) of the pose in source axes, from the planes only, and the sum of the weights across them.
+    """Information matrix (6, 6) of the pose in source axes from the planes only, and the sum of their normal weights.
 
     The Hessian of the registration also contains the weight along the planes. That is no information about the pose:
     the mean of a voxel's points lies anywhere on its wall. So it is subtracted, with J = [-R [p]x, R] of T p for T

@@ -29,7 +29,7 @@ from gnss_sem_map.mapping.labelled_scans import labelled_scans
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
-from gnss_sem_map.segmentation.remembered import RememberedSegmenter
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 from gnss_sem_map.sensor_log import Image, Skip, file_of
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
@@ -126,7 +126,7 @@ def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size
     assert size is not None
-    refusing = RememberedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
+    refusing = CachedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
     for _ in range(2):
         account = RunStats()
         found = build_maps(replace(drive, segmenter=refusing), account)
@@ -159,8 +159,8 @@ def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size
     assert size is not None
-    nowhere = RememberedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
-    with pytest.raises(WriteError, match="cannot keep what the network said"):
+    nowhere = CachedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
+    with pytest.raises(WriteError, match="cannot be written"):
         build_maps(replace(drive, segmenter=nowhere), RunStats())
 
 
@@ -406,11 +406,12 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from gnss_sem_map.errors import DataError
 from test_tiles import random_map, FRAME
-from gnss_sem_map import chunks, tiles
-from gnss_sem_map.labels import label_set
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import checkpoints
+from gnss_sem_map.voxels import tiles
 
 folder, written = Path(sys.argv[2]), random_map(count=200_000)
-store = chunks.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
+store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),
@@ -426,7 +427,7 @@ for attempt in (
 def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     """No file may grow beyond 20 kB, as if the disk were full there."""
     done = subprocess.run(
-        [sys.executable, "-c", FILL, str(Path(__file__).parent), str(tmp_path)],
+        [sys.executable, "-c", FILL, str(Path(__file__).parents[1] / "voxels"), str(tmp_path)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     first, second = done.stdout.splitlines()

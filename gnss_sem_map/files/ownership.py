@@ -1,4 +1,4 @@
-"""What we wrote, and can prove it: every folder of results carries a list of its files, and only those are removed.
+"""Ownership of files: every result folder has a list of its files, and only listed files are ever removed.
 
 The list holds the size of each file, and the content of small ones (those that people edit) as a checksum: what was
 changed since is somebody's work, and no longer ours.
@@ -16,21 +16,21 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 
 MARKER = ".gnss-sem-map.json"
-"""The list of files, in every folder that we wrote."""
+"""Name of the list of files in every folder that we write."""
 CONTENT_BYTES = 1 << 16
-"""Of files up to this size the content is compared as well."""
+"""For files up to this size, the content is compared as well."""
 
 Listed = Mapping[str, list[str]]
-"""Path within the folder -> what a file of ours may look like there; folders end in '/'."""
+"""Path within the folder -> accepted states (size, checksum) of our file; folders end in '/'."""
 
 
 def write_list(folder: Path) -> None:
-    """List everything that is in a folder as ours."""
+    """Write the list of all files in a folder: they are ours."""
     _write_marker(folder, {name: [look(folder / name)] for name in _content(folder)})
 
 
 def read_list(folder: Path) -> Listed | None:
-    """What we wrote into a folder; None when it carries no list, or a damaged one."""
+    """Read the list of our files in a folder; None when it has no list, or a damaged one."""
     try:
         files = json.loads((folder / MARKER).read_text("utf-8"))["files"]
         return {str(name): [str(look) for look in looks] for name, looks in files.items()}
@@ -39,7 +39,7 @@ def read_list(folder: Path) -> Listed | None:
 
 
 def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -> str | None:
-    """Something in a folder that we did not write, or that was changed since; None when all of it is ours.
+    """A file in a folder that we did not write, or that was changed since; None when all files are ours.
 
     A folder without a list is ours when `by_name` accepts the path of everything in it.
     """
@@ -57,13 +57,13 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether everything that we wrote into a folder is still there, as it was."""
+    """Whether all files that we wrote into a folder still exist, unchanged."""
     listed = read_list(folder)
     return listed is not None and all(look(folder / name) in looks for name, looks in listed.items())
 
 
 def remove(folder: Path) -> None:
-    """Remove what we wrote into a folder, its list last, and then the folder; raises OSError where that fails.
+    """Remove our files from a folder, the list last, and then the folder; raises OSError.
 
     What is not ours stays, and so does the folder that holds it: then that is the error.
     """
@@ -81,14 +81,14 @@ def remove(folder: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the beginnings of lists and pages that somebody was killed at writing; raises OSError."""
+    """Remove unfinished lists and pages of killed processes; raises OSError."""
     for path in folder.glob(".*.part") if folder.is_dir() else ():
         if is_partial(path.name):
             path.unlink()
 
 
 def amend(folder: Path, name: str, content: bytes) -> None:
-    """Write one more file into a folder, or write it anew; it is listed first, so that it is ours at every moment.
+    """Add or replace a file in a folder; it is listed first, so that it is ours at every moment.
 
     Raises DataError when a file lies there that we did not write, or the disk is full.
     """
@@ -107,7 +107,7 @@ def amend(folder: Path, name: str, content: bytes) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all; raises OSError."""
+    """Write a file atomically; raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with beside.open("wb") as file:
@@ -120,7 +120,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def is_partial(name: str) -> bool:
-    """Whether a path in a folder is that of a list, or a page, that somebody was killed at writing."""
+    """Whether a path is that of an unfinished list or page of a killed process."""
     files = "|".join(map(re.escape, (MARKER, "report.html", "metrics.json", "check.html")))
     return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
 
@@ -146,7 +146,7 @@ def _look(content: bytes) -> str:
 
 
 def _content(folder: Path) -> Iterator[str]:
-    """Everything in a folder but its list, as paths within it; folders end in '/', links to folders do not."""
+    """All paths within a folder without its list; folders end in '/', links to folders do not."""
     for place, folders, files in os.walk(folder):
         within = Path(place).relative_to(folder)
         for name in sorted(folders):

@@ -1,4 +1,4 @@
-"""What a run says of itself, read back: it may have been damaged or written over since."""
+"""Reading run.json, which may be damaged or of another program."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_run(out: Path) -> dict[str, Any]:
 
 
 def inputs_of(out: Path) -> dict[str, str]:
-    """The drive and the segmenter that a run was made of, as far as it names them; raises DataError."""
+    """The drive and the segmenter of a run, as far as run.json names them; raises DataError."""
     inputs = read_run(out).get("inputs", {})
     if not isinstance(inputs, dict):
         raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: found {type(inputs).__name__})")

@@ -1,4 +1,4 @@
-"""RefineNet weights on disk: only tensors are read, never code, and they must fit the network to the last one."""
+"""RefineNet weights on disk: only tensors are read, never code, and all of them must fit the network."""
 
 from __future__ import annotations
 

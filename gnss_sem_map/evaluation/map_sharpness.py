@@ -237,7 +237,7 @@ def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
 def _gather(
     rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
 ) -> tuple[int, int]:
-    """Add points from `start` on to their cubes, with moments about the centre of the cube, until the table is half full.
+    """Add points from `start` on to their cubes, with moments about the cube's centre, until the table is half full.
 
     `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
     """

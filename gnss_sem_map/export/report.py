@@ -41,12 +41,15 @@ FILES = {
     "metrics.json": "the content of this page about the evaluation, machine-readable",
 }
 WORDS = {
-    "SA": "static points kept (SA)", "DA": "points on moving vehicles removed (DA)", "AA": "both, geometric mean
-    (AA)", "SA_vehicle": "points on parked vehicles kept", "ece": "expected calibration error (ECE)", "ate_m":
-    "absolute trajectory error (m)", "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of
-    freedom)", "position_nees_per_dof": "squared position error divided by its claimed variance (NEES per degree of
-    freedom)", "orientation_nees_per_dof": "squared orientation error divided by its claimed variance (NEES per degree
-    of freedom)",
+    "SA": "static points kept (SA)",
+    "DA": "points on moving vehicles removed (DA)",
+    "AA": "both, geometric mean (AA)",
+    "SA_vehicle": "points on parked vehicles kept",
+    "ece": "expected calibration error (ECE)",
+    "ate_m": "absolute trajectory error (m)",
+    "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of freedom)",
+    "position_nees_per_dof": "squared position error / claimed variance (NEES per degree of freedom)",
+    "orientation_nees_per_dof": "squared orientation error / claimed variance (NEES per degree of freedom)",
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260
@@ -116,9 +119,7 @@ def _section(title: str, *parts: str) -> str:
 
 
 def _sharpness(sharpness: Mapping[str, Mapping[str, Any]]) -> str:
-    """Table of surface thickness of the map, and of a map from GNSS and IMU alone: a wrong calibration blurs
-    surfaces.
-    """
+    """Surface thickness of the map, and of a map from GNSS and IMU alone: a wrong calibration blurs surfaces."""
     if not sharpness:
         return ""
     figures = list(dict.fromkeys(name for values in sharpness.values() for name in values))

@@ -58,8 +58,8 @@ def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:
     t, p = stamps[order], _cartesian(geodetic[order])
     around = median_filter(p, size=(min(NEIGHBOURS, len(p)), 1), mode="reflect")
     half = NEIGHBOURS // 2
-    places = np.arange(len(t))
-    span = t[np.minimum(places + half, len(t) - 1)] - t[np.maximum(places - half, 0)]
+    rows = np.arange(len(t))
+    span = t[np.minimum(rows + half, len(t) - 1)] - t[np.maximum(rows - half, 0)]
     kept = np.linalg.norm(p - around, axis=1) <= JUMP_M + FASTEST_M_S * span
     jumps = np.linalg.norm(np.diff(p[kept], axis=0), axis=1) > JUMP_M + FASTEST_M_S * np.diff(t[kept])
     place = np.concatenate([[0], np.cumsum(jumps)])[: int(kept.sum())]

@@ -122,9 +122,7 @@ def _points(
 def fit_temperature(
     true: NDArray[np.int64], scores: NDArray[np.float32], doubts: NDArray[np.float32]
 ) -> float:
-    """The temperature under which scores (n, c), with systematic error rates (n,), best predict the true classes
-    (n,).
-    """
+    """The temperature under which scores (n, c) with error rates (n,) best predict the true classes (n,)."""
 
     def cross_entropy(log_temperature: float) -> float:
         probabilities = doubted(softmax(scores / np.float32(np.exp(log_temperature))), doubts[:, None])

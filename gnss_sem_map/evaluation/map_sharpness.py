@@ -151,9 +151,8 @@ def _clouds(
 def _length(trajectory: Trajectory, stamps: Array) -> float:
     if len(stamps) < 2:
         return 0.0
-    every = max(
-        1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps))))
-    )  # jitter does not count as distance
+    # so far apart, jitter does not count as distance
+    every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))
     positions = trajectory.at(np.append(stamps[:-1:every], stamps[-1]), EXTRAPOLATE_S)[:, :3, 3]
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
@@ -197,9 +196,7 @@ class _Stretch:
             self.voxels, done = _occupy(self._voxels, self.voxels, done, cloud.voxels)
 
     def surfaces(self) -> tuple[Array, Array]:
-        """Variances (c, 3), smallest first, of the cubes with enough points and sweeps, and |z| of their normals
-        (c,).
-        """
+        """Variances (c, 3), ascending, of cubes with enough points and sweeps, and |z| of their normals (c,)."""
         seen = self._cubes[:, SCANS] >= self._settings.min_scans
         sums = self._cubes.view(np.float64)[seen, SUMS:]
         sums = sums[sums[:, 0] >= self._settings.min_points]

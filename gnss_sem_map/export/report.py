@@ -216,7 +216,7 @@ def _refinement(refinement: Mapping[str, Any]) -> str:
     vehicles = {f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))}
     table = _table(("step", "voxels changed", "of these"), changed) if changed else ""
     errors = {
-        "looks that err in all views, estimated without truth": _percent(refinement.get("systematic_errors"))
+        "systematic label error rate, estimated without truth": _percent(refinement.get("systematic_errors"))
     }
     return table + _pairs(vehicles | (errors if "systematic_errors" in refinement else {}))
 

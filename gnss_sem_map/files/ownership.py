@@ -26,14 +26,14 @@ Listed = Mapping[str, list[str]]
 
 def write_list(folder: Path) -> None:
     """Write the list of all files in a folder: they are ours."""
-    _write_marker(folder, {name: [look(folder / name)] for name in _content(folder)})
+    _write_marker(folder, {name: [state_of(folder / name)] for name in _content(folder)})
 
 
 def read_list(folder: Path) -> Listed | None:
     """Read the list of our files in a folder; None when it has no list, or a damaged one."""
     try:
         files = json.loads((folder / MARKER).read_text("utf-8"))["files"]
-        return {str(name): [str(look) for look in looks] for name, looks in files.items()}
+        return {str(name): [str(state) for state in states] for name, states in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
@@ -50,7 +50,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
         if listed is None:
             ours = by_name(name) and not os.path.islink(folder / name)
         else:
-            ours = name in listed and look(folder / name) in listed[name]
+            ours = name in listed and state_of(folder / name) in listed[name]
         if not ours:
             return name
     return None
@@ -59,7 +59,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
 def is_whole(folder: Path) -> bool:
     """Whether all files that we wrote into a folder still exist, unchanged."""
     listed = read_list(folder)
-    return listed is not None and all(look(folder / name) in looks for name, looks in listed.items())
+    return listed is not None and all(state_of(folder / name) in states for name, states in listed.items())
 
 
 def remove(folder: Path) -> None:
@@ -71,7 +71,7 @@ def remove(folder: Path) -> None:
     # the deepest first, so that folders are empty when their turn comes
     for name in sorted(listed, key=lambda name: name.count("/") - name.endswith("/"), reverse=True):
         path = folder / name
-        if look(path) in listed[name]:
+        if state_of(path) in listed[name]:
             path.rmdir() if name.endswith("/") else path.unlink()
     remove_partials(folder)
     left = next(_content(folder), None)
@@ -95,10 +95,10 @@ def amend(folder: Path, name: str, content: bytes) -> None:
     path, listed = folder / name, read_list(folder)
     try:
         if listed is not None:
-            if os.path.lexists(path) and look(path) not in listed.get(name, []):
+            if os.path.lexists(path) and state_of(path) not in listed.get(name, []):
                 raise DataError(f"{path}: was not written by us, or was changed since; move it away")
-            looks = [*listed.get(name, []), _look(content)]
-            _write_marker(folder, {**listed, name: list(dict.fromkeys(looks))[-3:]})
+            states = [*listed.get(name, []), _state_of_bytes(content)]
+            _write_marker(folder, {**listed, name: list(dict.fromkeys(states))[-3:]})
         write_whole(path, content)
     except OSError as error:
         raise DataError(
@@ -125,8 +125,8 @@ def is_partial(name: str) -> bool:
     return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
 
 
-def look(path: Path) -> str:
-    """What a file looks like: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
+def state_of(path: Path) -> str:
+    """State of a file: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
     try:
         if path.is_symlink():
             return "other"
@@ -135,12 +135,12 @@ def look(path: Path) -> str:
         if not path.is_file():
             return "other"
         size = path.stat().st_size
-        return _look(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
+        return _state_of_bytes(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
     except OSError:
         return "other"
 
 
-def _look(content: bytes) -> str:
+def _state_of_bytes(content: bytes) -> str:
     size = len(content)
     return str(size) if size > CONTENT_BYTES else f"{size} {hashlib.sha256(content).hexdigest()[:32]}"
 

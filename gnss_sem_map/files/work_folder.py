@@ -2,7 +2,7 @@
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    what is mapped (`chunks`)
-          answers/               what a network said of the images (`remembering`)
+          answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
 """

@@ -52,9 +52,7 @@ class NetworkSegmenter:
 
     @property
     def threads(self) -> int:
-        """Number of threads: one per core on a CPU, because cores that share an image wait for each other; one on a
-        GPU.
-        """
+        """Number of threads: one per core on a CPU, where cores that share an image would wait; one on a GPU."""
         return torch.get_num_threads() if self._device.type == "cpu" else 1
 
     def on_one_core(self, image: Image) -> NDArray[np.float32]:

@@ -12,13 +12,13 @@ How the drive's sensors measure (KITTI's conventions, where they were measured o
 - oxts rows of the drive follow the scans by 10.7 to 22.6 ms, jittering; the `_extract` twin has all rows, 100 Hz.
   The position error drifts slowly, 0.35 m (0.5 m up), as `pos_accuracy` says.
 
-Files in `truth/` in the drive's folder (stamps in s since the first row of the drive's oxts, positions in m, east,
-north, up of the LocalFrame at that row's position):
+Files in `truth/` in the drive's folder (stamps in s since the first row of the drive's oxts, positions in m: east,
+north, up in the LocalFrame at that row's position):
 
 - `world.json`: `epoch_ns` (Unix time of stamp zero), `lat_deg`, `lon_deg`, `alt_m` (the LocalFrame), `seed`.
 - `trajectory.tum` (100 Hz) and `trajectory_lidar.tum` (at the scans' stamps): T_map_imu, `stamp tx ty tz qx qy qz qw`.
-- `labels/<frame>.label`: SemanticKITTI, uint32 per point: class in the low 16 bits (252 and above for objects that move at
-  any time of the drive, also while they wait), instance in the high ones.
+- `labels/<frame>.label`: SemanticKITTI, uint32 per point: class in the low 16 bits (252 and above for objects that move
+  at any time of the drive, also while they wait), instance in the high ones.
 - `train_ids/<frame>.png`: the class image, Cityscapes trainIds, 255 void (parking bays). Sky is 10.
 - `single_frame/<frame>.label`: class of each visible point in that image alone (40 48 10 50 70), 0 elsewhere.
 - `vehicles.csv`: all vehicles within 120 m at every scan's stamp: centre of the bottom, yaw, size, moving or not.

@@ -109,7 +109,7 @@ def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]])
 def seen_alone(
     image: SimulatedImage, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], z: Floats
 ) -> npt.NDArray[np.uint32]:
-    """Label of every point of a scan by the true class image: 40 48 10 50 70, and 0 where the image shows another thing.
+    """Label of every point of a scan by the true class image: 40 48 10 50 70, 0 where it shows another thing.
 
     `u`, `v`, `z`: the points' pixels and depths. A point counts as seen when the image's true depth there is its own.
     """

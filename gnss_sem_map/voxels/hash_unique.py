@@ -10,9 +10,7 @@ LEAST_BITS = 10
 
 
 def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The distinct keys in ascending order (u,), and the index (n,) of every key among them, as `np.unique` gives
-    them.
-    """
+    """The distinct keys (u,) in ascending order, and the index (n,) of every key among them; as `np.unique`."""
     found, numbers = _numbered(keys)
     order = np.argsort(found)
     rank = np.empty(len(found), np.int32)

@@ -107,7 +107,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
         ["all", "31,102", "29,724", "90.0 %", "81.2 %", "90.0 %", "85.7 %"],
         ["vehicles", "12", "vehicle to road: 12"],
         ["vehicles, moving", "2"],
-        ["looks that err in all views, estimated without truth", "10.4 %"],
+        ["systematic label error rate, estimated without truth", "10.4 %"],
         ["squared residuals divided by their variances (chi2 per degree of freedom)", "1.031"],
         ["p imu antenna (m)", "0, -0.32, 0.5"],
         ["absolute trajectory error (m)", "0.1235"],

@@ -181,7 +181,7 @@ def by_the_paper(drive: Drive) -> Points:
 
 
 def removed_in_all(drive: Drive, found: MovingObjects) -> Points:
-    """The points of what moved and, as in a run, those in voxels that witnesses look through."""
+    """The points of moving objects and, as in a run, those in voxels with free-space evidence."""
     maps = build_maps(replace(drive, moving=found.points), RunStats())
     refined, _ = refine(maps.static, witnesses=found.keyframes if drive.matched else None)
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last

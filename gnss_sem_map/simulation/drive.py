@@ -38,7 +38,7 @@ _PLACE = LocalFrame(lat_deg=49.0131, lon_deg=8.4044, alt_m=115.0)
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A drive before it is written: the world, the times of the measurements, and the rows of the navigation unit.
+    """A drive before it is written: world, times of the measurements, rows of the navigation unit.
 
     Stamps are seconds since the first row of the drive's oxts; the map is the LocalFrame of that row's position.
     """

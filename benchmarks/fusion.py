@@ -32,7 +32,7 @@ from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
 from gnss_sem_map.evaluation.metrics import Tables
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
-from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
@@ -91,7 +91,7 @@ def single_frame(excerpt: Excerpt, drive: Drive) -> Labels:
     if excerpt.single_frame is not None:
         return {name: read_labels(path) for name, path in label_files(excerpt.single_frame).items()}
     found = {}
-    for seen in seen_scans(drive):
+    for seen in labelled_scans(drive):
         entries = np.zeros(len(seen.valid), np.uint32)
         five = seen.classes[:, :-1]
         of_pixel = np.append(np.where(five.any(axis=1), IDS[five.argmax(axis=1)], 0), 0)  # -1 is the last
@@ -166,7 +166,7 @@ def opened(excerpt: Excerpt) -> Drive:
     """The drive, with the trajectory that a run would use."""
     log, settings = open_drive(excerpt.drive), Settings()
     network = open_segmenter(excerpt.segmenter, URBAN, expected_size=log.calibration.image_size)
-    trajectory, _ = pipeline.estimate_trajectory(log, settings, pipeline.Account())
+    trajectory, _ = pipeline.estimate_trajectory(log, settings, pipeline.RunStats())
     return Drive(log, trajectory, network, settings)
 
 

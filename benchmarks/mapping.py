@@ -39,8 +39,8 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.probabilities import KeepsLabels
 from gnss_sem_map.mapping import labelled_scans
 from gnss_sem_map.mapping.fusion import STATIC, Drive, fuse_scans, map_chunks
-from gnss_sem_map.mapping.labelled_scans import SeenScan
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.mapping.labelled_scans import LabelledScan
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.projection import ClassImage, class_image
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
@@ -103,11 +103,11 @@ def whole_chain(job: Drive) -> Figures:
     """Read, deskew, project, occlusion, fuse: compiled against numpy, with decoded labels and with decoding them."""
     race, log = Race(), job.log
     table, plain = VoxelTable(SIZE, URBAN), numpy_chain.NumpyMap(SIZE, URBAN)
-    views = labelled_scans.Views(job, Account())
+    views = labelled_scans.Views(job, RunStats())
     points = 0
 
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
-        seen = labelled_scans._see(job, scan, scan.read(), (image, classes), views, Account())
+        seen = labelled_scans._see(job, scan, scan.read(), (image, classes), views, RunStats())
         assert seen is not None
         table.add(seen.keys, seen.pixels, seen.classes)
 
@@ -141,21 +141,21 @@ def real_time(job: Drive) -> Figures:
     best = np.inf
     for _ in range(3):
         start = time.process_time()
-        fuse_scans(job, job.log.scans, Account())
+        fuse_scans(job, job.log.scans, RunStats())
         best = min(best, (time.process_time() - start) / len(job.log.scans))
     return {"cpu_ms_per_scan": 1e3 * best, "real_time_factor": 0.1 / best}
 
 
-def seen_of(job: Drive) -> list[SeenScan]:
+def seen_of(job: Drive) -> list[LabelledScan]:
     """The scans, placed and looked at once, for those who only fuse."""
-    return list(labelled_scans.seen_scans(job))
+    return list(labelled_scans.labelled_scans(job))
 
 
-def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]:
+def against_peers(job: Drive, seen: list[LabelledScan]) -> tuple[Figures, list[str]]:
     """Transform with one pose a scan, for no peer knows more, and fuse, as far as each peer goes."""
     race, missing = Race(), []
     table, bare = VoxelTable(SIZE, URBAN), VoxelTable(SIZE, URBAN)
-    contestants: dict[str, Callable[[SeenScan, Points], Any]] = {
+    contestants: dict[str, Callable[[LabelledScan, Points], Any]] = {
         "ours, classes": lambda s, p: table.add(_keys(job, s, p), s.pixels, s.classes),
         "ours, no classes": lambda s, p: bare.add(_keys(job, s, p)),
     }
@@ -179,15 +179,15 @@ def against_peers(job: Drive, seen: list[SeenScan]) -> tuple[Figures, list[str]]
     }, missing  # fmt: skip
 
 
-def _keys(job: Drive, seen: SeenScan, points: Points) -> NDArray[np.int64]:
+def _keys(job: Drive, seen: LabelledScan, points: Points) -> NDArray[np.int64]:
     placed = labelled_scans._see(
-        job, seen.scan, points, None, labelled_scans.Views(job, Account()), Account()
+        job, seen.scan, points, None, labelled_scans.Views(job, RunStats()), RunStats()
     )
     assert placed is not None
     return placed.keys
 
 
-def against_group_by(seen: list[SeenScan]) -> tuple[Figures, list[str]]:
+def against_group_by(seen: list[LabelledScan]) -> tuple[Figures, list[str]]:
     """Ten scans at once, all in memory, keys and log-likelihoods ready: who groups fastest."""
     race, missing, seen = Race(), [], seen[:10]
     logs = numpy_chain.log_table(5, 5)
@@ -234,7 +234,7 @@ def _touch(rows: Any, ints: Any, places: Any, nothing: Any) -> None:
             ints[places[i], c] += nothing[c]
 
 
-def over_the_floor(seen: list[SeenScan], voxels: int) -> Figures:
+def over_the_floor(seen: list[LabelledScan], voxels: int) -> Figures:
     """Fusing the scans into a map of so many voxels, against random prefetched updates of a table of the same size."""
     rng, table = np.random.default_rng(0), VoxelTable(SIZE, URBAN)
     while len(table) < voxels:  # surface voxels far from the scans
@@ -261,7 +261,7 @@ def over_the_floor(seen: list[SeenScan], voxels: int) -> Figures:
 
 def on_disk(job: Drive) -> Figures:
     """Bytes of the tiles of the drive's map, and what writing and reading them costs."""
-    table = fuse_scans(job, job.log.scans, Account())[0]
+    table = fuse_scans(job, job.log.scans, RunStats())[0]
     raw, race = SemanticMap.of(table.to_map()), Race()
     with tempfile.TemporaryDirectory() as folder:
         race.run("write", lambda: tiles.write(raw, Path(folder) / "map", None))
@@ -297,7 +297,7 @@ def peak_of(scans: int) -> None:
     """In a process of its own: map the cheap drive to tiles on disk, and print the peak memory in MB."""
     with tempfile.TemporaryDirectory() as folder:
         job = cheap_drive(scans)
-        store = map_chunks(job, Path(folder) / "work", Account())
+        store = map_chunks(job, Path(folder) / "work", RunStats())
         pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
         tiles.write_tiles(pieces, Path(folder) / "map", None, SIZE, URBAN)
         about = json.loads((Path(folder) / "map/map.json").read_text())
@@ -310,7 +310,7 @@ def first_scan(drive: str, spec: str) -> None:
     """In a process of its own: seconds from the imports' end to the first fused scan, compiled code cached."""
     job = open_job(Path(drive), spec, 1)
     start, cpu = time.perf_counter(), time.process_time()
-    fuse_scans(job, job.log.scans, Account())
+    fuse_scans(job, job.log.scans, RunStats())
     print(json.dumps({"wall_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}))
 
 
@@ -323,7 +323,7 @@ def _child(call: str) -> Figures:
 def measure(drive: Path, spec: str, scans: int) -> tuple[Figures, list[str]]:
     """Everything that one drive can say."""
     job = open_job(drive, spec, scans)
-    fuse_scans(job, job.log.scans[:2], Account())  # compile
+    fuse_scans(job, job.log.scans[:2], RunStats())  # compile
     figures: Figures = {"full chain": whole_chain(job), "real time": real_time(job), "map": on_disk(job)}
     seen = seen_of(replace(job, log=_only(job.log, job.log.scans[-40:])))
     figures["peers"], missing = against_peers(job, seen)

@@ -16,18 +16,18 @@ import numpy_chain
 from numpy.typing import NDArray
 
 from gnss_sem_map.mapping.fusion import Drive
-from gnss_sem_map.mapping.labelled_scans import SeenScan
+from gnss_sem_map.mapping.labelled_scans import LabelledScan
 from gnss_sem_map.sensor_log import Points
 
 
-def _pose(job: Drive, seen: SeenScan) -> NDArray[np.float64]:
+def _pose(job: Drive, seen: LabelledScan) -> NDArray[np.float64]:
     T = np.asarray(job.trajectory.at([seen.scan.stamp], 0.15)[0] @ job.log.calibration.T_imu_lidar)
     left, _, right = np.linalg.svd(T[:3, :3])  # kiss-icp refuses a rotation off by 1e-9, as KITTI's are
     T[:3, :3] = left @ right
     return T
 
 
-def open3d_hash(job: Drive) -> Callable[[SeenScan, Points], None]:
+def open3d_hash(job: Drive) -> Callable[[LabelledScan, Points], None]:
     """Open3D's hash of integer voxels, sums and hits in numpy."""
     import open3d as o3d
 
@@ -36,7 +36,7 @@ def open3d_hash(job: Drive) -> Callable[[SeenScan, Points], None]:
     evidence, hits = np.zeros((capacity, 5), np.int32), np.zeros(capacity, np.uint32)
     logs = numpy_chain.log_table(5, 5)
 
-    def add(seen: SeenScan, points: Points) -> None:
+    def add(seen: LabelledScan, points: Points) -> None:
         T = _pose(job, seen)
         p_map = points.xyz[seen.valid].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
         indices = core.Tensor.from_numpy(np.floor(p_map / job.settings.mapping.voxel_size_m).astype(np.int32))
@@ -51,7 +51,7 @@ def open3d_hash(job: Drive) -> Callable[[SeenScan, Points], None]:
     return add
 
 
-def kiss_icp_map(job: Drive) -> Callable[[SeenScan, Points], None]:
+def kiss_icp_map(job: Drive) -> Callable[[LabelledScan, Points], None]:
     """KISS-ICP's local map."""
     from kiss_icp.mapping import VoxelHashMap
 

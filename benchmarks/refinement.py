@@ -34,13 +34,13 @@ from gnss_sem_map.dynamics.moving_objects import MovingObjects
 from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.fusion import build_maps
-from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.pipeline import estimate_trajectory
 from gnss_sem_map.refinement.count_grid import count_grid
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
@@ -177,24 +177,24 @@ def count_grid_beside_bincount(large: bool) -> Figures:
 
 def by_the_paper(drive: Drive) -> Points:
     """Points in voxels that eq. 12 and 13 remove."""
-    maps = build_maps(drive, Account())
+    maps = build_maps(drive, RunStats())
     refined, _ = refine(maps.static + maps.removed, PAPER)
     gone = refined.states == State.REMOVED
     points = {}
-    for seen in seen_scans(drive):
-        places = refined.voxels.places(keys_of(seen.p_map, refined.voxels.voxel_size_m))
+    for seen in labelled_scans(drive):
+        places = refined.voxels.indices_of(keys_of(seen.p_map, refined.voxels.voxel_size_m))
         points[seen.scan.number] = np.flatnonzero((places >= 0) & gone[places])
     return points
 
 
 def removed_in_all(drive: Drive, found: MovingObjects) -> Points:
     """The points of what moved and, as in a run, those in voxels that witnesses look through."""
-    maps = build_maps(replace(drive, moving=found.points), Account())
-    refined, _ = refine(maps.static, beside=Evidence(keyframes=found.witnesses if drive.matched else None))
+    maps = build_maps(replace(drive, moving=found.points), RunStats())
+    refined, _ = refine(maps.static, beside=Evidence(keyframes=found.keyframes if drive.matched else None))
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last
     points = {}
-    for seen in seen_scans(replace(drive, segmenter=None)):
-        places = maps.static.places(keys_of(seen.p_map, maps.static.voxel_size_m))
+    for seen in labelled_scans(replace(drive, segmenter=None)):
+        places = maps.static.indices_of(keys_of(seen.p_map, maps.static.voxel_size_m))
         moved = found.points.get(seen.scan.number, np.empty(0, np.int64))
         points[seen.scan.number] = np.union1d(moved, np.flatnonzero(empty[places]))
     return points
@@ -204,7 +204,7 @@ def timed_find_moving(drive: Drive) -> tuple[MovingObjects, dict[str, float]]:
     """What moved, and what finding it costs per scan: beside reading and labelling, and waiting for all."""
     find_moving(replace(drive, log=replace(drive.log, scans=drive.log.scans[:10])))  # compiles
     found: list[MovingObjects] = []
-    reading, waiting_to_read = clocked(lambda: [None for _ in seen_scans(drive)])
+    reading, waiting_to_read = clocked(lambda: [None for _ in labelled_scans(drive)])
     finding, waiting = clocked(lambda: found.append(find_moving(drive)))
     per_scan = 1e3 / len(drive.log.scans)
     return found[0], {
@@ -224,9 +224,9 @@ def on_raw_drive(data: Path) -> Figures:
     )
     figures: Figures = {}
     for name, trajectory in (
-        (AS_IT_RUNS, estimate_trajectory(log, Settings(), Account())[0]),
+        (AS_IT_RUNS, estimate_trajectory(log, Settings(), RunStats())[0]),
         ("the unit's own poses", log.reference),
-        ("GNSS and IMU alone", estimate_trajectory(log, alone, Account())[0]),
+        ("GNSS and IMU alone", estimate_trajectory(log, alone, RunStats())[0]),
     ):
         drive = Drive(log, trajectory, segmenter, Settings(), matched=name == AS_IT_RUNS)
         found, cost = timed_find_moving(drive)
@@ -246,7 +246,9 @@ def perfectly_seen(folder: Path) -> Drive:
     """A simulated drive with the poses that a run finds, and perfect class images."""
     log = open_drive(folder)
     segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
-    return Drive(log, estimate_trajectory(log, Settings(), Account())[0], segmenter, Settings(), matched=True)
+    return Drive(
+        log, estimate_trajectory(log, Settings(), RunStats())[0], segmenter, Settings(), matched=True
+    )
 
 
 def on_simulated_drive(folder: Path) -> Figures:
@@ -257,7 +259,7 @@ def on_simulated_drive(folder: Path) -> Figures:
     cases = what_they_do(folder)
     counts = np.zeros((3, 2), np.int64)
     movers: dict[str, NDArray[np.int64]] = {}
-    for seen in seen_scans(Drive(drive.log, drive.trajectory, None, drive.settings)):
+    for seen in labelled_scans(Drive(drive.log, drive.trajectory, None, drive.settings)):
         truth = np.fromfile(folder / "truth" / "labels" / f"{seen.scan.name}.label", "<u4")[seen.valid]
         removed = np.zeros(len(truth), np.uint32)
         removed[points.get(seen.scan.number, [])] = 1
@@ -323,7 +325,7 @@ def strict_counts(
 ) -> dict[str, NDArray[np.int64]]:
     """Confusion of single image, fused map, refined map and the paper's refinement, on the points of the first."""
     drive = replace(drive, moving=points)
-    maps = build_maps(drive, Account())
+    maps = build_maps(drive, RunStats())
     raw = maps.static + maps.removed
     stages = {
         "fused (eq. 6)": SemanticMap.of(raw),
@@ -335,14 +337,14 @@ def strict_counts(
         for name in ("single image", *stages)
     }
     ids = np.append(URBAN.semantic_kitti_ids, 0).astype("<u4")
-    for seen in seen_scans(drive):
+    for seen in labelled_scans(drive):
         true = np.fromfile(truth / f"{seen.scan.name}.label", "<u4")[seen.valid]
         alone = np.fromfile(single_frame / f"{seen.scan.name}.label", "<u4")[seen.valid]
         of_image = alone & 0xFFFF != 0
         counts["single image"] += confusion(alone[of_image], true[of_image], TABLES, seen.scan.name)
         keys = keys_of(seen.p_map[of_image], raw.voxel_size_m)
         for name, stage in stages.items():
-            places = stage.voxels.places(keys)
+            places = stage.voxels.indices_of(keys)
             shown = np.where((places >= 0) & (stage.labels[places] >= 0), stage.labels[places], -1)
             if name == "paper":
                 shown[stage.states[places] == State.REMOVED] = -1

@@ -36,7 +36,9 @@ def _table(path: Path, columns: tuple[str, ...]) -> NDArray[np.float64]:
             places = [names.index(name) for name in columns]
             rows = np.loadtxt(file, delimiter=",", usecols=places, ndmin=2)
     except (OSError, ValueError) as error:
-        raise MeasurementError(f"{path}: {error}; expected a table with columns {','.join(columns)}") from None
+        raise MeasurementError(
+            f"{path}: {error}; expected a table with columns {','.join(columns)}"
+        ) from None
     if len(rows) == 0:
         raise MeasurementError(f"{path}: empty; expected rows of {','.join(columns)}")
     return rows

@@ -1,4 +1,4 @@
-"""In which axes, units and clocks the sensors of a log report, and how their data become ours.
+"""Axes, units and clocks of the sensors of a log, and their conversion to ours.
 
 Ours: x forward, y left, z up; specific force in m/s² (at rest it points up), angular rate in rad/s; one clock.
 """
@@ -46,7 +46,7 @@ Axes = Annotated[str, AfterValidator(_known)]
 
 
 class SensorConventions(BaseModel):
-    """How the sensors of a drive report. What is empty is as the drive's `log.yaml` says, and else as ours."""
+    """Conventions of the sensors of a drive. Empty ones are as in the drive's `log.yaml`, and else ours."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -73,7 +73,7 @@ class SensorConventions(BaseModel):
     )
 
     def over(self, drive: SensorConventions) -> SensorConventions:
-        """These, and where nothing is set here those of the drive."""
+        """These conventions, completed with those of the drive."""
         return drive.model_copy(update=self.model_dump(exclude_none=True))
 
     def imu_in_ours(self, imu: ImuSamples) -> ImuSamples:

@@ -14,7 +14,7 @@ class DataError(SemMapError, ValueError):
 
 
 class WriteError(DataError):
-    """What is needed later cannot be written: no fault of the one scan or image that it was about."""
+    """A file that is needed later cannot be written: the run stops, where other errors skip one scan or image."""
 
 
 class ImageSizeError(DataError):

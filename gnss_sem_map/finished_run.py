@@ -26,7 +26,7 @@ from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -122,12 +122,12 @@ class Run:
         Scans are read only where the run has point labels. Raises ConfigError where more than the refinement changes.
         """
         _check_same_map(self.settings, settings)
-        found, raw, account = evidence.read(self.folder, self.label_set), self.map(refined=False), Account()
-        with account.stage("refinement"):
+        found, raw, stats = evidence.read(self.folder, self.label_set), self.map(refined=False), RunStats()
+        with stats.stage("refinement"):
             state, report = pipeline.refine_map(raw.voxels - found.moved, found, settings)
         assert state.decided is not None
         result = pipeline.Result(
-            self.trajectory, None, raw, state.decided, report, account, found, kerbs=state.kerbs
+            self.trajectory, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
         )
         log = self.drive() if is_folder(self.folder / "labels") else None
         return self._written(out, result, settings, log, {})
@@ -145,7 +145,7 @@ class Run:
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_sharp = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, matched=is_sharp)
-        result = pipeline.map_drive(drive, Account(), progress, labels_from=segmenter)
+        result = pipeline.map_drive(drive, RunStats(), progress, labels_from=segmenter)
         inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
         return self._written(out, result, settings, with_labels, {"inputs": inputs})

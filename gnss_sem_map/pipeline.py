@@ -39,10 +39,10 @@ from gnss_sem_map.refinement.road_sidewalk import ways
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, run_steps
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.segmentation.remembered import RememberedSegmenter, answers_folder
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, answers_folder
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
 
@@ -59,7 +59,7 @@ class Result:
     raw: SemanticMap
     refined: SemanticMap
     refinement: RefinementReport
-    account: Account
+    stats: RunStats
     evidence: RunEvidence
     """What is known beside the map, kept so that it can be refined again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
@@ -92,27 +92,27 @@ def run(
     EstimationError from the smoother.
     """
     log = log.in_our_conventions(settings.sensors)
-    account = Account(skips=list(log.skips))
+    stats = RunStats(skips=list(log.skips))
     _sensor_model(settings)  # of other classes: refused now
-    page = check_drive(log, segmenter, settings, account, force)
-    with account.stage("trajectory"):
+    page = check_drive(log, segmenter, settings, stats, force)
+    with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
-        found = locate(log, settings, account, progress, page.solution)
+        found = locate(log, settings, stats, progress, page.solution)
         progress("trajectory", 1, 1)
-    with account.stage("sharpness"):
+    with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
         figures = of_drive(log, trajectories, progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
     drive = Drive(log, found.trajectory, segmenter, settings, matched=found.from_lidar_odometry)
     result = map_drive(
-        drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
+        drive, stats, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
     )
     return replace(result, solution=found.solution, sharpness=sharpness, preflight=page)
 
 
 def map_drive(
     drive: Drive,
-    account: Account,
+    stats: RunStats,
     progress: Progress = silent,
     *,
     work: Path | None = None,
@@ -122,25 +122,25 @@ def map_drive(
 ) -> Result:
     """Raw map and refined map of a drive whose trajectory is known; see `run`."""
     with _answers(drive, work, resume, labels_from) as folder:
-        drive, found = _without_moving(drive, folder, account, progress)
-        with account.stage("mapping"):
+        drive, found = _without_moving(drive, folder, stats, progress)
+        with stats.stage("mapping"):
             maps = build_maps(
-                drive, account, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
+                drive, stats, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
             )
     raw = SemanticMap.of(maps.static + maps.removed)
-    with account.stage("refinement"):
+    with stats.stage("refinement"):
         progress("refinement", 0, 1)
-        keyframes = found.witnesses if drive.matched else None
+        keyframes = found.keyframes if drive.matched else None
         heights = _heights(drive, raw.voxels)
         evidence = RunEvidence(maps.removed, drive.moving or {}, keyframes, heights)
         state, report = refine_map(maps.static, evidence, drive.settings)
         progress("refinement", 1, 1)
     refined = _decided(state)
     if (refined.states == State.REMOVED).all():
-        account.warnings.append("everything was taken for moving: what is drawn is what was removed")
+        stats.warnings.append("everything was taken for moving: what is drawn is what was removed")
     report = replace(report, tracked=found.objects)
     return Result(
-        drive.trajectory, None, raw, refined, report, account, evidence,
+        drive.trajectory, None, raw, refined, report, stats, evidence,
         from_lidar_odometry=drive.matched, kerbs=state.kerbs,
     )  # fmt: skip
 
@@ -175,14 +175,14 @@ def _heights(drive: Drive, voxels: VoxelMap) -> SurfaceHeights | None:
 
 
 def check_drive(
-    log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account, force: bool = False
+    log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats, force: bool = False
 ) -> Preflight:
     """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
-    with account.stage("preflight"):
+    with stats.stage("preflight"):
         page = preflight.check(log, settings, segmenter, with_camera=segmenter is not None)
     if page.level is Level.RED and not force:
         raise PreflightError(log.name, page)
-    account.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
+    stats.warnings.extend(str(finding) for finding in (*page.of(Level.RED), *page.of(Level.AMBER)))
     return page
 
 
@@ -197,7 +197,7 @@ def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) ->
 
 
 def _without_moving(
-    drive: Drive, folder: Path, account: Account, progress: Progress
+    drive: Drive, folder: Path, stats: RunStats, progress: Progress
 ) -> tuple[Drive, MovingObjects]:
     """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
     log, settings = drive.log, drive.settings
@@ -206,9 +206,9 @@ def _without_moving(
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
         label_set = open_label_set(settings.classes)
-        remembered = RememberedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
+        remembered = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
         drive = replace(drive, segmenter=remembered)
-    with account.stage("motion"):
+    with stats.stage("motion"):
         moving = find_moving(drive, progress)
-    account.counts["points of moving objects"] += sum(map(len, moving.points.values()))
+    stats.counts["points of moving objects"] += sum(map(len, moving.points.values()))
     return replace(drive, moving=moving.points), moving

@@ -1,4 +1,4 @@
-"""What a run did and what it cost: counts, skips, warnings, seconds and memory of every stage."""
+"""Statistics of a run: counts, skips, warnings, and time and memory of every stage."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from dataclasses import dataclass, field
 from gnss_sem_map.sensor_log import Skip
 
 Progress = Callable[[str, int, int], None]
-"""Called with the stage, how much of it is done, and how much there is."""
+"""Called with the name of a stage, the number of finished steps, and their total."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Progress for those who do not watch."""
+    """Progress that is not shown."""
 
 
 @dataclass
-class Account:
-    """What a run did: counts, skips, and the cost of every stage."""
+class RunStats:
+    """Statistics of a run: counts, skips, warnings, and time and memory of every stage."""
 
     counts: Counter[str] = field(default_factory=Counter)
     skips: list[Skip] = field(default_factory=list)
@@ -31,7 +31,7 @@ class Account:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time everything inside as one stage."""
+        """Measure time and peak memory of the block as one stage."""
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

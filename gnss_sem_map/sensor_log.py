@@ -1,4 +1,4 @@
-"""One drive: what every sensor reported, each measurement with its own stamp.
+"""One drive: the measurements of all sensors, each with its own stamp.
 
 Scans and images are read when they are needed; everything else is small and in memory. Measurements are joined by
 stamp, or by the frame number in the file name, never by their position in a list.
@@ -99,7 +99,7 @@ def file_of(item: Scan | Image) -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Where the sensors sit, and how the camera sees."""
+    """Calibration: poses of the sensors and camera intrinsics."""
 
     T_imu_lidar: NDArray[np.float64]
     """(4, 4)."""
@@ -143,13 +143,13 @@ def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
 
 @dataclass(frozen=True)
 class Skip:
-    """Something that was expected, is not there or not usable, and was left out."""
+    """Something that is missing or not usable, and was skipped."""
 
     what: str
     where: str
     reason: str
     frames: int = 1
-    """How many frames, rows or files it stands for."""
+    """Number of frames, rows or files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,14 +171,14 @@ class SensorLog:
     imu_noise: ImuNoise | None = None
     """None: the estimator's default."""
     initial_attitude: AttitudePrior | None = None
-    """What the navigation unit knows of the attitude at the first IMU stamp; None: found from the motion."""
+    """Attitude of the navigation unit at the first IMU stamp; None: estimated from the motion."""
     given: Trajectory | None = None
-    """Poses that came with the drive; where they are there, nothing is smoothed."""
+    """Poses given with the drive; if present, there is no smoothing."""
     reference: Trajectory | None = None
-    """What the drive's own navigation system says, to compare with; never used as input."""
+    """Poses by the drive's own navigation system, for comparison; never used as input."""
     skips: tuple[Skip, ...] = ()
     conventions: SensorConventions | None = field(default_factory=SensorConventions)
-    """In which axes, units and clocks the drive says that its sensors report; None: all are ours already."""
+    """Axes, units and clocks of the drive's sensors, as the drive declares them; None: all are ours."""
 
     def __post_init__(self) -> None:
         for what, items in (("scans", self.scans), ("images", self.images)):
@@ -192,7 +192,7 @@ class SensorLog:
 
     @property
     def folders(self) -> set[Path]:
-        """Where the files of scans and images are."""
+        """Folders of the files of scans and images."""
         files = {*map(file_of, self.scans), *map(file_of, self.images)}
         return {file.parent for file in files if file is not None}
 
@@ -207,7 +207,7 @@ class SensorLog:
         return replace(self, scans=tuple(scan for scan in self.scans if low <= scan.number < high))
 
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
-        """The same log in our axes, units and clock, once: what is chosen wins over what the drive says of itself."""
+        """The same log in our axes, units and clock; chosen conventions have priority over those of the drive."""
         if self.conventions is None:
             return self
         theirs = chosen.over(self.conventions)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.evaluation.metrics import Tables, dynamic, dynamic_counts
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.labelled_scans import Drive, seen_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.sensor_log import Calibration
 
@@ -119,7 +119,7 @@ def removal(drive: Drive, moving: Mapping[int, NDArray[np.int64]], folder: Path)
     poses = drive.trajectory.at(stamps, EXTRAPOLATE_S) @ calibration.T_imu_lidar
     T_map_lidar = {scan.number: T for scan, T in zip(drive.log.scans, poses, strict=True)}
     counts = np.zeros((3, 2), np.int64)
-    for seen in seen_scans(drive):
+    for seen in labelled_scans(drive):
         T = T_map_lidar[seen.scan.number]
         p_lidar = (seen.p_map - T[:3, 3]) @ T[:3, :3]
         true = truth(boxes, p_lidar, seen.scan.number, in_image(p_lidar, calibration), T_map_lidar)

@@ -16,7 +16,7 @@ from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.run_folder import claimed_run, write_run
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
@@ -64,12 +64,12 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
     network = open_segmenter("demo", label_set) if source == "network" else None
     settings = config.load(overrides=[f"calibration={DEMO_CALIBRATION}"] if network else [])
 
-    account = Account()
+    stats = RunStats()
     with new_folder(world) as folder:
-        with account.stage("simulate"):
+        with stats.stage("simulate"):
             drive = simulate(folder, seconds, seed, lambda done, total: progress("simulate", done, total))
         log = open_drive(drive)
-        with account.stage("segment"):
+        with stats.stage("segment"):
             if network is not None:
                 write_cache(log.images, network, label_set, folder / PROBABILITIES, "demo", 1, progress)
             else:
@@ -85,7 +85,7 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
     metrics = score_run(out, drive / "truth")
     write_report(out, about, metrics)
     return Demo(
-        about | {"seconds": account.seconds | about["seconds"]},
+        about | {"seconds": stats.seconds | about["seconds"]},
         metrics,
         tuple(out / name for name in PICTURES if (out / name).is_file()),
     )

@@ -79,9 +79,9 @@ def calibrate(
         found = measure(list(zip(run_folders, truth, strict=True)), drive, segmenter, progress)
     with replacing(out) as file:
         file.write(found.to_yaml().encode())
-    points = sum(int(street.answers.sum()) for street in found.streets)
+    points = sum(int(one.answers.sum()) for one in found.drives)
     typer.echo(
-        f"{points} points of {len(found.streets)} drives, temperature {found.temperature:.2f};"
+        f"{points} points of {len(found.drives)} drives, temperature {found.temperature:.2f};"
         f" now use --set calibration={out}"
     )
 

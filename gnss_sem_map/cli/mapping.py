@@ -72,7 +72,7 @@ def run(
                 force=force,
             )
             about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
-    warn(result.account.warnings)
+    warn(result.stats.warnings)
     print_run(about, out, as_json)
 
 
@@ -108,17 +108,17 @@ def trajectory(
     """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
     from gnss_sem_map import pipeline
     from gnss_sem_map.export import run_folder
-    from gnss_sem_map.run_stats import Account
+    from gnss_sem_map.run_stats import RunStats
 
     settings = settings_of(config, set_)
     with run_folder.claimed_run(out, inputs_of(drive, config, settings)):
         log = open_log(drive, drive_format, None)
-        account = Account(skips=list(log.skips))
-        page = pipeline.check_drive(log, None, settings, account, force)
-        with progress_bars() as progress, account.stage("trajectory"):
-            estimate, solution = pipeline.estimate_trajectory(log, settings, account, progress)
-        about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, account, settings, page)
-    warn(account.warnings)
+        stats = RunStats(skips=list(log.skips))
+        page = pipeline.check_drive(log, None, settings, stats, force)
+        with progress_bars() as progress, stats.stage("trajectory"):
+            estimate, solution = pipeline.estimate_trajectory(log, settings, stats, progress)
+        about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, stats, settings, page)
+    warn(stats.warnings)
     if as_json:
         typer.echo(json.dumps(about))
     else:

@@ -1,4 +1,4 @@
-"""Drives in: every reader turns one folder layout into a `SensorLog`."""
+"""Dataset readers: each reads one folder layout into a `SensorLog`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DriveFormat = Literal["kitti-raw", "kitti-odometry", "table"]
 
 
 def detect_format(drive: Path) -> DriveFormat:
-    """Say what kind of drive a folder holds, from what is there; raises DataError when it is none."""
+    """Detect the format of a drive from its files; raises DataError for an unknown one."""
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
     if is_folder(drive / "oxts"):
@@ -30,7 +30,7 @@ def detect_format(drive: Path) -> DriveFormat:
 
 
 def open_drive(drive: Path, drive_format: DriveFormat | None = None) -> SensorLog:
-    """Open a drive of any known format: small things are read now, scans and images when they are needed."""
+    """Open a drive of any known format: tables are read now, scans and images when they are needed."""
     from gnss_sem_map.datasets import csv_log, kitti_odometry, kitti_raw
 
     readers = {

@@ -1,4 +1,4 @@
-"""Table logs: a user's own drive as plain tables, with scans and images beside them where there are any.
+"""CSV logs: a user's own drive as tables, with optional scans and images beside them.
 
     imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
                                                        or as `imu_axes`, `force_unit`, `rate_unit` of log.yaml say
@@ -42,10 +42,10 @@ Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
 MOST_OUTSIDE = 0.1
-"""Share of a sweep's points that may have no time of it."""
+"""Largest share of a sweep's points without a valid time."""
 UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
 SWEEPS_S = (0.01, 0.6)
-"""What most of a sweep takes: scanners turn 2 to 50 times a second."""
+"""Duration of most of a sweep: scanners have 2 to 50 revolutions per second."""
 Matrix4 = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
@@ -59,7 +59,7 @@ GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", 
 
 
 class LogFile(SensorConventions):
-    """What `log.yaml` may say about the drive; its axes, units and clocks are those of `SensorConventions`."""
+    """Content of `log.yaml`; axes, units and clocks are those of `SensorConventions`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -126,7 +126,7 @@ def _about(path: Path) -> LogFile:
 
 
 def _fixes(path: Path) -> tuple[Array, list[Skip]]:
-    """The rows of the receiver that are fixes, as they come, and what was left out."""
+    """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     rows = _table(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S)
     stamped = np.isfinite(rows[:, 0])
     stamped[stamped] = ~far_off(rows[stamped, 0])
@@ -194,7 +194,7 @@ def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any
 
 
 def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
-    """Stamp of every frame, the first where there are several; and the lines that were left out.
+    """Stamp of every frame, the first one if there are several; and the skipped lines.
 
     A number may have 19 digits: it is never a floating number.
     """
@@ -217,7 +217,7 @@ def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
 
 
 def _whole(text: str) -> int | None:
-    """A frame number, as `7`, `0007` or, as some programs write it, `7.0`; None for anything else."""
+    """A frame number, written `7`, `0007` or `7.0`; None for anything else."""
     whole = text.strip()
     head, point, tail = whole.partition(".")
     if point and not tail.strip("0"):
@@ -226,7 +226,7 @@ def _whole(text: str) -> int | None:
 
 
 def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
-    """Number, stamp and file of every frame that has both; and what was left out."""
+    """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
     if not found.files and not is_file(folder / "stamps.csv"):
         return [], found.skips
@@ -261,7 +261,7 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.Sta
 
 
 def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> None:
-    """Make points without a time of this sweep such as cannot be used; raises DataError when they are many."""
+    """Invalidate the points without a time in this sweep; raises DataError when they are too many."""
     outside = ~(np.abs(after) <= LONGEST_SWEEP_S)
     count = int(outside.sum())
     if count > MOST_OUTSIDE * len(rows):
@@ -282,7 +282,7 @@ def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> 
 
 
 def _mistake_of(after: Array) -> str:
-    """What times of a sweep probably are that are no seconds after its stamp; none is sorted out by a few odd ones."""
+    """Probable unit or reference of point times that are not seconds after the stamp; robust to a few outliers."""
     known = after[np.isfinite(after)]
     if not len(known):
         return "point times are not numbers"

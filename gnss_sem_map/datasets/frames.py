@@ -1,4 +1,4 @@
-"""Files numbered by frame: the number in the name is the key, the position in the folder means nothing."""
+"""Files numbered by frame: the key is the number in the name, never the position in the folder."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from gnss_sem_map.files.untrusted import inside, is_folder, open_file, reason, s
 from gnss_sem_map.sensor_log import Skip
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Of two images of one frame the first kind is read."""
+"""If a frame has two images, the first of these endings is read."""
 MOST_POINTS = 10_000_000
 FARTHEST_M, NEAREST_M = 1000.0, 1e-6
-"""No LiDAR on a road sees farther; and a coordinate nearer to zero, but not zero, is no measurement."""
+"""Range limit of LiDARs on roads; and coordinates nearer to zero, but not zero, are no measurements."""
 NO_POINTS, EVERY = 0.1, 8
 """With so many of its points out of these bounds a file is no scan: of random bytes nine in ten coordinates are. Every
 eighth point tells it at no cost."""
@@ -60,7 +60,7 @@ def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
 
 
 def state_of(path: Path) -> State | None:
-    """How a file is now, to be compared when it is read; None where that cannot be known."""
+    """State of a file, to be compared when it is read; None if it cannot be read."""
     try:
         found = status(path)
     except DataError:
@@ -98,7 +98,7 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
 
 
 def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
-    """Points that were not measured, zero or not finite, are no reason to refuse a scan."""
+    """Check the coordinates of a scan; points that were not measured (zero or not finite) are accepted."""
     sizes = np.abs(rows[::EVERY, :3])
     out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
     share = float(out.any(axis=1).mean())

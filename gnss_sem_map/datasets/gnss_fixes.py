@@ -1,4 +1,4 @@
-"""Which rows of a receiver are fixes: a place on Earth, an accuracy, and no jump that no vehicle can make."""
+"""Valid fixes of a receiver: a position on Earth, an accuracy, and no jump that a vehicle cannot make."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Array = NDArray[np.float64]
 LEAST_STDDEV_M, LARGEST_STDDEV_M = 1e-4, 1e5
 LARGEST_ALT_M = 1e5
 JUMP_M, FASTEST_M_S = 20_000.0, 150.0
-"""A fix this much farther from its neighbours than the fastest car can be is of somewhere else."""
+"""A fix is an outlier if it is farther from its neighbours than the fastest car drives, by this margin."""
 NEIGHBOURS = 21
 
 
 def usable_fixes(
     stamps: Array, geodetic: Array, stddevs: Array, where: str
 ) -> tuple[NDArray[np.bool_], list[Skip]]:
-    """Which rows are fixes (n,), and one skip for each kind of those that are not.
+    """Mask (n,) of the rows that are valid fixes, and one skip for each kind of invalid rows.
 
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
     """
@@ -48,7 +48,9 @@ def usable_fixes(
 
 
 def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:
-    """Whether each fix is where its neighbours in time are; of places too far apart the one with most fixes stays."""
+    """Mask of the fixes close to their neighbours in time; of positions too far apart, the group with most fixes is
+    kept.
+    """
     near = np.ones(len(stamps), np.bool_)
     if len(stamps) < 3:
         return near
@@ -56,8 +58,8 @@ def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:
     t, p = stamps[order], _cartesian(geodetic[order])
     around = median_filter(p, size=(min(NEIGHBOURS, len(p)), 1), mode="reflect")
     half = NEIGHBOURS // 2
-    places = np.arange(len(t))
-    span = t[np.minimum(places + half, len(t) - 1)] - t[np.maximum(places - half, 0)]
+    rows = np.arange(len(t))
+    span = t[np.minimum(rows + half, len(t) - 1)] - t[np.maximum(rows - half, 0)]
     kept = np.linalg.norm(p - around, axis=1) <= JUMP_M + FASTEST_M_S * span
     jumps = np.linalg.norm(np.diff(p[kept], axis=0), axis=1) > JUMP_M + FASTEST_M_S * np.diff(t[kept])
     place = np.concatenate([[0], np.cumsum(jumps)])[: int(kept.sum())]

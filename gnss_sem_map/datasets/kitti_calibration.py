@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 MOST_BYTES = 1 << 20
 LARGEST = 1e6
-"""No length in m, and none in px, is larger."""
+"""Largest length in m or px."""
 LARGEST_SIDE_PX = 65_535
 
 
@@ -53,7 +53,7 @@ def transform(R: Array, t: Array, where: str) -> Array:
 
 
 def rotation_fault(R: Array) -> str:
-    """What is wrong with a matrix (3, 3) that is no rotation, in a few words."""
+    """Why a matrix (3, 3) is not a rotation, in a few words."""
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(R))
         scale = float(np.cbrt(determinant))

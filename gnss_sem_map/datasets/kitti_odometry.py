@@ -24,7 +24,7 @@ from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog,
 Array = NDArray[np.float64]
 
 SIX_DIGITS = 2e-4
-"""How far rows of six digits, multiplied many times over, are off a rotation."""
+"""Tolerance for rotations: rows of six digits, the product of many multiplications."""
 FARTHEST_M = 1e6
 
 

@@ -29,12 +29,12 @@ from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog,
 Array = NDArray[np.float64]
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
 FIRST_YEAR, LAST_YEAR = 1980, 2200
-"""Of GPS, and of nanoseconds in 64 bits."""
+"""Years of GPS, and of nanoseconds in 64 bits."""
 MOST_ROW_BYTES = 10_000
 
 CAMERA_TIME_OFFSET_S = -0.0085
 ATTITUDE_STDDEVS_RAD = np.array([0.005, 0.005, 0.01])
-"""How far the unit's first roll, pitch and yaw are believed; a looser yaw lets a short track turn the whole map."""
+"""Standard deviations of the unit's first roll, pitch, yaw; with a larger one a short track rotates the whole map."""
 OXTS_NOISE = ImuNoise(
     accelerometer_noise_density=5e-4,
     gyroscope_noise_density=6e-5,
@@ -48,11 +48,11 @@ OXTS_NOISE = ImuNoise(
 OXTS_COLUMNS = 30
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
-"""ax ay az: in the body; af al au are levelled with the unit's own attitude and would leak it."""
+"""ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would leak into the result."""
 ANGULAR_RATE = slice(17, 20)
 POSITION_ACCURACY = 23
 LEAST_ACCURACY_M = 1e-4
-"""Zero is no standard deviation; what is too small to be true is for the pre-flight to say."""
+"""Standard deviations must be positive; too small ones are a matter of the pre-flight check."""
 
 
 def read(drive: Path) -> SensorLog:
@@ -189,7 +189,7 @@ def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
 
 
 def _oxts_row(path: Path) -> tuple[str, Array]:
-    """What is wrong with a row of the navigation unit, if anything, and its numbers; the accuracy may be none."""
+    """Error of a row of the navigation unit, if any, and its numbers; the accuracy may be missing."""
     try:
         row = np.array(read_text(path, MOST_ROW_BYTES).split(), np.float64)
     except DataError as error:
@@ -213,7 +213,7 @@ def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[A
 
 
 def _reference_poses(positions: Array, oxts: Array) -> Array:
-    """What the unit itself says: T_map_imu (k, 4, 4)."""
+    """Poses by the navigation unit itself: T_map_imu (k, 4, 4)."""
     T_map_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
     T_map_imu[:, :3, :3] = _attitudes(oxts)
     T_map_imu[:, :3, 3] = positions

@@ -1,4 +1,4 @@
-"""Stamps that can be of one drive: looked at before anything is sized by them."""
+"""Plausibility of stamps: checked before memory is allocated by them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ LONGEST_SWEEP_S = 1.0
 FAR_FROM_SWEEP_S = 0.5
 """A scan's stamp may lie this far outside its sweep."""
 LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_FRAME_STEP_S = 0.5, 100.0, 20.0
-"""Usual steps are far shorter, a thousandth of a second in place of a second makes them longer."""
+"""Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer."""
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 
 
 class Stamped(Protocol):
-    """What happened at one moment."""
+    """A measurement with a stamp."""
 
     @property
     def number(self) -> int:
@@ -52,7 +52,7 @@ def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -
 
 
 def sweep_fault(stamp: float, start: float, end: float) -> str | None:
-    """Why these cannot be the stamp, start and end of one sweep, s; None where they can."""
+    """Why these are not the stamp, start and end of one sweep, s; None if they are plausible."""
     if not start < end:
         return "the sweep ends before it starts"
     if end - start > LONGEST_SWEEP_S:
@@ -63,7 +63,7 @@ def sweep_fault(stamp: float, start: float, end: float) -> str | None:
 
 
 def in_order(what: str, items: list[T], skips: list[Skip]) -> tuple[T, ...]:
-    """Sorted by stamp; of two with the same stamp the first stays, and none that is far off in time: see `skips`."""
+    """Sorted by stamp; of two with equal stamps the first is kept, and outliers in time are removed: see `skips`."""
     alone = far_off(np.array([item.stamp for item in items]))
     for item, is_off in zip(items, alone, strict=True):
         if is_off:

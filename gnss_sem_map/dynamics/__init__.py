@@ -1,1 +1,1 @@
-"""Moving objects, found in the scans before there is a map."""
+"""Moving objects: found in the scans by free-space evidence, before the map is built."""

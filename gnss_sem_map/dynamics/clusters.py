@@ -1,7 +1,7 @@
-"""The objects of one scan: what the image calls a vehicle, and what stands around the car and is no larger than one.
+"""Segments of one scan: candidates for vehicles, found by clustering.
 
-Points are gathered into voxels once, and whatever is asked of a segment is asked of those: a scan has ten times as many
-points.
+A candidate has points that the image labels as vehicle, or lies outside of the image and has the size of a vehicle.
+Points are grouped into voxels once, and segments are computed from voxels: a scan has ten times as many points.
 """
 
 from __future__ import annotations
@@ -17,65 +17,67 @@ from gnss_sem_map.voxels.hash_unique import distinct
 from gnss_sem_map.voxels.voxel_map import keys_of, unpack
 
 VOXEL_M = 0.2
-CLOSER = 0.5
-"""What may be two vehicles is taken apart at this share of the distance."""
+SPLIT_EPS_SHARE = 0.5
+"""A segment that may be two vehicles is clustered again with this share of the distance."""
 PART_M = 0.2
-"""A segment inside the box of another, or this far outside, is a part of it: a far edge of a roof, a mirror."""
+"""A segment inside the bounding box of another, extended by this, is a part of it: the far edge of a roof, a mirror."""
 LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.5
-"""What is longer than the first is perhaps two vehicles. A segment that reaches beyond what the image shows is no
-larger than the next two, a lorry or a bus, and one that no image shows no lower than the last: what comes back of a car
-behind is its front, without the windscreen."""
+"""A segment longer than LARGE_M may be two vehicles. A segment that extends beyond the image has at most LONGEST_M and
+HIGHEST_M, the size of a lorry or a bus. One without vehicle labels is at least LEAST_HEIGHT_M high: of a car behind the
+LiDAR only the front returns points, not the windscreen."""
 LEAST_POINTS = 20
-"""A segment that no image shows has at least so many points."""
+"""A segment without vehicle labels has at least so many points."""
 MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200
-"""A segment is two objects only when each has at least this share of its points, and so many: fewer are sparse, so
-that one object comes apart as well."""
+"""A segment is split into two objects only when each has at least this share of its points and at least so many points:
+a sparse object would be split as well."""
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
-    """Sets of points of one scan, and what is asked of each of them."""
+class PointSets:
+    """Sets of points of one scan (voxels, clusters or segments), with the statistics of each set."""
 
     points: NDArray[np.int64]
-    """(p,) how many it has."""
-    named: NDArray[np.int64]
-    """(p,) how many of them the image calls a vehicle."""
+    """(p,) number of points."""
+    labelled: NDArray[np.int64]
+    """(p,) number of points that the image labels as vehicle."""
     sums: NDArray[np.float64]
-    """(p, 3) m: of their coordinates."""
+    """(p, 3) m: sums of the coordinates."""
     lowest: NDArray[np.float64]
-    """(p, 3) m: corner of the box around them."""
+    """(p, 3) m: lower corner of the bounding box."""
     highest: NDArray[np.float64]
-    """(p, 3) m: the opposite corner."""
+    """(p, 3) m: upper corner of the bounding box."""
 
     @classmethod
     def of(
         cls, p_map: NDArray[np.float64], is_object: NDArray[np.bool_], part: NDArray[np.int32], count: int
-    ) -> Parts:
-        """Of points (n, 3): `part` (n,) says to which of `count` parts each belongs, -1 for none."""
+    ) -> PointSets:
+        """The sets of points (n, 3): `part` (n,) is the set of each point, 0 to `count` - 1, or -1 for none."""
         ones = np.ones(len(p_map), np.int64)
-        return cls(ones, is_object.astype(np.int64), p_map, p_map, p_map).joined(part, count)
+        return cls(ones, is_object.astype(np.int64), p_map, p_map, p_map).merged(part, count)
 
-    def joined(self, whole: NDArray[np.integer], count: int) -> Parts:
-        """Parts of these parts: `whole` (p,) says to which of `count` each belongs, -1 for none."""
+    def merged(self, whole: NDArray[np.integer], count: int) -> PointSets:
+        """Unions of these sets: `whole` (p,) is the union of each set, 0 to `count` - 1, or -1 for none."""
         low = np.full((count, 3), np.inf)
-        joined = Parts(np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, 3)), low, -low)
-        _join(
-            self.points, self.named, self.sums, self.lowest, self.highest, whole,
-            joined.points, joined.named, joined.sums, joined.lowest, joined.highest,
+        merged = PointSets(
+            np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, 3)), low, -low
+        )
+        _merge(
+            self.points, self.labelled, self.sums, self.lowest, self.highest, whole,
+            merged.points, merged.labelled, merged.sums, merged.lowest, merged.highest,
         )  # fmt: skip
-        return joined
+        return merged
 
 
 @njit(cache=True, nogil=True)
-def _join(
-    points, named, sums, lowest, highest, whole, all_points, all_named, all_sums, all_lowest, all_highest
+def _merge(
+    points, labelled, sums, lowest, highest, whole, all_points, all_named, all_sums, all_lowest, all_highest
 ):
     for i in range(len(whole)):
         w = whole[i]
         if w < 0:
             continue
         all_points[w] += points[i]
-        all_named[w] += named[i]
+        all_named[w] += labelled[i]
         for axis in range(3):
             all_sums[w, axis] += sums[i, axis]
             all_lowest[w, axis] = min(all_lowest[w, axis], lowest[i, axis])
@@ -84,18 +86,18 @@ def _join(
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """The segments of one scan, voxel by voxel."""
+    """The segments of one scan, stored by voxel."""
 
     voxel: NDArray[np.int32]
-    """(n,) of every point, -1 for one in no segment."""
+    """(n,) index of the voxel of every point, -1 for a point in no segment."""
     keys: NDArray[np.int64]
-    """(v,) the voxels, in ascending order; each is of one segment."""
-    parts: Parts
-    """(v,) what of each voxel belongs to its segment."""
+    """(v,) keys of the voxels, in ascending order; each voxel belongs to one segment."""
+    parts: PointSets
+    """(v,) the points of each voxel that belong to its segment."""
     number: NDArray[np.int32]
-    """(v,) its segment."""
-    cut: NDArray[np.bool_]
-    """(s,) segments that the edge of the view or something nearer cuts."""
+    """(v,) the segment of each voxel."""
+    truncated: NDArray[np.bool_]
+    """(s,) segments that are cut off by the edge of the image or hidden in part by something nearer."""
 
     @property
     def of_points(self) -> NDArray[np.int32]:
@@ -103,23 +105,26 @@ class Segments:
         return np.append(self.number, np.int32(-1)).take(self.voxel)
 
     @property
-    def whole(self) -> Parts:
-        """What is asked of every segment (s,)."""
-        return self.parts.joined(self.number, len(self.cut))
+    def whole(self) -> PointSets:
+        """Statistics of every segment (s,)."""
+        return self.parts.merged(self.number, len(self.truncated))
 
     def points_of(self, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Points (n,) of some of the segments (s,)."""
+        """Mask of the points (n,) that belong to the chosen segments (s,)."""
         return np.append(which[self.number], False).take(self.voxel)
 
-    def sums_of(self, looks: NDArray[np.int32]) -> NDArray[np.float64]:
-        """What the points of every segment sum up to (k, s), of k things that are known of every voxel (k, v)."""
-        weights, count = looks * self.parts.points, len(self.cut)
+    def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
+        weights, count = counts * self.parts.points, len(self.truncated)
         return np.array([np.bincount(self.number, row, count) for row in weights], np.float64)
 
 
 @njit(cache=True, nogil=True)
-def _whole(low, high):
-    """The cluster that each one is part of: its own, or the first of vehicle size whose box (s, 2) holds its box."""
+def _enclosing_clusters(low, high):
+    """For each cluster the cluster that contains it: itself, or the first of vehicle size whose box contains its box.
+
+    `low` and `high` (s, 2 or 3) are the corners of the boxes; only east and north count.
+    """
     owners = np.arange(len(low))
     for j in range(len(low)):
         if np.hypot(high[j, 0] - low[j, 0], high[j, 1] - low[j, 1]) > LARGE_M or owners[j] != j:
@@ -129,95 +134,103 @@ def _whole(low, high):
         for i in range(len(low)):
             if west <= low[i, 0] and south <= low[i, 1] and high[i, 0] <= east and high[i, 1] <= north:
                 owners[i] = j if owners[i] == i else owners[i]
-    for i in range(len(low)):  # an owner may itself have been found to be a part
+    for i in range(len(low)):  # a containing cluster may itself be a part of another
         while owners[owners[i]] != owners[i]:
             owners[i] = owners[owners[i]]
     return np.searchsorted(np.unique(owners), owners)
 
 
 def find_segments(p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float) -> Segments:
-    """Segments among points above ground (n, 3), and which of them the edge of the view cuts.
+    """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
-    `is_object` says which points the image calls a vehicle; the others it does not show. A vehicle at the edge of the
-    view goes on in the points around it, if the whole is no larger than a vehicle; else its shown part is a segment,
-    marked as cut. Where the image shows nothing, whatever has a vehicle's size is a segment.
+    `is_object` (n,) marks the points that the image labels as vehicle; the other points lie outside of the image. A
+    vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
+    its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
+    is a segment. Source: the clustering of section 3.3.2 (Ester et al., 1996), here on single scans.
     """
     keys, voxel = distinct(keys_of(p_map, VOXEL_M))
-    voxels = Parts.of(p_map, is_object, voxel, len(keys))
-    clusters, count = _objects(keys, voxels, eps_m)
-    whole = voxels.joined(clusters, count)
+    voxels = PointSets.of(p_map, is_object, voxel, len(keys))
+    clusters, count = _object_clusters(keys, voxels, eps_m)
+    whole = voxels.merged(clusters, count)
     fits = _is_vehicle_sized(whole)
     number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
-    shown = ~fits[clusters] & (voxels.named > 0)  # of what is too large, or too small, the part with a name
+    shown = ~fits[clusters] & (
+        voxels.labelled > 0
+    )  # of clusters that are too large or too small, the labelled part
     part = _cluster(keys[shown], eps_m)
     number[shown] = part + np.int32(fits.sum())
-    cut = np.zeros(part.max(initial=-1) + 1, np.bool_)
-    cut[part] = (whole.points > whole.named)[clusters[shown]]  # with points that the image does not show
+    truncated = np.zeros(part.max(initial=-1) + 1, np.bool_)
+    truncated[part] = (whole.points > whole.labelled)[
+        clusters[shown]
+    ]  # the cluster has points outside of the image
     kept = number >= 0
     row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
     row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
-    parts = Parts.of(p_map, is_object, row, int(kept.sum()))
+    parts = PointSets.of(p_map, is_object, row, int(kept.sum()))
     return Segments(
-        row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), cut])
+        row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
     )
 
 
-def _is_vehicle_sized(whole: Parts) -> NDArray[np.bool_]:
+def _is_vehicle_sized(whole: PointSets) -> NDArray[np.bool_]:
     size = whole.highest - whole.lowest
     length, height = np.hypot(size[:, 0], size[:, 1]), size[:, 2]
     unnamed = (height >= LEAST_HEIGHT_M) & (whole.points >= LEAST_POINTS)
-    return np.asarray((length <= LONGEST_M) & (height <= HIGHEST_M) & ((whole.named > 0) | unnamed))
+    return np.asarray((length <= LONGEST_M) & (height <= HIGHEST_M) & ((whole.labelled > 0) | unnamed))
 
 
-def _objects(keys: NDArray[np.int64], voxels: Parts, eps_m: float) -> tuple[NDArray[np.int64], int]:
-    """Cluster of every voxel (v,) and their number.
+def _object_clusters(
+    keys: NDArray[np.int64], voxels: PointSets, eps_m: float
+) -> tuple[NDArray[np.int64], int]:
+    """Cluster of every voxel (v,) and the number of clusters.
 
-    What is too large comes apart, and what is a part of another is joined to it.
+    Clusters that are too large are split; clusters inside the box of another are merged with it.
     """
     clusters = _cluster(keys, eps_m)
     count = int(clusters.max(initial=-1)) + 1
-    boxes = voxels.joined(clusters, count)
+    boxes = voxels.merged(clusters, count)
     size = boxes.highest - boxes.lowest
     large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_M)[clusters]
-    clusters[large] = _cluster(keys[large], CLOSER * eps_m) + np.int32(count)
+    clusters[large] = _cluster(keys[large], SPLIT_EPS_SHARE * eps_m) + np.int32(count)
     used, of_used = np.unique(clusters, return_inverse=True)
-    boxes = voxels.joined(of_used, len(used))
-    owners = _whole(boxes.lowest, boxes.highest)
+    boxes = voxels.merged(of_used, len(used))
+    owners = _enclosing_clusters(boxes.lowest, boxes.highest)
     return owners[of_used], int(owners.max(initial=-1)) + 1
 
 
-def take_apart(
+def split_segments(
     segments: Segments,
     hits: NDArray[np.int32],
-    throughs: NDArray[np.int32],
+    misses: NDArray[np.int32],
     eps_m: float,
     least_through_per_hit: float,
 ) -> Segments:
-    """Segments where what once was empty is apart from what always stood beside it.
+    """Split segments that hold both a moving object and something static beside it.
 
-    A mover that passes something closely is one segment with it. If a good part of a segment was seen through, by
-    `throughs` (v,) and `hits` (v,) of its voxels, and a good part was not, it is clustered again, more closely, and its
-    clusters that were seen through become a new segment.
+    A moving object that passes something closely is in one segment with it. `hits` and `misses` (v,) count the scans
+    that hit each voxel and that saw through it. If a large share of a segment was seen through and a large share was
+    not, the segment is clustered again with a smaller distance, and its clusters that were seen through become a new
+    segment.
     """
-    points, number, count = segments.parts.points, segments.number.copy(), len(segments.cut)
-    once_empty = throughs > least_through_per_hit * hits
-    stood = (hits > 0) & (throughs == 0)
+    points, number, count = segments.parts.points, segments.number.copy(), len(segments.truncated)
+    once_empty = misses > least_through_per_hit * hits
+    stood = (hits > 0) & (misses == 0)
     all_of, empty_of, stood_of = (
         np.bincount(number, points * which, count) for which in (np.ones_like(stood), once_empty, stood)
     )
     least = np.maximum(MIXED_SHARE * all_of, LEAST_DENSE_POINTS)
-    cut = segments.cut
+    truncated = segments.truncated
     for mixed in np.flatnonzero((empty_of >= least) & (stood_of >= least)):
         part = np.flatnonzero(number == mixed)
-        clusters = _cluster(segments.keys[part], CLOSER * eps_m)
-        hit, through = (np.bincount(clusters, points[part] * looks[part]) for looks in (hits, throughs))
-        left = (through > least_through_per_hit * hit)[clusters]
-        if min(points[part[left]].sum(), points[part[~left]].sum()) >= least[mixed]:
-            number[part[left]] = len(cut)
-            cut = np.append(cut, cut[mixed])
-    return replace(segments, number=number, cut=cut)
+        clusters = _cluster(segments.keys[part], SPLIT_EPS_SHARE * eps_m)
+        hit, missed = (np.bincount(clusters, points[part] * counts[part]) for counts in (hits, misses))
+        moved = (missed > least_through_per_hit * hit)[clusters]
+        if min(points[part[moved]].sum(), points[part[~moved]].sum()) >= least[mixed]:
+            number[part[moved]] = len(truncated)
+            truncated = np.append(truncated, truncated[mixed])
+    return replace(segments, number=number, truncated=truncated)
 
 
 def _cluster(keys: NDArray[np.int64], eps_m: float) -> NDArray[np.int32]:
-    """Cluster of every voxel: neighbouring ones belong together."""
+    """Cluster of every voxel (v,): voxels nearer than `eps_m` are in one cluster."""
     return dbscan(unpack(keys), eps_m / VOXEL_M, min_samples=1)

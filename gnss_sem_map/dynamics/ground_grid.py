@@ -1,4 +1,4 @@
-"""One scan from above: how high its points are over the ground, and which are near a place or other points."""
+"""Grid of one scan, seen from above: height over the ground, and distances to a position or to other points."""
 
 from __future__ import annotations
 
@@ -10,41 +10,43 @@ GROUND_CELL_M = 1.0
 
 
 def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height of every point of one scan (n, 3) over the lowest of its 1 m cell and the eight around it: (n,) m."""
+    """Height (n,) m of every point (n, 3) m over the lowest point in its 1 m cell and the eight cells around it."""
     heights = np.empty(len(p_map))
     if len(p_map):
         _heights(p_map, GROUND_CELL_M, heights)
     return heights
 
 
-def within(p_map: NDArray[np.float64], centre: NDArray[np.float64], reach_m: float) -> NDArray[np.bool_]:
-    """Points (n, 3) at most so far from a centre (2,), east and north."""
+def within_radius(
+    p_map: NDArray[np.float64], centre: NDArray[np.float64], reach_m: float
+) -> NDArray[np.bool_]:
+    """Mask (n,) of the points (n, 3) m with a horizontal distance of at most `reach_m` from a centre (2,) m."""
     found = np.empty(len(p_map), np.bool_)
-    _within(p_map, centre[0], centre[1], reach_m * reach_m, found)
+    _within_radius(p_map, centre[0], centre[1], reach_m * reach_m, found)
     return found
 
 
-def near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
-    """Points (n, 3) in a square cell of `reach_m` that holds a marked point, or beside one."""
+def in_cells_near(p_map: NDArray[np.float64], marked: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
+    """Mask (n,) of the points in a square cell of size `reach_m` that holds a marked point, or in a cell beside one."""
     if reach_m == 0 or not marked.any():
         return marked
     found = np.empty(len(p_map), np.bool_)
-    _near(p_map, marked, reach_m, found)
+    _in_cells_near(p_map, marked, reach_m, found)
     return found
 
 
-def reached(
+def closer_than(
     points: NDArray[np.floating], marked: NDArray[np.bool_], asked: NDArray[np.bool_], reach_m: float
 ) -> NDArray[np.bool_]:
-    """Which of the points (n, 2 or 3) that are asked for are nearer than `reach_m` to a marked one: (n,)."""
+    """Mask (n,) of the `asked` points (n, 2 or 3) m whose distance to a marked point is less than `reach_m`."""
     found = np.zeros(len(points), np.bool_)
     if reach_m > 0 and marked.any():
-        _reached(points, marked, asked, reach_m, found)
+        _closer_than(points, marked, asked, reach_m, found)
     return found
 
 
 @njit(cache=True, nogil=True)
-def _within(p_map, x, y, square, found):
+def _within_radius(p_map, x, y, square, found):
     for i in range(len(p_map)):
         east, north = p_map[i, 0] - x, p_map[i, 1] - y
         found[i] = east * east + north * north <= square
@@ -52,9 +54,9 @@ def _within(p_map, x, y, square, found):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cells(p_map, size_m):
-    """Cell of every point (n, 3), as its place in a list, and the length and width of the grid.
+    """Index of the cell of every point (n, 3) in the flattened grid, and the length and width of the grid.
 
-    Around the cells of the points is one more on all sides, so that each has eight neighbours.
+    The grid has a margin of one cell, so that every cell with a point has eight neighbours.
     """
     n = len(p_map)
     east, north = np.empty(n, np.int32), np.empty(n, np.int32)
@@ -73,7 +75,7 @@ def _heights(p_map, size_m, heights):
     lowest = np.full(length * width, np.inf)
     for i in range(len(cells)):
         lowest[cells[i]] = min(lowest[cells[i]], p_map[i, 2])
-    # of three along one axis, then of three of those along the other
+    # the minimum over 3 x 3 cells is separable: first along one axis, then along the other
     across = lowest.copy()
     for c in range(1, len(lowest) - 1):
         across[c] = min(lowest[c - 1], lowest[c], lowest[c + 1])
@@ -84,7 +86,7 @@ def _heights(p_map, size_m, heights):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _near(p_map, marked, size_m, found):
+def _in_cells_near(p_map, marked, size_m, found):
     cells, length, width = _cells(p_map, size_m)
     reached = np.zeros(length * width, np.bool_)
     for i in range(len(cells)):
@@ -98,10 +100,10 @@ def _near(p_map, marked, size_m, found):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _reached(points, marked, asked, reach_m, found):
+def _closer_than(points, marked, asked, reach_m, found):
     cells, length, width = _cells(points, reach_m)
     latest, before = np.full(length * width, -1, np.int32), np.empty(len(cells), np.int32)
-    for i in np.flatnonzero(marked):  # a list of those in each cell
+    for i in np.flatnonzero(marked):  # a linked list of the marked points of each cell
         before[i] = latest[cells[i]]
         latest[cells[i]] = i
     for i in np.flatnonzero(asked):

@@ -1,4 +1,4 @@
-"""What became of an object: parked, moving, stopped and left, or unknown; how sure, and why."""
+"""Motion state of tracked objects: parked, moving, stopped and left, or unknown, with its probability and reason."""
 
 from __future__ import annotations
 
@@ -14,71 +14,75 @@ from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
 from gnss_sem_map.dynamics.visibility import VisibilitySettings
 
 LEAST_TRACKED_POINTS = 5
-"""Smaller segments are judged on their own."""
+"""Smaller segments are not tracked; each is classified on its own."""
 SEEN_THROUGH_ALONE = 20
-"""A segment seen through more than this, and twice as often as hit, is gone whatever its track says."""
+"""A segment with more misses than this, and twice as many misses as hits, has moved, whatever its track says."""
 LENGTH_M = 5.0
-"""Of a car."""
+"""Length of a car."""
 SHIFT_STDDEV_M = 0.5
-"""How well the shift of an object's ends is known."""
+"""Standard deviation of the measured shift of an object's ends."""
 
 
 class Motion(StrEnum):
-    """What became of an object."""
+    """Motion state of an object."""
 
     PARKED = "parked"
     MOVING = "moving"
     STOPPED_AND_LEFT = "stopped and left"
     UNKNOWN = "unknown"
     UNSUPPORTED = "unsupported"
-    """No vehicle at all: its voxels fall back to their second-best class."""
+    """Not a vehicle: its voxels take their second-best class."""
 
 
 GONE = (Motion.MOVING, Motion.STOPPED_AND_LEFT)
 
 
 class MotionSettings(VisibilitySettings):
-    """What speaks for motion, and how much of it is enough."""
+    """Thresholds of the search for moving objects."""
 
     enabled: bool = Field(default=True, description="Whether moving objects are sought before mapping.")
-    segment_eps_m: float = Field(default=0.7, gt=0, le=3, description="Points of a segment are this near, m.")
-    gate_m: float = Field(default=1.5, gt=0, description="A track goes on this near to its prediction, m.")
+    segment_eps_m: float = Field(default=0.7, gt=0, le=3, description="DBSCAN distance of segments, m.")
+    gate_m: float = Field(
+        default=1.5, gt=0, description="Tracking gate: largest distance to the prediction, m."
+    )
     through_per_hit: float = Field(
         default=1.0,
         gt=0,
-        description="An object moved when seen through more often than this times hit,",
+        description="An object has moved if its points have more misses per hit than this,",
     )
     matched_through_per_hit: float = Field(
         default=0.4,
         gt=0,
-        description="or than this, where scans were matched, so that poses do not blur what stands.",
+        description="or than this, if the poses come from LiDAR odometry (they blur static objects less).",
     )
-    least_shift_m: float = Field(default=1.5, gt=0, description="Both ends of a mover went this far, m,")
+    least_shift_m: float = Field(default=1.5, gt=0, description="Displacement: both ends moved this far, m,")
     least_speed_m_s: float = Field(default=1.0, gt=0, description="and at least this fast, m/s,")
     least_through_per_hit: float = Field(
-        default=0.25, ge=0, description="and its track was seen through at least this often, per hit."
+        default=0.25, ge=0, description="and the points of the track have at least so many misses per hit."
     )
     window_scans: int = Field(
-        default=150, ge=10, description="A scan is judged when so many later ones were seen, or at the end."
+        default=150,
+        ge=10,
+        description="A scan is decided after so many later scans, or at the end of the drive.",
     )
-    farthest_object_m: float = Field(default=60.0, gt=0, description="No objects are sought farther away, m.")
+    farthest_object_m: float = Field(default=60.0, gt=0, description="Largest range of objects, m.")
     grow_m: float = Field(
-        default=0.5, ge=0, description="Points above ground this near to a moving segment are part of it, m."
+        default=0.5, ge=0, description="Points above ground this close to a moving segment belong to it, m."
     )
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedObject:
-    """One object through time, and what became of it."""
+    """One object over time, with its motion state."""
 
     motion: Motion
     probability: float
-    """That it moved."""
+    """Probability that it moved."""
     displaced: bool
-    """It was seen to go elsewhere."""
+    """Its displacement was measured."""
     reason: str
     segments: tuple[int, ...]
-    """Places in the list of all segments."""
+    """Indices in the list of all segments."""
     points: int
     first_stamp: float
     last_stamp: float
@@ -86,113 +90,115 @@ class TrackedObject:
     """(s, 2) m: the centroids of its segments, in time order."""
 
 
-def judge(
+def classify_motion(
     segments: list[Segment],
     hits: NDArray[np.float64],
-    throughs: NDArray[np.float64],
+    misses: NDArray[np.float64],
     settings: MotionSettings,
     matched: bool = False,
 ) -> list[TrackedObject]:
-    """Every segment as part of an object with a verdict: its track's, or its own where that is plainer.
+    """Track the segments and give every object its motion state.
 
-    `hits` and `throughs` (s,): how often other scans hit the points of a segment, or saw through them. A car ahead that
-    creeps on by 0.4 of its length while it is seen is seen through 0.4 times as often as hit, by 0.8 of its length as
-    often (measured in the street of the tests). Parked cars reach 0.3 where poses were `matched` by their scans, and
-    more than 1 where they were not (six simulated drives, KITTI 0005).
+    `hits` and `misses` (s,) count how often other scans hit the points of a segment and how often they saw through
+    them. `matched`: the poses come from LiDAR odometry. A car ahead that moves by 0.4 of its length while observed
+    has 0.4 misses per hit, by 0.8 of its length 1.0 (measured in the simulated street of the tests). Parked cars reach
+    0.3 misses per hit with poses from LiDAR odometry, and more than 1 without (six simulated drives, KITTI 0005).
+
+    This takes the place of eq. 13, which calls long and dense clusters of the map moving vehicles.
     """
     through_per_hit = settings.matched_through_per_hit if matched else settings.through_per_hit
     large = [n for n, segment in enumerate(segments) if segment.points >= LEAST_TRACKED_POINTS]
     alone = [n for n, segment in enumerate(segments) if segment.points < LEAST_TRACKED_POINTS]
     objects = []
-    fleeting = (throughs > settings.through_per_hit * hits)[large]
-    for one in track([segments[n] for n in large], settings.gate_m, fleeting):
+    mostly_free = (misses > settings.through_per_hit * hits)[large]
+    for one in track([segments[n] for n in large], settings.gate_m, mostly_free):
         members = [large[place] for place in one.segments]
         if not any(segments[n].shown for n in members):
-            objects += _nameless(members, segments, hits, throughs, settings)
+            objects += _motion_without_labels(members, segments, hits, misses, settings)
             continue
-        whole = _verdict(members, segments, hits, throughs, settings, through_per_hit)
-        gone = [n for n in members if throughs[n] > max(2 * hits[n], SEEN_THROUGH_ALONE)]
+        whole = _motion_of_track(members, segments, hits, misses, settings, through_per_hit)
+        gone = [n for n in members if misses[n] > max(2 * hits[n], SEEN_THROUGH_ALONE)]
         if whole.motion in GONE or not gone:
             objects.append(whole)
             continue
         alone += gone
         if rest := [n for n in members if n not in set(gone)]:
-            objects.append(_describe(rest, segments, whole.motion, whole.probability, whole.reason))
+            objects.append(_tracked_object(rest, segments, whole.motion, whole.probability, whole.reason))
     for n in alone:
-        probability = _probability(throughs[n], hits[n])
+        probability = _probability(misses[n], hits[n])
         motion = Motion.MOVING if probability > 0.5 else Motion.UNKNOWN
-        reason = f"one scan only: seen through {throughs[n]:.0f} times, hit {hits[n]:.0f} times"
-        objects.append(_describe([n], segments, motion, probability, reason))
+        reason = f"one scan only: seen through {misses[n]:.0f} times, hit {hits[n]:.0f} times"
+        objects.append(_tracked_object([n], segments, motion, probability, reason))
     return objects
 
 
-def _verdict(
+def _motion_of_track(
     members: list[int],
     segments: list[Segment],
     hits: NDArray[np.float64],
-    throughs: NDArray[np.float64],
+    misses: NDArray[np.float64],
     settings: MotionSettings,
     through_per_hit: float,
 ) -> TrackedObject:
-    """What became of a track: it went elsewhere, or the places where it was were empty at other times."""
-    hit, through = float(hits[members].sum()), float(throughs[members].sum())
-    vanished = _probability(through, through_per_hit * hit)
+    """Motion state of a track: it was displaced, or its volume was free at other times."""
+    hit, missed = float(hits[members].sum()), float(misses[members].sum())
+    vanished = _probability(missed, through_per_hit * hit)
     moved = displacement_of([segments[n] for n in members])
     displaced = 0.0
     if moved and moved.speed_m_s > settings.least_speed_m_s and moved.shift_m > 0:
-        away = _away(members, segments, settings.least_shift_m)
-        # on less than its length it covers its own places: they must be the more often empty
+        away = _away_from_median(members, segments, settings.least_shift_m)
+        # an object that moved less than its length hides the volume where it was: it must be free more often
         least = settings.least_through_per_hit * max(1.0, LENGTH_M / moved.shift_m)
-        if throughs[away].sum() > least * hits[away].sum():
+        if misses[away].sum() > least * hits[away].sum():
             displaced = float(ndtr((moved.shift_m - settings.least_shift_m) / SHIFT_STDDEV_M))
-    reason = f"seen through {through:.0f} times, hit {hit:.0f} times"
+    reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
     if moved and displaced > 0.5:
         motion = Motion.MOVING
-        reason = f"both ends went {moved.shift_m:.1f} m at {moved.speed_m_s:.1f} m/s, {reason}"
+        reason = f"both ends moved {moved.shift_m:.1f} m at {moved.speed_m_s:.1f} m/s, {reason}"
     elif vanished > 0.5:
         stood = moved is not None and moved.speed_m_s < settings.least_speed_m_s and hit > 0
         motion = Motion.STOPPED_AND_LEFT if stood else Motion.MOVING
     else:
         motion = Motion.PARKED if hit > 0 else Motion.UNKNOWN
-    return _describe(members, segments, motion, max(vanished, displaced), reason, displaced > 0.5)
+    return _tracked_object(members, segments, motion, max(vanished, displaced), reason, displaced > 0.5)
 
 
-def _away(members: list[int], segments: list[Segment], reach_m: float) -> list[int]:
-    """The segments of a track that are not where it was most of the time: a mover may have stood there for long."""
+def _away_from_median(members: list[int], segments: list[Segment], reach_m: float) -> list[int]:
+    """The segments of a track away from its median position, where a moving object may have stood for long."""
     centroids = np.array([segments[n].centroid for n in members])
     distances = np.linalg.norm(centroids - np.median(centroids, axis=0), axis=1)
     return [n for n, distance in zip(members, distances, strict=True) if distance > reach_m]
 
 
-def _nameless(
+def _motion_without_labels(
     members: list[int],
     segments: list[Segment],
     hits: NDArray[np.float64],
-    throughs: NDArray[np.float64],
+    misses: NDArray[np.float64],
     settings: MotionSettings,
 ) -> list[TrackedObject]:
-    """A track that no image ever showed: it must have gone elsewhere, and its places been empty at other times."""
-    away = _away(members, segments, settings.least_shift_m)
-    if throughs[away].sum() <= settings.through_per_hit * hits[away].sum():
+    """Motion state of a track without vehicle labels: it must be displaced, and its volume free at other times."""
+    away = _away_from_median(members, segments, settings.least_shift_m)
+    if misses[away].sum() <= settings.through_per_hit * hits[away].sum():
         return []
-    whole = _verdict(members, segments, hits, throughs, settings, settings.through_per_hit)
+    whole = _motion_of_track(members, segments, hits, misses, settings, settings.through_per_hit)
     return [whole] if whole.displaced else []
 
 
-def _probability(through: float, hit: float) -> float:
-    """Probability that a place is rather seen through than hit, after so many looks of each kind.
+def _probability(misses: float, hits: float) -> float:
+    """Probability that a volume is free rather than occupied, after so many misses and hits.
 
-    The share of looks that pass is Beta(1 + t, 1 + h); n looks at one object repeat each other and count as the
-    square root of n.
+    The share of misses has the posterior Beta(1 + misses, 1 + hits); n observations of one object are correlated and
+    count as the square root of n.
     """
-    looks = through + hit
-    if looks == 0:
+    observations = misses + hits
+    if observations == 0:
         return 0.0
-    discount = looks**-0.5
-    return float(betaincc(1 + through * discount, 1 + hit * discount, 0.5))
+    discount = observations**-0.5
+    return float(betaincc(1 + misses * discount, 1 + hits * discount, 0.5))
 
 
-def _describe(
+def _tracked_object(
     members: list[int],
     segments: list[Segment],
     motion: Motion,

@@ -1,7 +1,10 @@
-"""What every scan saw, and what it looked through: range images, and the evidence of free space in them.
+"""Range images of scans, and the visibility test for free-space evidence.
 
-A place that other scans look through was empty at their time. A place that they hit was not. Points are worked through
-in blocks, and arithmetic is apart from looking things up, so that a processor calculates for several points at once.
+A position that a scan saw through was free at that time (a miss); a position that it hit was occupied. The test
+compares the range of the position with the ranges in a 3 x 3 window of the range image, as in Kim and Kim, "Remove,
+then Revert: Static Point Cloud Map Construction using Multiresolution Range Images" (IROS 2020), here with one
+resolution. Points are processed in blocks, with arithmetic apart from table look-ups, so that the compiler can use SIMD
+instructions.
 """
 
 from __future__ import annotations
@@ -13,15 +16,15 @@ from numpy.typing import NDArray
 
 ROWS, COLUMNS = 68, 900
 LOWEST_DEG, ROW_DEG, COLUMN_DEG = -25.2, 0.42, 0.4
-"""Elevation and azimuth of the pixels: the 64 beams of a HDL-64E, a little finer than it."""
+"""Elevation and azimuth of the pixels: a little finer than the 64 beams of an HDL-64E."""
 WIDTH = COLUMNS + 2
-"""An image has a frame: a row of nothing above and below, and on either side the column of the other one."""
+"""An image has a margin of one pixel: empty rows above and below; left and right the column from the other side."""
 NEAREST_M, FARTHEST_M = 2.5, 650.0
-"""Returns nearer than the first are the carrier itself; those beyond the second do not fit a pixel."""
+"""Nearer returns are of the vehicle that carries the LiDAR; farther ones do not fit the 16 bits of a pixel."""
 UNITS_PER_M = 100
 EMPTY = np.uint16(65535)
 LEAST_FILLED = 3
-"""A 3 x 3 window with fewer returns says nothing: sky, glass, or the edge of the view."""
+"""A 3 x 3 window with fewer returns is no evidence: sky, glass, or the edge of the view."""
 BLOCK = 1024
 EIGHTH = float(np.tan(np.pi / 8))
 ARCTANGENT_DEG = tuple(
@@ -51,7 +54,7 @@ def _atan2_deg(y, x):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _pixel(x, y, z):
-    """Row and column without the frame; the row may lie outside of the image."""
+    """Row and column without the margin; the row may lie outside of the image."""
     row = int32(np.floor((_atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / ROW_DEG))
     column = int32(np.floor((_atan2_deg(y, x) + 180.0) / COLUMN_DEG))
     return row, column - COLUMNS if column >= COLUMNS else column
@@ -87,10 +90,10 @@ def draw(p_map, T_lidar_map, image):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _look(drawn, corner, low, high):
-    """What one scan says of a place at `low` to `high` cm: 1 it was hit, -1 seen through, 0 hidden or unknown.
+def _test_visibility(drawn, corner, low, high):
+    """Visibility test of a position at a range of `low` to `high` cm in one scan: 1 hit, -1 miss, 0 hidden or unknown.
 
-    `corner` is the lowest pixel of the 3 x 3 window around the place.
+    `corner` is the lowest pixel of the 3 x 3 window around the position.
     """
     filled, rows, hit, nearer = 0, 0, False, False
     for row in range(3):
@@ -103,15 +106,15 @@ def _look(drawn, corner, low, high):
         corner += WIDTH
     if hit:
         return 1
-    around = rows & 0b010 or rows == 0b101  # beams passed at its height, or both above and below
+    around = rows & 0b010 or rows == 0b101  # beams passed in its row, or in the rows above and below
     return -1 if around and filled >= LEAST_FILLED and not nearer else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
-    """Segments (count,) of a scan that go on behind something nearer, to the left or to the right.
+    """Mask (count,) of the segments of a scan that something nearer hides in part, on the left or on the right.
 
-    The sides of a segment are its outermost columns; something nearer in the next ones hides what is there.
+    The sides of a segment are its outermost columns; nearer returns in the three columns beyond hide it.
     """
     n, flat = len(segments), p_map.reshape(-1)
     rows, columns, ranges = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n)
@@ -131,7 +134,7 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
             columns[i] - first[s] + COLUMNS // 2
         ) % COLUMNS - COLUMNS // 2  # across the seam at the rear
         low[s], high[s] = min(low[s], columns[i]), max(high[s], columns[i])
-    looks, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
     for i in range(n):
         s = segments[i]
         if s < 0 or not 0 <= rows[i] < ROWS:
@@ -139,7 +142,7 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
         for side, edge, step in ((0, low[s], -1), (1, high[s], 1)):
             if abs(columns[i] - edge) > 1:
                 continue
-            looks[s, side] += 1
+            counts[s, side] += 1
             for beyond in range(1, 4):
                 seen = image[rows[i] + 1, (columns[i] + first[s] + step * beyond) % COLUMNS + 1]
                 if seen != EMPTY and seen / UNITS_PER_M < ranges[i] - margin_m:
@@ -147,23 +150,25 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
                     break
     result = np.zeros(count, np.bool_)
     for s in range(count):
-        result[s] = 3 * hidden[s, 0] > looks[s, 0] or 3 * hidden[s, 1] > looks[s, 1]
+        result[s] = 3 * hidden[s, 0] > counts[s, 0] or 3 * hidden[s, 1] > counts[s, 1]
     return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def look_at(places, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin_ratio, hits, throughs):
-    """Count for every place (m, 3) the scans that hit it and those that saw through it.
+def count_hits_and_misses(
+    positions, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin_ratio, hits, misses
+):
+    """Count for every position (m, 3) m the scans that hit it and those that saw through it; adds to `hits`, `misses`.
 
-    `images` (k, 70, 902), `T_lidar_map` (k, 4, 4); only scans with the place in range count, with a margin that
-    grows with range.
+    `images` (k, 70, 902) cm, `T_lidar_map` (k, 4, 4). Only scans with the position in range count. A return is a hit
+    within a margin that grows with range.
     """
-    p_lidar, who = np.empty((3, BLOCK)), np.empty(BLOCK, np.int32)
+    p_lidar, index = np.empty((3, BLOCK)), np.empty(BLOCK, np.int32)
     corners, lows, highs = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.uint16), np.empty(BLOCK, np.uint16)
-    for start in range(0, len(places), BLOCK):
-        here = places[start : start + BLOCK]
+    for start in range(0, len(positions), BLOCK):
+        here = positions[start : start + BLOCK]
         for k in range(len(images)):
-            count = _in_range(here, T_lidar_map[k], nearest_m, farthest_m, p_lidar, who)
+            count = _in_range(here, T_lidar_map[k], nearest_m, farthest_m, p_lidar, index)
             xs, ys, zs, drawn = p_lidar[0], p_lidar[1], p_lidar[2], images[k].reshape(-1)
             for i in range(count):
                 x, y, z = xs[i], ys[i], zs[i]
@@ -175,25 +180,25 @@ def look_at(places, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin
                 corners[i] = row * WIDTH + column if (row >= 0) & (row < ROWS) else -1
             for i in range(count):
                 if corners[i] >= 0:
-                    said = _look(drawn, corners[i], lows[i], highs[i])
-                    hits[start + who[i]] += said == 1
-                    throughs[start + who[i]] += said == -1
+                    visibility = _test_visibility(drawn, corners[i], lows[i], highs[i])
+                    hits[start + index[i]] += visibility == 1
+                    misses[start + index[i]] += visibility == -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _in_range(places, T_lidar_map, nearest_m, farthest_m, p_lidar, who):
-    """Collect the places (m, 3) in range of a scan, axis by axis as it sees them, and which they are; how many."""
-    count, flat = 0, places.reshape(-1)
+def _in_range(positions, T_lidar_map, nearest_m, farthest_m, p_lidar, index):
+    """Collect the positions (m, 3) in range of a scan, in its frame, and their indices; returns how many."""
+    count, flat = 0, positions.reshape(-1)
     xs, ys, zs = p_lidar[0], p_lidar[1], p_lidar[2]
     nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
-    for i in range(len(places)):
+    for i in range(len(positions)):
         x, y, z = _in_lidar(T_lidar_map, flat, i)
         square = x * x + y * y + z * z
-        xs[count], ys[count], zs[count], who[count] = x, y, z, i  # kept only if it counts: no branch
+        xs[count], ys[count], zs[count], index[count] = x, y, z, i  # kept only if it counts: no branch
         count += (square >= nearest) & (square <= farthest)
     return count
 
 
 def empty_image() -> NDArray[np.uint16]:
-    """A range image in which nothing was seen."""
+    """A range image without returns."""
     return np.full((ROWS + 2, WIDTH), EMPTY, np.uint16)

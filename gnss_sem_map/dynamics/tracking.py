@@ -1,4 +1,4 @@
-"""Segments of one object through time, by where it should be next."""
+"""Tracking: segments of one object over time, associated with predictions of constant velocity."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 LONGEST_GAP = 5
-"""A track that was not seen for more scans than this has ended."""
+"""A track ends after more scans than this without a segment."""
 NEW_SHARE = 0.3
-"""How much a new step counts in the velocity of a track."""
+"""Weight of a new step in the velocity of a track (exponential smoothing)."""
 LEAST_ENDS = 4
-"""Fewer segments than this show no motion."""
+"""Displacement is measured from at least so many segments."""
 SMOOTHED = 5
 """Segments in the running median of a track's boxes."""
 SPEED_OVER_S = 0.5
+"""Speed is measured over this time."""
 FASTEST_M_S = 45.0
-"""Of what was seen once, and whose place was found empty: next it may be as far away as this speed takes it."""
+"""Gate of a track with a single segment that is mostly free: this speed times the time between scans."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +32,14 @@ class Segment:
     centroid: NDArray[np.float64]
     """(2,) m, east and north in the map frame."""
     lowest: NDArray[np.float64]
-    """(2,) m: corner of the box around it."""
+    """(2,) m: lower corner of the bounding box."""
     highest: NDArray[np.float64]
-    """(2,) m: the opposite corner."""
+    """(2,) m: upper corner of the bounding box."""
     points: int
     shown: bool
-    """An image calls some of it a vehicle."""
-    cut: bool
-    """The edge of the view cuts it: its ends are not its own."""
+    """An image labels some of its points as vehicle."""
+    truncated: bool
+    """It is cut off by the edge of the image or hidden in part: its box is not that of the object."""
 
 
 @dataclass(eq=False)
@@ -46,18 +47,21 @@ class Track:
     """One object: its segments, at most one per scan, in time order."""
 
     segments: list[int] = field(default_factory=list)
-    """Positions in the list of all segments."""
+    """Indices in the list of all segments."""
     last: Segment | None = None
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
     def predict(self, stamp: float) -> NDArray[np.float64]:
-        """Where its centroid should be, (2,) m."""
+        """Predicted centroid (2,) m at constant velocity."""
         if self.last is None:
-            raise ValueError("a track without segments is nowhere")
+            raise ValueError("a track without segments has no position")
         return np.asarray(self.last.centroid + self.velocity * (stamp - self.last.stamp))
 
     def extend(self, number: int, segment: Segment, first_share: float = 0.5) -> None:
-        """Take the next segment; the first step counts half, for its two centroids saw different parts."""
+        """Append a segment and update the velocity.
+
+        The first step counts half: its two centroids may be of different parts of the object.
+        """
         if self.last is not None:
             step = (segment.centroid - self.last.centroid) / (segment.stamp - self.last.stamp)
             share = NEW_SHARE if len(self.segments) > 1 else first_share
@@ -66,12 +70,13 @@ class Track:
         self.last = segment
 
 
-def track(segments: list[Segment], gate_m: float, fleeting: NDArray[np.bool_]) -> list[Track]:
-    """Tracks of the segments, which come in time order: each scan's are joined to the nearest prediction, greedily.
+def track(segments: list[Segment], gate_m: float, mostly_free: NDArray[np.bool_]) -> list[Track]:
+    """Tracks of segments in time order: those of a scan are assigned to the nearest prediction, greedily.
 
-    A segment is `fleeting` (s,) if other scans found its place empty, more often than not. What drives fast is nowhere
-    near where it was: among what is left, fleeting segments are joined to fleeting ones of the scan before, as far as
-    the fastest could have come. What stands is not fleeting, and is never joined so.
+    `mostly_free` (s,): other scans saw through the segment more often than they hit it. A fast object is farther from
+    its prediction than the gate, because a new track has no velocity yet: of the remaining segments, those that are
+    mostly free are assigned to new tracks of mostly free segments of the scan before, within the distance that the
+    fastest vehicle covers. Static segments are not mostly free, and are never assigned in this way.
     """
     tracks: list[Track] = []
     by_scan: dict[int, list[int]] = {}
@@ -81,13 +86,13 @@ def track(segments: list[Segment], gate_m: float, fleeting: NDArray[np.bool_]) -
     for scan, numbers in by_scan.items():
         alive = [t for t in alive if t.last is not None and scan - t.last.scan <= LONGEST_GAP + 1]
         free, taken = set(numbers), set()
-        for number, place in _nearest_first(segments, numbers, alive, gate_m):
-            if number in free and place not in taken:
+        for number, row in _nearest_first(segments, numbers, alive, gate_m):
+            if number in free and row not in taken:
                 free.remove(number)
-                taken.add(place)
-                alive[place].extend(number, segments[number])
-        for number, t in _fast_ones(
-            segments, [n for n in sorted(free) if fleeting[n]], alive, fleeting, scan
+                taken.add(row)
+                alive[row].extend(number, segments[number])
+        for number, t in _fast_pairs(
+            segments, [n for n in sorted(free) if mostly_free[n]], alive, mostly_free, scan
         ):
             if number in free and len(t.segments) == 1:
                 free.remove(number)
@@ -100,29 +105,29 @@ def track(segments: list[Segment], gate_m: float, fleeting: NDArray[np.bool_]) -
     return tracks
 
 
-def _fast_ones(
+def _fast_pairs(
     segments: list[Segment],
     numbers: list[int],
     alive: list[Track],
-    fleeting: NDArray[np.bool_],
+    mostly_free: NDArray[np.bool_],
     scan: int,
 ) -> list[tuple[int, Track]]:
-    """Pairs of a segment and a track of one fleeting segment of the scan before, nearest first."""
+    """Pairs of a segment and a track with one mostly free segment, from the scan before; nearest first."""
     begun = [
         t
         for t in alive
-        if len(t.segments) == 1 and fleeting[t.segments[0]] and t.last and t.last.scan == scan - 1
+        if len(t.segments) == 1 and mostly_free[t.segments[0]] and t.last and t.last.scan == scan - 1
     ]
     if not begun or not numbers or begun[0].last is None:
         return []
     reach_m = FASTEST_M_S * (segments[numbers[0]].stamp - begun[0].last.stamp)
-    return [(n, begun[place]) for n, place in _nearest_first(segments, numbers, begun, reach_m)]
+    return [(n, begun[row]) for n, row in _nearest_first(segments, numbers, begun, reach_m)]
 
 
 def _nearest_first(
     segments: list[Segment], numbers: list[int], alive: list[Track], gate_m: float
 ) -> list[tuple[int, int]]:
-    """Pairs (segment, place of the track) within the gate, nearest first."""
+    """Pairs (segment, index of the track in `alive`) within the gate, nearest first."""
     if not alive or not numbers:
         return []
     stamp = segments[numbers[0]].stamp
@@ -136,21 +141,22 @@ def _nearest_first(
 
 @dataclass(frozen=True)
 class Displacement:
-    """How far and how fast an object went."""
+    """How far and how fast an object moved."""
 
     shift_m: float
-    """By how much both of its ends moved, at least, between the two times at which it was farthest apart."""
+    """Smaller one of the shifts of its two ends, between the two times at which its centroids are farthest apart."""
     speed_m_s: float
-    """Its highest speed over half a second."""
+    """Highest speed over half a second."""
 
 
 def displacement_of(segments: list[Segment]) -> Displacement | None:
-    """The displacement of a track from both ends of its boxes: one end alone moves when more of it comes in view.
+    """Displacement of a track, measured at both ends of its boxes; None for a track of few segments.
 
-    It may stand before or after: the two times are those at which its centroids, smoothed by a running median, are
-    farthest apart. None for a track of few segments; those that the edge of the view cuts do not count.
+    One end alone also moves when more of a parked object becomes visible. The object may stand before or after: the two
+    times are those at which its centroids, smoothed by a running median, are farthest apart. Truncated segments
+    are left out.
     """
-    whole = [s for s in segments if not s.cut]
+    whole = [s for s in segments if not s.truncated]
     if len(whole) < LEAST_ENDS:
         return None
     stamps = np.array([s.stamp for s in whole])

@@ -1,4 +1,4 @@
-"""What scans say of a place: that something was there, or that they looked through it."""
+"""Free-space evidence: how many keyframe scans hit a position, and how many saw through it."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics import range_images
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 
 THREADS = min(os.cpu_count() or 1, 4)
-"""More would wait for the one that reads, each with two scans in memory."""
-PLACES_AT_ONCE = 1 << 14
-"""Places that one thread looks at before it takes the next."""
+"""More threads would wait for the one that reads, each with two scans in memory."""
+POINTS_PER_BLOCK = 1 << 14
+"""Positions that one thread works on at a time."""
 APART_M, APART_S = 1.0, 1.0
-"""Of a whole drive those scans are kept that are so far apart, in either: they take no more memory than its map."""
+"""Distance and time between keyframe scans, whichever comes first: the scans take no more memory than the map."""
 
 
 class VisibilitySettings(BaseModel):
@@ -32,62 +32,65 @@ class VisibilitySettings(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
-    """Scans that can be asked."""
+class KeyframeScans:
+    """Range images and poses of scans, for free-space evidence."""
 
     images: NDArray[np.uint16]
-    """(k, h, w): their range images."""
+    """(k, h, w) cm: range images."""
     T_lidar_map: NDArray[np.float64]
-    """(k, 4, 4): where they were."""
+    """(k, 4, 4): poses."""
 
     @classmethod
-    def of(cls, scans: list[tuple[NDArray[np.uint16], NDArray[np.float64]]]) -> Witnesses:
+    def of(cls, scans: list[tuple[NDArray[np.uint16], NDArray[np.float64]]]) -> KeyframeScans:
         """Range images with their poses, at least one."""
         images, poses = zip(*scans, strict=True)
         return cls(np.stack(images), np.stack(poses))
 
-    def near(self, places: NDArray[np.float64], reach_m: float) -> Witnesses:
-        """Those that are no farther than that from the box around some places (m, 3) m: in a long drive, few."""
-        stood = -np.einsum("kji,kj->ki", self.T_lidar_map[:, :3, :3], self.T_lidar_map[:, :3, 3])
-        outside = np.maximum(places.min(axis=0) - stood, stood - places.max(axis=0)).max(axis=1)
+    def near(self, positions: NDArray[np.float64], reach_m: float) -> KeyframeScans:
+        """The scans at most `reach_m` from the bounding box of positions (m, 3) m: few scans of a long drive."""
+        origins = -np.einsum("kji,kj->ki", self.T_lidar_map[:, :3, :3], self.T_lidar_map[:, :3, 3])
+        outside = np.maximum(positions.min(axis=0) - origins, origins - positions.max(axis=0)).max(axis=1)
         close = outside <= reach_m
-        return self if close.all() else Witnesses(self.images[close], self.T_lidar_map[close])
+        return self if close.all() else KeyframeScans(self.images[close], self.T_lidar_map[close])
 
 
-class AlongTheDrive:
-    """Collects witnesses from all along a drive, however long it stands and however fast it goes."""
+class KeyframeSelector:
+    """Selects keyframe scans at regular distances along a drive."""
 
     def __init__(self) -> None:
         self._kept: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
-        self._stamp, self._stood = -np.inf, np.full(3, np.inf)
+        self._stamp, self._origin = -np.inf, np.full(3, np.inf)
 
     def add(self, stamp: float, image: NDArray[np.uint16], T_lidar_map: NDArray[np.float64]) -> None:
         """Keep a scan that is APART_S or APART_M from the last one that was kept."""
-        stood = np.linalg.inv(T_lidar_map)[:3, 3]
-        if stamp - self._stamp >= APART_S or np.linalg.norm(stood - self._stood) >= APART_M:
+        origin = np.linalg.inv(T_lidar_map)[:3, 3]
+        if stamp - self._stamp >= APART_S or np.linalg.norm(origin - self._origin) >= APART_M:
             self._kept.append((image, T_lidar_map))
-            self._stamp, self._stood = stamp, stood
+            self._stamp, self._origin = stamp, origin
 
-    def witnesses(self) -> Witnesses | None:
-        """All that were kept; None without a scan."""
-        return Witnesses.of(self._kept) if self._kept else None
+    def keyframes(self) -> KeyframeScans | None:
+        """The selected scans; None if there are none."""
+        return KeyframeScans.of(self._kept) if self._kept else None
 
 
-def testify(
-    places: NDArray[np.float64], witnesses: Witnesses, settings: VisibilitySettings
+def hits_and_misses(
+    positions: NDArray[np.float64], keyframes: KeyframeScans, settings: VisibilitySettings
 ) -> NDArray[np.int32]:
-    """How many witnesses hit each place (v, 3) m, and how many saw through it: (2, v); see `range_images.look_at`."""
-    looks = np.zeros((2, len(places)), np.int32)
+    """Count the scans that hit each position (v, 3) m, and those that saw through it: (2, v) hits and misses.
 
-    def look(part: slice) -> None:
-        asked = witnesses.near(places[part], settings.farthest_m)
-        range_images.look_at(
-            places[part], asked.images, asked.T_lidar_map,
+    See `range_images.count_hits_and_misses`, which does the visibility test.
+    """
+    counts = np.zeros((2, len(positions)), np.int32)
+
+    def count(part: slice) -> None:
+        close = keyframes.near(positions[part], settings.farthest_m)
+        range_images.count_hits_and_misses(
+            positions[part], close.images, close.T_lidar_map,
             settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
-            *looks[:, part],
+            *counts[:, part],
         )  # fmt: skip
 
-    starts = range(0, len(places), PLACES_AT_ONCE)
-    for _ in ahead(look, (slice(start, start + PLACES_AT_ONCE) for start in starts), THREADS):
+    starts = range(0, len(positions), POINTS_PER_BLOCK)
+    for _ in prefetch(count, (slice(start, start + POINTS_PER_BLOCK) for start in starts), THREADS):
         pass
-    return looks
+    return counts

@@ -1,4 +1,4 @@
-"""Calibration files from run folders with a known truth: what the network's answers were worth there."""
+"""Fit of the segmentation confusion model: calibration files from run folders with known truth."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from gnss_sem_map.evaluation.metrics import Tables
 from gnss_sem_map.files.run_json import inputs_of
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.labels.sensor_model import CELLS, LabelCalibration, Street, cells_of
-from gnss_sem_map.mapping.labelled_scans import Drive, SeenScan, seen_scans
+from gnss_sem_map.labels.sensor_model import CELLS, CalibrationDrive, LabelCalibration, cells_of
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.potts_mrf import LEAST_PROBABILITY
 from gnss_sem_map.refinement.steps import run_steps
 from gnss_sem_map.refinement.systematic_error import doubted
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of, softmax
 
 LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE = 0.5, 20.0
 Counted = tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]
-"""Of the n points that count: true class (n,), scores of the voxel (n, c), systematic errors of its map (n,)."""
+"""For the n counted points: true class (n,), scores of the voxel (n, c), systematic error rate of the map (n,)."""
 
 
 def calibrate(
@@ -41,14 +41,14 @@ def calibrate(
     segmenter: str | None = None,
     progress: Progress = silent,
 ) -> LabelCalibration:
-    """Measure what the network's answers were worth in run folders, each given with its folder of true `.label` files.
+    """Fit the segmentation confusion model on run folders, each with its folder of true `.label` files.
 
-    Drive and segmenter are those of the run unless given. Counted are the points that an image shows and that have a
-    true class of the map. The temperature is the one under which the untrained map's confidence, with its doubt that
-    all views err alike, fits the truth best (maximum likelihood; Guo et al., "On calibration of modern neural
-    networks", 2017). Raises DataError where something is missing, or runs have different classes.
+    Drive and segmenter are those of the run unless given. Points with a pixel and a true class of the map are counted.
+    The temperature is the maximum-likelihood one for the confidence of the map without calibration, its systematic
+    error rate included (Guo et al., "On calibration of modern neural networks", 2017). Raises DataError where something
+    is missing, or runs have different classes.
     """
-    streets, counted, label_set = [], [], None
+    calibration_drives, counted, label_set = [], [], None
     for out, truth in runs:
         opened, voxels = _open(out, drive, segmenter)
         of_run = open_label_set(opened.settings.classes)
@@ -58,28 +58,28 @@ def calibrate(
                 " one file holds one class set"
             )
         label_set = of_run
-        street, points = measure(opened, voxels, _truths(truth), progress)
-        streets.append(street)
+        calibration_drive, points = measure(opened, voxels, _truths(truth), progress)
+        calibration_drives.append(calibration_drive)
         counted.append(points)
     if label_set is None:
         raise DataError("calibrate: found no run folder, expected at least one")
     temperature = fit_temperature(*(np.concatenate(parts) for parts in zip(*counted, strict=True)))
-    return LabelCalibration(label_set.name, label_set.names, tuple(streets), temperature)
+    return LabelCalibration(label_set.name, label_set.names, tuple(calibration_drives), temperature)
 
 
 def measure(
     drive: Drive, voxels: VoxelMap, truths: Mapping[str, Path], progress: Progress = silent
-) -> tuple[Street, Counted]:
-    """What one drive's labelled points say, and what its untrained map says of them.
+) -> tuple[CalibrationDrive, Counted]:
+    """Counts of one drive, and the scores of its map (made without calibration) for the counted points.
 
-    `voxels` is the map that the drive made; `truths` are its `.label` files by scan name.
+    `voxels` is the map of the drive; `truths` are its `.label` files by scan name.
     """
     tables, c = Tables.of(voxels.label_set), len(voxels.label_set.names)
     state, _ = run_steps(voxels, drive.settings.refinement)
     cells = cells_of(height_over_ground(voxels.centres), flatness(voxels.keys))
     answers, found = np.zeros((c, c + 1), np.int64), np.zeros((c, CELLS[0] * CELLS[1]), np.int64)
     true_classes, rows = [], []
-    for done, seen in enumerate(seen_scans(drive, Account())):
+    for done, seen in enumerate(labelled_scans(drive, RunStats())):
         true, answer, row = _points(drive, seen, voxels, truths, tables)
         np.add.at(answers, (true, answer), 1)
         np.add.at(found, (true, cells[row]), 1)
@@ -89,17 +89,21 @@ def measure(
     true = np.concatenate([*true_classes, np.empty(0, np.int64)])
     if not len(true):
         raise DataError(
-            f"{drive.log.name}: no point has both a pixel and a true class; is the truth of this drive?"
+            f"{drive.log.name}: no point has both a pixel and a true class; is it the truth of this drive?"
         )
     row = np.concatenate(rows)
     doubts = np.full(len(true), state.systematic_error, np.float32)
-    return Street(drive.log.name, answers, found.reshape(c, *CELLS)), (true, state.scores[row], doubts)
+    return CalibrationDrive(drive.log.name, answers, found.reshape(c, *CELLS)), (
+        true,
+        state.scores[row],
+        doubts,
+    )
 
 
 def _points(
-    drive: Drive, seen: SeenScan, voxels: VoxelMap, truths: Mapping[str, Path], tables: Tables
+    drive: Drive, seen: LabelledScan, voxels: VoxelMap, truths: Mapping[str, Path], tables: Tables
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """True class, the network's answer, and voxel of every point of a scan that has all three."""
+    """True class, predicted class and voxel of every point of a scan that has all three."""
     if seen.scan.name not in truths:
         raise DataError(f"no truth for scan {seen.scan.name} of {drive.log.name}; is it another drive's?")
     entries = read_labels(truths[seen.scan.name])
@@ -109,28 +113,28 @@ def _points(
             " are they of the same scan?"
         )
     true = tables.truth[entries[seen.valid] & 0xFFFF].astype(np.int64)
-    row = voxels.places(keys_of(seen.p_map, drive.settings.mapping.voxel_size_m))
+    row = voxels.indices_of(keys_of(seen.p_map, drive.settings.mapping.voxel_size_m))
     use = (true >= 0) & (seen.pixels >= 0) & (row >= 0)
-    use[use] = seen.classes[seen.pixels[use]].any(axis=1)  # a void pixel is no answer
+    use[use] = seen.classes[seen.pixels[use]].any(axis=1)  # a void pixel has no predicted class
     return true[use], seen.labels[use].astype(np.int64), row[use]
 
 
 def fit_temperature(
     true: NDArray[np.int64], scores: NDArray[np.float32], doubts: NDArray[np.float32]
 ) -> float:
-    """The temperature under which scores (n, c), doubted by as much (n,), make the true classes (n,) most probable."""
+    """The temperature under which scores (n, c) with error rates (n,) best predict the true classes (n,)."""
 
-    def surprise(log_temperature: float) -> float:
+    def cross_entropy(log_temperature: float) -> float:
         probabilities = doubted(softmax(scores / np.float32(np.exp(log_temperature))), doubts[:, None])
         of_truth = probabilities[np.arange(len(true)), true]
         return -float(np.log(np.maximum(of_truth, LEAST_PROBABILITY)).mean(dtype=np.float64))
 
     bounds = tuple(np.log([LOWEST_TEMPERATURE, HIGHEST_TEMPERATURE]))
-    return float(np.exp(minimize_scalar(surprise, bounds=bounds, method="bounded").x))
+    return float(np.exp(minimize_scalar(cross_entropy, bounds=bounds, method="bounded").x))
 
 
 def _open(out: Path, drive: Path | None, segmenter: str | None) -> tuple[Drive, VoxelMap]:
-    """The drive behind a run folder, as the run saw it, and the map before refinement."""
+    """The drive of a run folder, with the run's settings and trajectory, and the map before refinement."""
     settings = config.load(out / "config.yaml")
     if settings.calibration is not None:
         raise DataError(f"{out}: was made with a calibration file; calibrate with a run made without one")

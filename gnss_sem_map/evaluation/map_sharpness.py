@@ -1,8 +1,8 @@
-"""How sharp the map is: bad poses, calibration or time offsets show as blur, and need no truth to be seen.
+"""Sharpness of the map: errors of poses, calibration or time offsets blur it, which is measured without any truth.
 
-Points are gathered in cubes of half a metre. Where many sweeps saw the same cube, its points should lie on one
-surface: the standard deviation across the surface is its thickness. Sharpness is consistency, not accuracy: a bent
-map can be sharp.
+Points are collected in cubes of half a metre. The points of many sweeps in one cube should lie on one surface: the
+standard deviation across the surface is its thickness. Sharpness measures consistency, not accuracy: a bent map can be
+sharp.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.voxel_map import keys_of
@@ -33,10 +33,10 @@ GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
 """A surface is ground when its normal is steeper than the first (its z), a wall when flatter than the second."""
 LENGTH_STEP_S = 1.0
 THINNEST_M = 1e-4
-"""No LiDAR measures finer: keeps the logarithm of the entropy finite."""
+"""Below the resolution of any LiDAR: keeps the logarithm of the entropy finite."""
 SCANS, LAST_SCAN, SUMS = 1, 2, 3
-"""Words of a cube's row behind its key: sweeps that saw it, the last of them, and ten sums (float64): the number of
-points, first and second moments about the cube's middle."""
+"""Columns of a cube's row after its key: number of sweeps with a point in it, the last of them, and ten sums (float64):
+the number of points, first and second moments about the centre of the cube."""
 CUBE_WORDS = SUMS + 10
 SMALLEST_TABLE = 1 << 14
 
@@ -51,7 +51,7 @@ class SharpnessSettings(BaseModel):
     every_nth_point: int = Field(3, gt=0, description="Of every sweep, this part of the points is used.")
     cell_size_m: float = Field(0.5, gt=0, description="Edge of the cubes whose thickness is measured.")
     min_points: int = Field(30, ge=4, description="Cubes with fewer points do not count.")
-    min_scans: int = Field(10, gt=0, description="Nor do those that fewer sweeps saw.")
+    min_scans: int = Field(10, gt=0, description="Nor do cubes with points of fewer sweeps.")
     voxel_size_m: float = Field(0.2, gt=0, description="Edge of the voxels that are counted.")
     max_scans: int = Field(
         400, gt=0, description="A longer drive is sampled in stretches that sum up to this."
@@ -61,7 +61,7 @@ class SharpnessSettings(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Sharpness:
-    """How sharp a map is; NaN where no cube was seen often enough."""
+    """Sharpness of a map; NaN if no cube has enough points and sweeps."""
 
     thickness_m: float
     """Median over the cubes of the standard deviation across the surface."""
@@ -83,7 +83,7 @@ class Sharpness:
 def of_clouds(
     clouds: Iterable[Array], length_m: float, settings: SharpnessSettings | None = None
 ) -> Sharpness:
-    """Sharpness of sweeps whose points (n, 3) are in the map; `length_m` is how far the vehicle drove."""
+    """Sharpness of sweeps with points (n, 3) m in the map frame; `length_m` is the distance driven."""
     settings = settings or SharpnessSettings()
     stretch = _Stretch(settings)
     for p_map in clouds:
@@ -99,8 +99,8 @@ def of_drive(
 ) -> list[Sharpness]:
     """Sharpness of one drive by each of several trajectories; every sweep is read once.
 
-    Sweeps that cannot be read, or that leave a trajectory, are left out for all of them. What moves is not taken
-    out: it blurs alike for every trajectory.
+    Sweeps that cannot be read, or that are outside of a trajectory, are left out for all of them. Moving objects are
+    included: they blur the map in the same way for every trajectory.
     """
     settings = settings or SharpnessSettings()
     stretches = _stretches(log.scans, settings)
@@ -111,7 +111,7 @@ def of_drive(
     def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
         return _clouds(numbered_scan[1], trajectories, log.calibration.T_imu_lidar, settings)
 
-    for done, ((n, scan), clouds) in enumerate(ahead(clouds_of, numbered), 1):
+    for done, ((n, scan), clouds) in enumerate(prefetch(clouds_of, numbered), 1):
         if clouds is not None:
             stamps[n].append(scan.stamp)
             for of_one, cloud in zip(gathered, clouds, strict=True):
@@ -122,7 +122,7 @@ def of_drive(
 
 
 def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tuple[Scan, ...]]:
-    """The whole drive, or stretches of neighbouring sweeps spread evenly over it."""
+    """The whole drive, or sections of consecutive sweeps spread evenly over it."""
     if len(scans) <= settings.max_scans:
         return [scans] if scans else []
     count = max(1, settings.max_scans // settings.stretch_scans)
@@ -133,7 +133,7 @@ def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tup
 def _clouds(
     scan: Scan, trajectories: Sequence[Trajectory], T_imu_lidar: Array, settings: SharpnessSettings
 ) -> list[_Cloud] | None:
-    """A sweep in the map, by each trajectory; None when it cannot be read, or leaves a trajectory or the map."""
+    """A sweep in the map by each trajectory; None if it cannot be read, or is outside of a trajectory or the map."""
     every, (nearest_m, farthest_m) = settings.every_nth_point, (settings.nearest_m, settings.farthest_m)
     try:
         points = scan.read()
@@ -151,14 +151,15 @@ def _clouds(
 def _length(trajectory: Trajectory, stamps: Array) -> float:
     if len(stamps) < 2:
         return 0.0
-    every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))  # jitter is no way driven
+    # so far apart, jitter does not count as distance
+    every = max(1, round(LENGTH_STEP_S / float(np.median(np.diff(stamps)))))
     positions = trajectory.at(np.append(stamps[:-1:every], stamps[-1]), EXTRAPOLATE_S)[:, :3, 3]
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class _Cloud:
-    """The points (n, 3) of a sweep in the map, and in which cubes and voxels they lie."""
+    """The points (n, 3) m of a sweep in the map, with the keys of their cubes and voxels."""
 
     p_map: Array
     cubes: Keys
@@ -171,7 +172,7 @@ class _Cloud:
 
 
 class _Stretch:
-    """The points of neighbouring sweeps, as sums per cube and as occupied voxels; it grows with the place only."""
+    """Points of consecutive sweeps, as sums per cube and as occupied voxels; memory grows with the mapped area only."""
 
     def __init__(self, settings: SharpnessSettings) -> None:
         self.scans = 0
@@ -180,7 +181,7 @@ class _Stretch:
         self._cube_count = self.voxels = 0
 
     def add(self, cloud: _Cloud) -> None:
-        """One more sweep."""
+        """Add one sweep."""
         self.scans += 1
         done = 0
         while done < len(cloud.cubes):
@@ -195,7 +196,7 @@ class _Stretch:
             self.voxels, done = _occupy(self._voxels, self.voxels, done, cloud.voxels)
 
     def surfaces(self) -> tuple[Array, Array]:
-        """Variances (c, 3), smallest first, of the cubes seen often enough, and the |z| of their normals (c,)."""
+        """Variances (c, 3), ascending, of cubes with enough points and sweeps, and |z| of their normals (c,)."""
         seen = self._cubes[:, SCANS] >= self._settings.min_scans
         sums = self._cubes.view(np.float64)[seen, SUMS:]
         sums = sums[sums[:, 0] >= self._settings.min_points]
@@ -212,7 +213,7 @@ def _empty(slots: int, words: int) -> Keys:
 
 
 def _with_room(rows: Keys, count: int) -> Keys:
-    """The table itself, or when it is half full one twice as large."""
+    """The table itself, or a table of twice the size when it is half full."""
     if 2 * count < len(rows):
         return rows
     larger = _empty(2 * len(rows), rows.shape[1])
@@ -222,7 +223,7 @@ def _with_room(rows: Keys, count: int) -> Keys:
 
 @njit(cache=True, nogil=True, inline="always")
 def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
-    """Row of a key, entered where it is new, and whether it is; one row must be empty."""
+    """Row of a key, inserted if it is new, and whether it is new; one row must be empty."""
     row = kernels.find_or_insert(rows, key)
     is_new = rows[row, 0] == 0
     rows[row, 0] = key
@@ -233,7 +234,7 @@ def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
 def _gather(
     rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
 ) -> tuple[int, int]:
-    """Add points from `start` on to their cubes, moments about the cube's middle, until the table is half full.
+    """Add points from `start` on to their cubes, with moments about the cube's centre, until the table is half full.
 
     `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
     """

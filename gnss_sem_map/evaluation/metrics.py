@@ -1,6 +1,6 @@
-"""How good a map is, point by point: accuracy and IoU (eq. 14, 15), coverage, calibration, removal of what moved.
+"""Metrics of a map by points: accuracy and IoU (eq. 14, 15), coverage, calibration, removal of moving objects.
 
-Everything is counted first and divided last, so that scans, drives and machines add up exactly.
+Points are counted first and divided last, so that counts of scans, drives and machines add up exactly.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet, taxonomy
 
 MOVING_IDS = range(252, 260)
-"""SemanticKITTI raw ids of everything that moves; the vehicles among them map to the class `vehicle`."""
+"""SemanticKITTI raw ids of moving objects; the vehicles among them map to the class `vehicle`."""
 CALIBRATION_BINS = 15
 RAW_IDS = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """Raw SemanticKITTI ids -> what they count as."""
+    """Tables from raw SemanticKITTI ids to classes."""
 
     truth: NDArray[np.int16]
     """(65536,) class index; -1 where a point with this truth is not counted at all."""
@@ -68,10 +68,10 @@ def confusion(
 def semantics(counts: NDArray[np.int64], label_set: LabelSet) -> dict[str, Any]:
     """Accuracy TP / (TP + FP) and IoU TP / (TP + FP + FN) per class and on average, and coverage, all in 0..1.
 
-    The figures are over labelled points, with the coverage beside them; under `strict` an unlabelled point is a miss of
-    its class. A class without any truth is left out of the mean, one that is never predicted counts as 0. Accuracy,
-    which others call precision, looks at labelled points only, so its strict mean differs in one case: a class of
-    whose points none is labelled is left out of the mean, but counts as 0 in the strict one.
+    The figures are over labelled points, with the coverage beside them; under `strict` an unlabelled point counts as a
+    false negative of its class. A class without truth is left out of the mean; one that is never predicted counts as 0.
+    Accuracy (elsewhere called precision) uses labelled points only, so its strict mean differs in one case: a class
+    without any labelled point is left out of the mean, but counts as 0 in the strict one.
     """
     labelled = counts[:, :-1]
     observed = _figures(labelled, labelled.sum(axis=1), label_set)
@@ -107,7 +107,7 @@ def dynamic_counts(
 ) -> NDArray[np.int64]:
     """Counts (3, 2) of one scan: rows moving vehicle, static vehicle, other static; columns kept, removed.
 
-    Points without truth, and what moves but is no vehicle, are not counted.
+    Points without truth, and moving objects that are no vehicles, are not counted.
     """
     if removed.shape != truth.shape:
         raise DataError(

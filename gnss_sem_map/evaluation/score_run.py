@@ -1,4 +1,4 @@
-"""A run folder against the truth: its point labels, its removed points, its trajectory."""
+"""Scores of a run folder against truth: point labels, removed points, trajectory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 
 LARGEST = 1e12
-"""No stamp in s, and no length in m, is larger."""
+"""Largest stamp in s and length in m."""
 
 ONE_SECOND = 10
 """Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
@@ -32,7 +32,7 @@ ONE_SECOND = 10
 def score_run(
     out: Path, truth: Path, label_set: LabelSet | None = None, restrict_to: Path | None = None
 ) -> dict[str, Any]:
-    """Everything that can be scored of a run folder, as `metrics.json` holds it; also written there.
+    """Scores of a run folder, in the layout of `metrics.json`; also written to it.
 
     `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
     the imu in the map frame at the scans' stamps). `label_set` is that of the run's settings unless given.
@@ -49,7 +49,7 @@ def score_run(
 
 
 def _check_scorable(out: Path) -> None:
-    """Raise DataError for a folder that says nothing of single points, which are what is scored."""
+    """Raise DataError for a folder without labels of single points, which are needed for scoring."""
     about = read_run(out)
     if "merged" in about:
         made_of = about["merged"] if isinstance(about["merged"], list) else [about["merged"]]
@@ -68,7 +68,7 @@ def _check_scorable(out: Path) -> None:
 
 
 def _known_metrics(out: Path) -> dict[str, Any]:
-    """What the run itself measured without a truth."""
+    """Metrics of the run itself, without truth."""
     return read_json(out / "metrics.json")
 
 
@@ -107,7 +107,7 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
 
 
 def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32]]]:
-    """Name and true ids of every scan that the run labelled; every one must have a truth, and at least one."""
+    """Name and true ids of every scan with labels; each must have truth, and there must be at least one."""
     wanted, known = label_files(predictions), label_files(truth)
     missing = sorted(set(wanted) - set(known))
     if missing:
@@ -118,7 +118,7 @@ def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
-    """Absolute error, nothing aligned; the same after the best rigid alignment; relative error over a second.
+    """Absolute trajectory error without alignment and after the best rigid alignment; relative error over a second.
 
     Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom.
     """

@@ -1,1 +1,1 @@
-"""The map and the trajectory as files that CloudCompare, QGIS, evo and a browser open as they are."""
+"""Export of map and trajectory to files for CloudCompare, QGIS, evo and browsers."""

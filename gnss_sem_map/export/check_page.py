@@ -1,4 +1,4 @@
-"""check.html: what the pre-flight found, on one page."""
+"""check.html: the findings of the pre-flight check on one page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GENERATOR = b'<meta name="generator" content="gnss-sem-map">'
 
 
 def check_writable(path: Path) -> None:
-    """Raise DataError when something lies at `path` that is no page of ours."""
+    """Raise DataError when `path` exists and is not a page of ours."""
     if path.is_dir():
         raise DataError(f"{path}: is a folder, expected a file to write; choose another -o")
     if path.exists() and GENERATOR not in path.read_bytes()[:2000]:
@@ -27,7 +27,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_check_page(path: Path, name: str, page: Preflight) -> None:
-    """Write the findings of a drive as one self-contained page, over an earlier one; raises DataError."""
+    """Write the findings of a drive as one self-contained page, replacing an earlier one; raises DataError."""
     check_writable(path)
     facts = f'<p class="facts">{escape(VERDICTS[page.level])} Checked in {page.seconds:.1f} s.</p>'
     title = f"Pre-flight of {name}"

@@ -16,7 +16,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import Laid, merge_runs
 from gnss_sem_map.pipeline import Result, refine_map
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 
@@ -49,7 +49,7 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
         raw,
         state.decided,
         report,
-        Account(),
+        RunStats(),
         merged.evidence,
         kerbs=state.kerbs,
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 LONGEST_SIDE_PX = 1800
 NARROWEST_PX, LOWEST_PX = 900, 300
-"""The map's window is at least this large, so that the legend has room."""
+"""Least size of the map window, so that the legend fits."""
 MARGIN_PX, TITLE_PX, SCALE_BAR_PX = 30, 60, 320
 ENTRY_PX = (215, 36)
 """Width and height of one class in the legend."""
@@ -33,9 +33,9 @@ PERSPECTIVE_PX = (1920, 1080)
 SUPERSAMPLING = 2
 FIELD_OF_VIEW_DEG = 62.0
 BEHIND_M, ABOVE_M = 13.0, 10.0
-"""From the vehicle to the eye."""
+"""Vector from the vehicle to the virtual camera."""
 AHEAD_M, BELOW_M = 24.0, 2.0
-"""From the vehicle to the point that the eye looks at: on the road ahead."""
+"""Vector from the vehicle to the point on the road ahead that the virtual camera looks at."""
 BEAD_M = 0.12
 TRACK_COLOUR = (255, 214, 10)
 SKY = np.array([[13, 17, 28], [38, 48, 66]], np.float32)
@@ -45,7 +45,7 @@ HOLLOWS = ((2, 6.0, 0.1), (8, 2.5, 0.15), (24, 1.5, 0.25), (64, 1.0, 0.35))
 
 UNLABELLED_BY_DAY, UNLABELLED_BY_NIGHT = (214, 217, 222), (72, 80, 97)
 UNLABELLED_ALONE = (150, 158, 172)
-"""In a map without any label."""
+"""Used in a map without labels."""
 
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
@@ -110,7 +110,7 @@ def _legend_entries(
 
 
 def _unlabelled(labels: NDArray[np.int8], beside_others: Colour) -> Colour:
-    """The colour of what has no label."""
+    """Colour of unlabelled voxels."""
     return beside_others if (labels >= 0).any() else UNLABELLED_ALONE
 
 
@@ -181,7 +181,7 @@ def _draw_scale_and_north(strip: Any, metres_per_px: float) -> None:
 
 
 def _round_length(longest_m: float) -> float:
-    """The longest of 1, 2, 5, 10, 20, 50... metres that is not longer than this."""
+    """The largest of 1, 2, 5, 10, 20, 50... metres that does not exceed the given length."""
     power = 10.0 ** np.floor(np.log10(longest_m))
     return float(max(step * power for step in (1, 2, 5) if step * power <= longest_m))
 
@@ -193,7 +193,7 @@ def write_perspective(
     at_s: float | None = None,
     camera: Camera | None = None,
 ) -> None:
-    """Draw the map as PNG, as a camera sees it that flies behind and above the vehicle, with legend and track.
+    """Draw the map as PNG, as seen by a virtual camera behind and above the vehicle, with legend and track.
 
     The vehicle is where it was at the stamp `at_s`, by default where the camera sees most of the map; without a
     trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
@@ -225,7 +225,7 @@ def write_perspective(
 
 
 def _behind(trajectory: Trajectory, at_s: float) -> Camera:
-    """Behind and above the vehicle, looking along its way."""
+    """Virtual camera behind and above the vehicle, in driving direction."""
     T_map_imu = trajectory.at([at_s])[0]
     vehicle, forward = T_map_imu[:3, 3], T_map_imu[:3, 0] * (1, 1, 0)
     forward /= np.linalg.norm(forward)
@@ -236,7 +236,7 @@ def _behind(trajectory: Trajectory, at_s: float) -> Camera:
 def _best_stamp(
     trajectory: Trajectory, centres: NDArray[np.float64], framed: NDArray[np.bool_], voxel_m: float
 ) -> float:
-    """The stamp, out of a few with some way still ahead, at which the most of the framed voxels are to be seen."""
+    """The stamp, of a few candidates before the end of the track, with most voxels in view."""
     along = _along(trajectory)
     stamps = trajectory.stamps[along <= max(0.0, along[-1] - AHEAD_M / 2)]
     stamps = stamps[:: 1 + len(stamps) // 20]
@@ -262,21 +262,21 @@ def _camera(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Camera:
 
 
 def _beads(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Points (n, 3) m along the track, so near to one another that they make a line."""
+    """Points (n, 3) m along the track, dense enough to be drawn as a line."""
     along = _along(trajectory)
     steps = np.arange(0.0, along[-1], BEAD_M / 2)
     return np.column_stack([np.interp(steps, along, axis) for axis in trajectory.positions.T])
 
 
 def _along(trajectory: Trajectory) -> NDArray[np.float64]:
-    """Way driven up to every pose, (k,) m."""
+    """Distance driven up to every pose, (k,) m."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)))
 
 
 def _lit(
     centres: NDArray[np.float64], half_m: NDArray[np.float64], rgb: NDArray[np.uint8], camera: Camera
 ) -> NDArray[np.uint8]:
-    """(h, w, 3) RGB: the cubes, lit from above, darkened in their hollows, fading into the sky with distance."""
+    """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog."""
     import cv2
 
     wide, high = camera.width_px, camera.height_px

@@ -1,4 +1,4 @@
-"""The map as a point cloud, one point per voxel: PLY to look at, LAZ with coordinates and class codes."""
+"""The map as a point cloud, one point per voxel: PLY for viewing, LAZ with UTM coordinates and class codes."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ def colours(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
 
 
 def drawable(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Voxels that a picture may show: all but the removed ones, or these where nothing else is there."""
+    """Voxels that a picture may show: all but the removed ones, or the removed ones if there are no others."""
     stands = semantic_map.states != State.REMOVED
     return np.asarray(stands if stands.any() else ~stands)
 
 
 def visible(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Voxels that a picture is about: `shown`, or in a map that shows no label all that are `drawable`."""
+    """Voxels that define the extent of a picture: `shown`, or all `drawable` ones in a map without labels."""
     return semantic_map.shown if semantic_map.shown.any() else drawable(semantic_map)
 
 
@@ -97,7 +97,7 @@ def _ply_header(semantic_map: SemanticMap, count: int, frame: LocalFrame | None)
 
 
 def _plain(name: str) -> str:
-    """A class name as one line of printable ASCII, whatever the user's class file holds."""
+    """A class name as one line of printable ASCII, for any content of the user's class file."""
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
 
 
@@ -144,7 +144,7 @@ def _las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeade
 
 
 def _placed(p_map: NDArray[np.float64], frame: LocalFrame | None) -> NDArray[np.float64]:
-    """Map points in the coordinates of the file: UTM, or as they are when the map is not georeferenced."""
+    """Map points in the coordinates of the file: UTM, or map frame if the map is not georeferenced."""
     return p_map if frame is None else to_utm(frame, p_map)
 
 

@@ -1,4 +1,4 @@
-"""One page about a run: what went in, what was left out and why, how good the result is, and what each file is."""
+"""Report of a run on one HTML page: inputs, skips with reasons, quality of the result, and a list of the files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gnss_sem_map.files.ownership import amend
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
     "topview.png": "The map from above, north up.",
-    "trajectory.png": "The trajectory and the fixes that it was made of.",
+    "trajectory.png": "The trajectory and its GNSS fixes.",
 }
 FILES = {
     **{each.file: each.what for each in FORMATS},
@@ -34,8 +34,8 @@ FILES = {
     "confidence": "the probability of each of these labels, float16",
     "removed": "1 for every LiDAR point on a moving vehicle that was taken out of the map",
     "config.yaml": "all settings of this run",
-    "run.json": "what this page says of the run, for programs",
-    "metrics.json": "what this page says of the evaluation, for programs",
+    "run.json": "the content of this page about the run, machine-readable",
+    "metrics.json": "the content of this page about the evaluation, machine-readable",
 }
 WORDS = {
     "SA": "static points kept (SA)",
@@ -44,14 +44,14 @@ WORDS = {
     "SA_vehicle": "points on parked vehicles kept",
     "ece": "expected calibration error (ECE)",
     "ate_m": "absolute trajectory error (m)",
-    "chi2_per_dof": "squared residuals by what their standard deviations allow (chi2 per degree of freedom)",
-    "position_nees_per_dof": "squared position error by its claimed variance (NEES per degree of freedom)",
-    "orientation_nees_per_dof": "squared orientation error by its claimed variance (NEES per degree of freedom)",
+    "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of freedom)",
+    "position_nees_per_dof": "squared position error / claimed variance (NEES per degree of freedom)",
+    "orientation_nees_per_dof": "squared orientation error / claimed variance (NEES per degree of freedom)",
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260
 MANY_SKIPS = 200
-"""The page lists this many; run.json lists all."""
+"""Number of skips on the page; run.json lists all."""
 
 
 def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
@@ -116,7 +116,7 @@ def _section(title: str, *parts: str) -> str:
 
 
 def _sharpness(sharpness: Mapping[str, Mapping[str, Any]]) -> str:
-    """Surface thickness of the map, and of the map that GNSS and IMU alone would give: blur shows wrong calibration."""
+    """Surface thickness of the map, and of a map from GNSS and IMU alone: a wrong calibration blurs surfaces."""
     if not sharpness:
         return ""
     figures = list(dict.fromkeys(name for values in sharpness.values() for name in values))
@@ -169,7 +169,7 @@ def _skips(skips: Mapping[str, Any]) -> str:
 
 
 def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
-    """Voxels, accuracy and IoU per class, before and after refinement, as far as they are known."""
+    """Table of voxels, accuracy and IoU per class, before and after refinement, as far as known."""
     counts = about_map.get("labelled", {})
     names = list(dict.fromkeys(n for s in ("raw", "refined") for n in _class_names(counts, semantics, s)))
     columns: list[tuple[str, list[Any]]] = []
@@ -213,7 +213,7 @@ def _refinement(refinement: Mapping[str, Any]) -> str:
     vehicles = {f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))}
     table = _table(("step", "voxels changed", "of these"), changed) if changed else ""
     errors = {
-        "looks that err in all views, estimated without truth": _percent(refinement.get("systematic_errors"))
+        "systematic label error rate, estimated without truth": _percent(refinement.get("systematic_errors"))
     }
     return table + _pairs(vehicles | (errors if "systematic_errors" in refinement else {}))
 
@@ -277,7 +277,7 @@ def _percent(share: float | None) -> str | None:
 
 
 def _shares(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with every fraction as a percentage."""
+    """The same metrics with fractions as percentages."""
     return {key: _percent(value) if isinstance(value, float) else value for key, value in values.items()}
 
 

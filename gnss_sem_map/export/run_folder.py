@@ -32,11 +32,11 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement.steps import RefinementReport
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
-PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "scikit-learn", "opencv-python-headless", "pyproj")
+PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
 
 RUN_FILES = re.compile(
@@ -70,14 +70,14 @@ def write_run(
     """Write everything that a run made (design: the run folder); returns the content of run.json."""
     inputs = {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        with result.account.stage("export"):
+        with result.stats.stage("export"):
             _write_trajectory(folder, log, result.trajectory, result.solution)
             driven = _while_mapping(result.trajectory, log)
             write_maps(folder, result, log.frame, driven, log.name)
             evidence.write(result.evidence, folder, log.frame)
             if write_labels:
                 write_point_labels(folder, log, result, settings)
-        about = about_run(drive, log, result.account) | {
+        about = about_run(drive, log, result.stats) | {
             "inputs": inputs,
             "scans_s": [log.scans[0].stamp, log.scans[-1].stamp],
             "preflight": result.preflight.as_dict(),
@@ -112,15 +112,15 @@ def write_again(
             shutil.copyfile(file, folder / file.name)
         frame = tiles.read_frame(source / "map")
         driven = between(result.trajectory, first, last)
-        with result.account.stage("export"):
+        with result.stats.stage("export"):
             write_maps(folder, result, frame, driven, str(about["name"]))
             evidence.write(result.evidence, folder, frame)
             if log is not None:
                 write_point_labels(folder, log, result, settings)
         about |= changed | {
-            "seconds": about["seconds"] | _seconds(result.account),
-            "counts": about["counts"] | dict(sorted(result.account.counts.items())),
-            "warnings": list(dict.fromkeys([*about["warnings"], *result.account.warnings])),
+            "seconds": about["seconds"] | _seconds(result.stats),
+            "counts": about["counts"] | dict(sorted(result.stats.counts.items())),
+            "warnings": list(dict.fromkeys([*about["warnings"], *result.stats.warnings])),
             "map": about_map(result),
         }
         if tracked is not None:
@@ -161,7 +161,7 @@ def write_trajectory_run(
     log: SensorLog,
     trajectory: Trajectory,
     solution: Solution | None,
-    account: Account,
+    stats: RunStats,
     settings: Settings,
     page: Preflight,
 ) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def write_trajectory_run(
     with claimed_run(out, [drive]), new_folder(out) as folder:
         _write_trajectory(folder, log, trajectory, solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        about = about_run(drive, log, account) | {
+        about = about_run(drive, log, stats) | {
             "preflight": page.as_dict(),
             "trajectory": _about_solution(solution),
         }
@@ -224,9 +224,9 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
         refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
 
 
-def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
+def about_run(drive: Path, log: SensorLog, stats: RunStats) -> dict[str, Any]:
     """What went in, what was left out and why, and what it cost."""
-    skips = sorted(set(account.skips), key=astuple)
+    skips = sorted(set(stats.skips), key=astuple)
     frames: Counter[str] = Counter()
     for skip in skips:
         frames[skip.what] += skip.frames
@@ -236,20 +236,20 @@ def about_run(drive: Path, log: SensorLog, account: Account) -> dict[str, Any]:
         "name": log.name,
         "epoch_ns": log.epoch_ns,
         "local_frame": None if log.frame is None else asdict(log.frame),
-        "counts": dict(sorted(account.counts.items())),
-        "warnings": account.warnings,
+        "counts": dict(sorted(stats.counts.items())),
+        "warnings": stats.warnings,
         "skips": {
             "count": len(skips),
             "frames": dict(sorted(frames.items())),
             "listed": [asdict(skip) for skip in skips],
         },
-        "seconds": _seconds(account),
-        "peak_memory_mb": {name: round(value) for name, value in account.peak_memory_mb.items()},
+        "seconds": _seconds(stats),
+        "peak_memory_mb": {name: round(value) for name, value in stats.peak_memory_mb.items()},
     }
 
 
-def _seconds(account: Account) -> dict[str, float]:
-    return {name: round(value, 3) for name, value in account.seconds.items()}
+def _seconds(stats: RunStats) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in stats.seconds.items()}
 
 
 def about_map(result: Result) -> dict[str, Any]:

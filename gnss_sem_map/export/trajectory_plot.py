@@ -1,4 +1,4 @@
-"""One picture of a trajectory that an engineer would want to see before believing it."""
+"""Diagnostic plot of a trajectory: track, residuals, standard deviations, biases."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

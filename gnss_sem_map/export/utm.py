@@ -18,7 +18,7 @@ def to_utm(frame: LocalFrame, p_map: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 def from_utm(frame: LocalFrame, p_utm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The way back: easting, northing, height (n, 3) m -> points (n, 3) m of the map frame."""
+    """Inverse: easting, northing, height (n, 3) m -> points (n, 3) m of the map frame."""
     easting, northing, alt_m = np.moveaxis(np.asarray(p_utm, np.float64), -1, 0)
     lon_deg, lat_deg = _utm(frame).transform(easting, northing, direction="INVERSE")
     return frame.to_map(lat_deg, lon_deg, alt_m)

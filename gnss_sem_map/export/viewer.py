@@ -1,4 +1,4 @@
-"""The map as one web page: every voxel, to turn and to ask, offline and without any library."""
+"""Interactive viewer: the map as one web page that works offline and without libraries."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ AXIS_BYTES = 3
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """What the page shows, one row per voxel."""
+    """The voxels of the page, one row per voxel."""
 
     size_m: float
     indices: NDArray[np.int64]
     labels: NDArray[np.uint8]
-    """The number of classes where there is no label."""
+    """Class index; the number of classes stands for no label."""
     confidence: NDArray[np.uint8]
     """0 to 255."""
     states: NDArray[np.uint8]
@@ -75,7 +75,7 @@ def write_viewer(
 
 
 def _within(most_voxels: int, semantic_map: SemanticMap) -> tuple[_Voxels, str]:
-    """The voxels to show, and what to say about those left out."""
+    """The voxels to show, and a note about those left out."""
     unlabelled = semantic_map.labels < 0
     remark = ""
     rows = np.arange(len(semantic_map))
@@ -99,7 +99,7 @@ def _within(most_voxels: int, semantic_map: SemanticMap) -> tuple[_Voxels, str]:
 
 
 def _morton(indices: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Z-order of voxels (v, 3), in which neighbours in space are mostly neighbours in the file."""
+    """Z-order (Morton order) of voxels (v, 3): neighbours in space are mostly neighbours in the file."""
     code = np.zeros(len(indices), np.uint64)
     for axis, values in enumerate((indices - indices.min(axis=0)).astype(np.uint64).T):
         for bit in range(21):
@@ -108,7 +108,7 @@ def _morton(indices: NDArray[np.int64]) -> NDArray[np.uint64]:
 
 
 def _planes(voxels: _Voxels) -> bytes:
-    """Byte planes, as the page's decoder expects them: similar bytes side by side compress well."""
+    """Byte planes, as the decoder of the page expects them: similar bytes side by side compress well."""
     differences = np.diff(
         voxels.indices - voxels.indices.min(axis=0), axis=0, prepend=np.zeros((1, 3), np.int64)
     )
@@ -119,7 +119,7 @@ def _planes(voxels: _Voxels) -> bytes:
 
 
 def _meta(voxels: _Voxels, label_set: LabelSet, trajectory: Trajectory | None) -> dict[str, Any]:
-    """What the page needs beside the voxels; lengths in voxels from `origin`, the lowest index."""
+    """Metadata for the page; lengths are in voxels from `origin`, the lowest index."""
     origin = voxels.indices.min(axis=0)
     positions = np.empty((0, 3)) if trajectory is None else trajectory.positions
     track = (positions / voxels.size_m - origin).round(2)

@@ -1,1 +1,1 @@
-"""Reading files that nobody can trust, and writing results without harm to what stands there."""
+"""Reading untrusted files, and writing results without damage to existing files."""

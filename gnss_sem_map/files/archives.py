@@ -1,4 +1,4 @@
-"""Arrays in an `.npz` file: what each is, and how large, is known before a byte of it is unpacked."""
+"""Arrays in an `.npz` file: type and size of each are checked before it is decompressed."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ HEADER = re.compile(
     r"\{'descr': '([<>|=]?[biufcU]\d{1,6})', 'fortran_order': (True|False),"
     r" 'shape': \(((?:\d{1,18}, ?)*\d{0,18})\),? ?\}\s*"
 )
-"""What numpy writes, and nothing that would have to be evaluated."""
+"""Format of the header that numpy writes; nothing in it is evaluated."""
 
 _ERRORS = (
     zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, KeyError, IndexError, OverflowError,
     RuntimeError, NotImplementedError,
 )  # fmt: skip
-"""What `zipfile` raises for a damaged archive."""
+"""Exceptions of `zipfile` for a damaged archive."""
 
 
 class Archive:
@@ -43,7 +43,7 @@ class Archive:
         self._path, self._members = path, members
 
     def array(self, name: str, most_bytes: int = MOST_BYTES) -> Member:
-        """What an array is; raises DataError where there is none, or it is not stored as numpy does."""
+        """Type and shape of an array; raises DataError if it does not exist or is not in numpy's format."""
         entries = {entry.filename: entry for entry in self._members.infolist()[:MOST_MEMBERS]}
         entry = entries.get(f"{name}.npy")
         if entry is None:
@@ -108,7 +108,7 @@ class Member:
 
 @contextmanager
 def open_archive(path: Path, most_bytes: int = MOST_BYTES) -> Iterator[Archive]:
-    """An `.npz` file; raises DataError when it is no archive, or larger than that."""
+    """Open an `.npz` file; raises DataError when it is not an archive, or too large."""
     with os.fdopen(open_file(path), "rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size > most_bytes:
@@ -122,7 +122,7 @@ def open_archive(path: Path, most_bytes: int = MOST_BYTES) -> Iterator[Archive]:
 
 
 def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:
-    """Type, order and shape of an array, and where its values begin."""
+    """Type, order and shape of an array, and the offset of its values."""
     magic = file.read(8)
     if magic[:6] != b"\x93NUMPY" or len(magic) < 8 or magic[6] not in (1, 2, 3):
         raise ValueError("no array of numpy")

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: written beside, then renamed into place."""
+"""Atomic files: written under another name beside the target, then renamed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[BinaryIO]:
-    """Open a new file to write; it becomes `path` when the block ends well and vanishes when it does not.
+    """Open a new file for writing; it is renamed to `path` when the block succeeds, and removed when it fails.
 
     Raises DataError when the folder does not exist or may not be written to, and when the disk is full.
     """

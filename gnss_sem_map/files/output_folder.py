@@ -1,4 +1,4 @@
-"""Where results go: one command at a time, beside what was there, and in its place when they are whole.
+"""Output folders: locked by one command at a time, written beside the old result, and renamed when complete.
 
 What lies at OUT is replaced only when all of it is ours (`ownership`), and never when it is, holds or lies in an
 input. The new result is written in `.OUT.work/part`; the old one moves to `.OUT.work/old`, the new one to OUT, and only
@@ -23,17 +23,17 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership, work_folder
 
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
-"""Errors of file systems that know no locks: there we go on without."""
+"""Errors of file systems without locks: there we continue without a lock."""
 FIRST_WORDS = "gnss-sem-map writes"
 RESUMABLE = "what is mapped so far is kept: `gnss-sem-map run ... --resume` goes on"
 
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """A place for results that is ours alone until the claim ends."""
+    """An output folder that this process holds exclusively until the claim ends."""
 
     out: Path
-    """Absolute, links followed."""
+    """Absolute path, with links resolved."""
     by_name: Callable[[str], bool]
     """Whether a folder without a list may hold a file of this path: results of older versions have no list."""
 
@@ -44,7 +44,7 @@ class Claim:
 
 
 _HELD: dict[Path, Claim] = {}
-"""The claims of this process: one that is already held is claimed again without a second look."""
+"""The claims of this process: a claim that is already held is not checked again."""
 
 
 @contextmanager
@@ -53,7 +53,7 @@ def claimed(
     inputs: Iterable[Path | str | None] = (),
     by_name: Callable[[str], bool] = lambda name: False,
 ) -> Iterator[Claim]:
-    """Have a place for results for ourselves, and know before any work that they can be put there.
+    """Claim an output folder, and check before any work that results can be written there.
 
     What a killed command left in the work folder is put right: an old result moved back, a new one that was not
     finished removed; what is mapped stays until a result is there. Raises DataError when another command writes there,
@@ -91,7 +91,7 @@ def claimed(
 
 @contextmanager
 def new_folder(out: Path, by_name: Callable[[str], bool] = lambda name: False) -> Iterator[Path]:
-    """A folder to write into; it becomes `out` when the block ends well and vanishes when it does not.
+    """A new folder for writing; it is renamed to `out` when the block succeeds, and removed when it fails.
 
     An earlier result of ours at `out` is replaced, and what was kept for --resume is removed. Raises DataError as
     `claimed` does, when the disk is full, and when the old result can no longer be replaced: then it says where the
@@ -142,7 +142,7 @@ def _free_name(out: Path) -> Path:
 
 
 def _move_back(claim: Claim) -> None:
-    """Put the old result back to its place when a command was killed before it had put the new one there."""
+    """Restore the old result when a command was killed before it had moved the new one into place."""
     out, old = claim.out, claim.work / work_folder.OLD
     free = not os.path.lexists(out) or (out.is_dir() and not any(out.iterdir()))
     if free and ownership.is_whole(old):
@@ -161,7 +161,7 @@ def _explained(work: Path) -> Iterator[None]:
 
 
 def real_path(out: Path) -> Path:
-    """Where a result goes: absolute, all links followed; raises DataError for a link that leads nowhere."""
+    """Absolute path of a result, with links resolved; raises DataError for a broken link."""
     try:
         real = Path(os.path.realpath(out))
         if real.is_symlink():
@@ -173,7 +173,9 @@ def real_path(out: Path) -> Path:
 
 
 def refuse_places(out: Path) -> None:
-    """Raise DataError for places that are somebody's whole world: / and the folders where we are and live."""
+    """Raise DataError for folders that are never results: /, the current folder and the home folder, and their
+    parents.
+    """
     for what, place in (("the folder that you are in", _here()), ("your home", _home())):
         if place is not None and (out == place or out in place.parents):
             raise DataError(
@@ -196,7 +198,7 @@ def _home() -> Path | None:
 
 
 def refuse_inputs(out: Path, inputs: Iterable[Path | str | None]) -> None:
-    """Raise DataError when a place for results is, holds or lies in one of the inputs, whatever links lead there."""
+    """Raise DataError when an output folder is, contains or lies in one of the inputs, with links resolved."""
     for given in inputs:
         if given is None or not os.path.exists(given):
             continue
@@ -213,7 +215,7 @@ def refuse_inputs(out: Path, inputs: Iterable[Path | str | None]) -> None:
 
 
 def refuse_foreign(claim: Claim) -> None:
-    """Raise DataError when anything at the place of the results is not ours, or may not be replaced."""
+    """Raise DataError when the output folder holds a file that we did not write, or that may not be replaced."""
     out = claim.out
     if not os.path.lexists(out):
         return
@@ -250,7 +252,7 @@ def refuse_foreign(claim: Claim) -> None:
 
 @contextmanager
 def _parents(out: Path) -> Iterator[None]:
-    """The folders above a place for results; those that we make vanish again when nothing came into them."""
+    """Create the parent folders of an output folder; created ones are removed again if they stay empty."""
     missing = [folder for folder in out.parents if not folder.exists()]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -266,7 +268,7 @@ def _parents(out: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Be the only command that writes a place: `.OUT.lock` says who does. The lock of a dead process holds nobody.
+    """Lock an output folder with `.OUT.lock`, which names the process. The lock of a dead process is ignored.
 
     Raises DataError when another command writes there, or the lock cannot be written.
     """

@@ -1,4 +1,4 @@
-"""What we wrote, and can prove it: every folder of results carries a list of its files, and only those are removed.
+"""Ownership of files: every result folder has a list of its files, and only listed files are ever removed.
 
 The list holds the size of each file, and the content of small ones (those that people edit) as a checksum: what was
 changed since is somebody's work, and no longer ours.
@@ -16,30 +16,30 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 
 MARKER = ".gnss-sem-map.json"
-"""The list of files, in every folder that we wrote."""
+"""Name of the list of files in every folder that we write."""
 CONTENT_BYTES = 1 << 16
-"""Of files up to this size the content is compared as well."""
+"""For files up to this size, the content is compared as well."""
 
 Listed = Mapping[str, list[str]]
-"""Path within the folder -> what a file of ours may look like there; folders end in '/'."""
+"""Path within the folder -> accepted states (size, checksum) of our file; folders end in '/'."""
 
 
 def write_list(folder: Path) -> None:
-    """List everything that is in a folder as ours."""
-    _write_marker(folder, {name: [look(folder / name)] for name in _content(folder)})
+    """Write the list of all files in a folder: they are ours."""
+    _write_marker(folder, {name: [state_of(folder / name)] for name in _content(folder)})
 
 
 def read_list(folder: Path) -> Listed | None:
-    """What we wrote into a folder; None when it carries no list, or a damaged one."""
+    """Read the list of our files in a folder; None when it has no list, or a damaged one."""
     try:
         files = json.loads((folder / MARKER).read_text("utf-8"))["files"]
-        return {str(name): [str(look) for look in looks] for name, looks in files.items()}
+        return {str(name): [str(state) for state in states] for name, states in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
 def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -> str | None:
-    """Something in a folder that we did not write, or that was changed since; None when all of it is ours.
+    """A file in a folder that we did not write, or that was changed since; None when all files are ours.
 
     A folder without a list is ours when `by_name` accepts the path of everything in it.
     """
@@ -50,20 +50,20 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
         if listed is None:
             ours = by_name(name) and not os.path.islink(folder / name)
         else:
-            ours = name in listed and look(folder / name) in listed[name]
+            ours = name in listed and state_of(folder / name) in listed[name]
         if not ours:
             return name
     return None
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether everything that we wrote into a folder is still there, as it was."""
+    """Whether all files that we wrote into a folder still exist, unchanged."""
     listed = read_list(folder)
-    return listed is not None and all(look(folder / name) in looks for name, looks in listed.items())
+    return listed is not None and all(state_of(folder / name) in states for name, states in listed.items())
 
 
 def remove(folder: Path) -> None:
-    """Remove what we wrote into a folder, its list last, and then the folder; raises OSError where that fails.
+    """Remove our files from a folder, the list last, and then the folder; raises OSError.
 
     What is not ours stays, and so does the folder that holds it: then that is the error.
     """
@@ -71,7 +71,7 @@ def remove(folder: Path) -> None:
     # the deepest first, so that folders are empty when their turn comes
     for name in sorted(listed, key=lambda name: name.count("/") - name.endswith("/"), reverse=True):
         path = folder / name
-        if look(path) in listed[name]:
+        if state_of(path) in listed[name]:
             path.rmdir() if name.endswith("/") else path.unlink()
     remove_partials(folder)
     left = next(_content(folder), None)
@@ -81,24 +81,24 @@ def remove(folder: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove the beginnings of lists and pages that somebody was killed at writing; raises OSError."""
+    """Remove unfinished lists and pages of killed processes; raises OSError."""
     for path in folder.glob(".*.part") if folder.is_dir() else ():
         if is_partial(path.name):
             path.unlink()
 
 
 def amend(folder: Path, name: str, content: bytes) -> None:
-    """Write one more file into a folder, or write it anew; it is listed first, so that it is ours at every moment.
+    """Add or replace a file in a folder; it is listed first, so that it is ours at every moment.
 
     Raises DataError when a file lies there that we did not write, or the disk is full.
     """
     path, listed = folder / name, read_list(folder)
     try:
         if listed is not None:
-            if os.path.lexists(path) and look(path) not in listed.get(name, []):
+            if os.path.lexists(path) and state_of(path) not in listed.get(name, []):
                 raise DataError(f"{path}: was not written by us, or was changed since; move it away")
-            looks = [*listed.get(name, []), _look(content)]
-            _write_marker(folder, {**listed, name: list(dict.fromkeys(looks))[-3:]})
+            states = [*listed.get(name, []), _state_of_bytes(content)]
+            _write_marker(folder, {**listed, name: list(dict.fromkeys(states))[-3:]})
         write_whole(path, content)
     except OSError as error:
         raise DataError(
@@ -107,7 +107,7 @@ def amend(folder: Path, name: str, content: bytes) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file that appears whole or not at all; raises OSError."""
+    """Write a file atomically; raises OSError."""
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with beside.open("wb") as file:
@@ -120,13 +120,13 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def is_partial(name: str) -> bool:
-    """Whether a path in a folder is that of a list, or a page, that somebody was killed at writing."""
+    """Whether a path is that of an unfinished list or page of a killed process."""
     files = "|".join(map(re.escape, (MARKER, "report.html", "metrics.json", "check.html")))
     return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
 
 
-def look(path: Path) -> str:
-    """What a file looks like: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
+def state_of(path: Path) -> str:
+    """State of a file: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
     try:
         if path.is_symlink():
             return "other"
@@ -135,18 +135,18 @@ def look(path: Path) -> str:
         if not path.is_file():
             return "other"
         size = path.stat().st_size
-        return _look(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
+        return _state_of_bytes(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
     except OSError:
         return "other"
 
 
-def _look(content: bytes) -> str:
+def _state_of_bytes(content: bytes) -> str:
     size = len(content)
     return str(size) if size > CONTENT_BYTES else f"{size} {hashlib.sha256(content).hexdigest()[:32]}"
 
 
 def _content(folder: Path) -> Iterator[str]:
-    """Everything in a folder but its list, as paths within it; folders end in '/', links to folders do not."""
+    """All paths within a folder without its list; folders end in '/', links to folders do not."""
     for place, folders, files in os.walk(folder):
         within = Path(place).relative_to(folder)
         for name in sorted(folders):

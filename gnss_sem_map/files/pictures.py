@@ -1,4 +1,4 @@
-"""PNG and JPEG: the size is read from the header before anything is decoded, and a damaged file is refused whole."""
+"""PNG and JPEG files: the size is read from the header before decoding, and damaged files are refused."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ MOST_PIXELS, LONGEST_SIDE = 64_000_000, 65_535
 MOST_FILE_BYTES = 256 << 20
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 DEPTH = len(PNG) + 16
-"""Where a PNG says how many bits a channel has."""
+"""Offset of the bit depth in a PNG."""
 FAULTS = (
     OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, ZeroDivisionError,
     struct.error, zlib.error,
 )  # fmt: skip
-"""What Pillow raises for damaged files."""
+"""Exceptions of Pillow for damaged files."""
 
 Image.MAX_IMAGE_PIXELS = None  # our own limit is lower, and an error in place of a warning
 warnings.filterwarnings("ignore", "Invalid APNG", UserWarning)  # an animation that is none is a plain picture
@@ -62,7 +62,7 @@ def read_ids(path: Path) -> NDArray[np.uint8]:
 
 @contextmanager
 def _opened(path: Path, content: bytes) -> Iterator[ImageFile.ImageFile]:
-    """A picture whose header is sound and whose checksums are right; raises DataError, also while it is decoded."""
+    """Open a picture with a valid header and valid checksums; raises DataError, also while it is decoded."""
     kind = "PNG" if content.startswith(PNG) else "JPEG" if content.startswith(JPEG) else None
     if kind is None:
         raise DataError(f"{shown(path)}: damaged image; expected PNG or JPEG")
@@ -86,7 +86,7 @@ def _depth(content: bytes) -> int:
 
 
 def _described(picture: ImageFile.ImageFile, content: bytes) -> str:
-    """What a picture is, in words."""
+    """Description of a picture for messages."""
     shape = (picture.height, picture.width, len(picture.getbands()))
     return f"uint{_depth(content)} {shape}{' by a palette' if picture.mode == 'P' else ''}"
 

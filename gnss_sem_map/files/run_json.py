@@ -1,4 +1,4 @@
-"""What a run says of itself, read back: it may have been damaged or written over since."""
+"""Reading run.json, which may be damaged or of another program."""
 
 from __future__ import annotations
 

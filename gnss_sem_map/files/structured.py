@@ -1,4 +1,4 @@
-"""YAML and JSON by one loader each, which no content can make slow, large or deep, nor bring to run anything.
+"""Safe loaders for YAML and JSON: with limits on size, depth and time, and without code execution.
 
 In our YAML only true and false are truth values (`vehicles: off` is a word, as it looks), dates are words, and there
 are no tags. Aliases count as much as what they stand for, so that a few lines cannot stand for a billion.
@@ -25,11 +25,11 @@ MOST_DIGITS = 40
 
 
 class _Refused(yaml.YAMLError):
-    """YAML that we do not take, though it may be right."""
+    """YAML that is valid but not accepted."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Scalars, lists and mappings, none too many."""
+    """Loader of scalars, lists and mappings, with a limit on their number."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -37,7 +37,7 @@ class _Loader(yaml.SafeLoader):
         self._weights: dict[int, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """One node with all in it; counted, with what an alias stands for."""
+        """Compose one node with its children, and count them; an alias counts as its target."""
         event = self.peek_event()
         if getattr(event, "tag", None) is not None:
             raise _Refused(f"found the tag {event.tag!r}, expected none")
@@ -60,7 +60,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
-        """A whole number of a bearable length."""
+        """A whole number with a limited number of digits."""
         if len(node.value) > MOST_DIGITS:
             raise _Refused(f"a number of {len(node.value)} digits, expected at most {MOST_DIGITS}")
         return int(super().construct_yaml_int(node))
@@ -76,7 +76,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def parse_yaml(text: str) -> Any:
-    """What YAML text says; raises ValueError, in one line, for text that is none or that we do not take."""
+    """Parse YAML text; raises ValueError with one line for text that is not valid or not accepted."""
     if max(map(len, text.split("\n"))) > LONGEST_YAML_LINE:
         raise ValueError(f"a line of more than {LONGEST_YAML_LINE} characters")
     try:
@@ -90,7 +90,7 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, error: type[SemMapError] = DataError) -> Any:
-    """What a YAML file says; raises `error` for a file that cannot be read, or that we do not take."""
+    """Read a YAML file; raises `error` for a file that cannot be read or is not accepted."""
     try:
         return parse_yaml(read_text(path, MOST_YAML_BYTES, error))
     except SemMapError:
@@ -114,7 +114,7 @@ def read_json(path: Path, error: type[SemMapError] = DataError) -> dict[str, Any
 
 
 def not_finite(content: Any, place: str = "") -> str | None:
-    """Where in nested lists and mappings a number is infinite or none, as `a.b.0`; None where there is no such."""
+    """Path, such as `a.b.0`, of the first number in nested lists and mappings that is infinite or NaN; else None."""
     if isinstance(content, float) and not math.isfinite(content):
         return place
     parts = (

@@ -1,4 +1,4 @@
-"""Files and folders that may be anything: absent, unreadable, a pipe, a device, a loop of links, or far too large."""
+"""Access to untrusted files and folders: they may be missing, unreadable, pipes, devices, link loops, or too large."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError, SemMapError
 
 MOST_BYTES = 1 << 30
-"""Of any file that is read whole."""
+"""Size limit of files that are read as a whole."""
 MOST_TEXT_BYTES = 256 << 20
 MOST_LINES = 5_000_000
 LONGEST_LINE = 100_000
@@ -25,12 +25,12 @@ KINDS = {
 
 
 def shown(path: object) -> str:
-    """A name as it can be printed and written: bytes that are no UTF-8 as `\\xff`."""
+    """A file name for messages: bytes that are not UTF-8 become `\\xff`."""
     return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def status(path: Path, error: type[SemMapError] = DataError) -> os.stat_result | None:
-    """What is at a path, links followed; None where nothing is. Raises `error` where that cannot be known."""
+    """Status of a path, with links resolved; None if nothing exists there. Raises `error` if it cannot be read."""
     try:
         return path.stat()
     except FileNotFoundError:
@@ -41,7 +41,7 @@ def status(path: Path, error: type[SemMapError] = DataError) -> os.stat_result |
 
 
 def _check_links(path: Path, error: type[SemMapError]) -> None:
-    """Raise `error` where nothing is there because a link, here or above, leads nowhere."""
+    """Raise `error` if the path does not exist because of a broken link in it."""
     for place in (path, *path.parents):
         if os.path.islink(place) and not os.path.exists(place):
             raise error(f"{shown(place)}: a link to what is not there")
@@ -50,7 +50,7 @@ def _check_links(path: Path, error: type[SemMapError]) -> None:
 
 
 def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:
-    """Whether there is a file; raises `error` where that cannot be known, or something else is there."""
+    """Whether the path is a file; raises `error` if that cannot be read, or if it is something else."""
     found = status(path, error)
     if found is not None:
         _check_ordinary(path, found, error)
@@ -58,7 +58,7 @@ def is_file(path: Path, error: type[SemMapError] = DataError) -> bool:
 
 
 def is_folder(path: Path, error: type[SemMapError] = DataError) -> bool:
-    """Whether there is a folder; raises `error` where that cannot be known, or something else is there."""
+    """Whether the path is a folder; raises `error` if that cannot be read, or if it is something else."""
     found = status(path, error)
     if found is not None and not stat.S_ISDIR(found.st_mode):
         raise error(f"{shown(path)}: found {_kind(found)}, expected a folder")
@@ -66,7 +66,7 @@ def is_folder(path: Path, error: type[SemMapError] = DataError) -> bool:
 
 
 def inside(folder: Path, error: type[SemMapError] = DataError) -> list[Path]:
-    """What is in a folder, by name; raises `error` where it cannot be listed."""
+    """Paths in a folder, sorted by name; raises `error` if it cannot be listed."""
     try:
         return [folder / name for name in sorted(os.listdir(folder))]
     except (OSError, ValueError) as problem:
@@ -74,7 +74,7 @@ def inside(folder: Path, error: type[SemMapError] = DataError) -> list[Path]:
 
 
 def open_file(path: Path, error: type[SemMapError] = DataError) -> int:
-    """A descriptor of an ordinary file; raises `error` for anything else, and never waits for a pipe."""
+    """Descriptor of a regular file; raises `error` for anything else, and never blocks on a pipe."""
     try:
         _check_ordinary(path, os.stat(path), error)  # before opening: to open some devices is to use them
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -91,7 +91,7 @@ def open_file(path: Path, error: type[SemMapError] = DataError) -> int:
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES, error: type[SemMapError] = DataError) -> bytes:
-    """The content of an ordinary file of at most `most` bytes; raises `error` for anything else."""
+    """Content of a regular file of at most `most` bytes; raises `error` for anything else."""
     with os.fdopen(open_file(path, error), "rb", buffering=0) as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -113,7 +113,7 @@ def read_text(path: Path, most: int = MOST_TEXT_BYTES, error: type[SemMapError] 
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a text file, of which there are not too many and none is too long; raises DataError."""
+    """Lines of a text file, with limits on their number and length; raises DataError."""
     lines = read_bytes(path, MOST_TEXT_BYTES).decode("utf-8", "replace").split("\n")
     if len(lines) > MOST_LINES or max(map(len, lines)) > LONGEST_LINE:
         raise DataError(
@@ -124,7 +124,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def reason(problem: OSError | ValueError) -> str:
-    """Why a file could not be had, in a few words."""
+    """Reason why a file could not be read, in a few words."""
     text = (problem.strerror or str(problem)) if isinstance(problem, OSError) else str(problem)
     return " ".join(text.split())
 

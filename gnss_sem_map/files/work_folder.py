@@ -1,8 +1,8 @@
-"""The hidden folder beside a result: what a run has done so far, and the new result until it is whole.
+"""Work folder: hidden beside the result; holds intermediate results, and the new result until it is complete.
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    what is mapped (`chunks`)
-          answers/               what a network said of the images (`remembering`)
+          answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
 """
@@ -25,7 +25,7 @@ OF_CHUNKS = re.compile(
 OURS = re.compile(
     rf"\.gnss-sem-map\.json|part/.*|old/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?|{OF_CHUNKS.pattern}"
 )
-"""Paths of everything that we ever write into a work folder."""
+"""Pattern of all paths that we write into a work folder."""
 
 
 def make(folder: Path) -> None:
@@ -40,7 +40,7 @@ def make(folder: Path) -> None:
 
 
 def refuse_foreign(folder: Path) -> None:
-    """Raise DataError when a work folder is none, or holds anything that we did not write."""
+    """Raise DataError when the folder is not a work folder, or holds a file that we did not write."""
     if not os.path.lexists(folder):
         return
     if folder.is_symlink() or not folder.is_dir():
@@ -56,13 +56,13 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def holds_work(folder: Path) -> bool:
-    """Whether there is something that --resume can use."""
+    """Whether there are intermediate results for --resume."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
     return done or any((folder / ANSWERS).glob("*.npz"))
 
 
 def clear(folder: Path) -> None:
-    """Remove a work folder with all that we wrote into it; what is not ours stays. Raises OSError.
+    """Remove a work folder with all our files; other files stay. Raises OSError.
 
     First goes what says that it can be resumed, last what says that it is ours.
     """
@@ -76,18 +76,18 @@ def clear(folder: Path) -> None:
 
 
 def forget(folder: Path) -> None:
-    """Remove what is mapped and what a network said; raises OSError."""
+    """Remove mapped chunks and cached probabilities; raises OSError."""
     forget_chunks(folder)
     forget_answers(folder)
 
 
 def forget_answers(folder: Path) -> None:
-    """Remove what a network said; raises OSError."""
+    """Remove cached probabilities; raises OSError."""
     _remove_known(folder, folder / ANSWERS)
 
 
 def forget_chunks(folder: Path) -> None:
-    """Remove what is mapped, first of all what says that it can be used; raises OSError."""
+    """Remove mapped chunks, their index first; raises OSError."""
     (folder / CHUNKS).unlink(missing_ok=True)
     for path in sorted(folder.iterdir()):
         if OF_CHUNKS.fullmatch(path.name + "/" * _is_folder(path)):
@@ -95,7 +95,7 @@ def forget_chunks(folder: Path) -> None:
 
 
 def drop_results(folder: Path) -> None:
-    """Remove the results in a work folder: the new one, and the one before it as far as it is ours. Raises OSError."""
+    """Remove the results in a work folder: the new one, and our files of the old one. Raises OSError."""
     part, old = folder / PART, folder / OLD
     if part.is_dir():
         shutil.rmtree(part)  # we made it, in a folder of ours

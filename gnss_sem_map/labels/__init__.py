@@ -1,1 +1,1 @@
-"""Class sets, and what the answers of a network are worth as evidence for their classes."""
+"""Class sets, class probabilities, and the confusion model of the segmentation network."""

@@ -1,7 +1,7 @@
-"""Class sets and the tables that map other data's classes onto them, by name and never by index.
+"""Class sets, and the tables that map the classes of networks and data sets to them; always by name, never by index.
 
-A `LabelSet` is what the map distinguishes; a `Taxonomy` is what some network or data set distinguishes. Both are
-YAML files (in `labels/`, or the user's own).
+A `LabelSet` holds the classes of the map; a `Taxonomy` holds those of a network or data set. Both are YAML files (in
+`labels/`, or the user's own).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
 
 OTHER = "other"
-"""The name of the evidence that belongs to none of the map's classes."""
+"""Name of the class for everything that is none of the map's classes."""
 
 UNLABELLED = -1
-"""The label of a voxel or point of which nothing is known."""
+"""Label of a voxel or point without a class."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelSet:
-    """The classes of a map, in the order in which evidence is stored."""
+    """The classes of a map, in the order of the columns of its evidence."""
 
     name: str
     names: tuple[str, ...]
@@ -37,11 +37,11 @@ class LabelSet:
     colours: NDArray[np.uint8]
     """(c, 3) RGB."""
     semantic_kitti_ids: NDArray[np.uint32]
-    """(c,) raw ids that `.label` files get."""
+    """(c,) raw ids for `.label` files."""
     asprs_codes: NDArray[np.uint8]
     """(c,) LAS classification codes (LAS 1.4; 64 and above are user codes)."""
     sources: Mapping[str, Mapping[str, str]]
-    """For every known taxonomy: its class name -> ours; what is absent is `other`."""
+    """For every known taxonomy: its class name -> ours; absent names are `other`."""
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -59,7 +59,7 @@ class LabelSet:
                 )
 
     def index(self, name: str) -> int:
-        """Position of a class; raises ConfigError, with the nearest name, where there is none."""
+        """Index of a class; raises ConfigError with the most similar name for an unknown one."""
         if name not in self.names:
             raise ConfigError(
                 f"class set {self.name!r} has no class {name!r}{_did_you_mean(name, self.names)}"
@@ -69,8 +69,8 @@ class LabelSet:
     def table_from(self, source_names: Sequence[str], source: str | None = None) -> NDArray[np.float32]:
         """The (s, c + 1) 0/1 matrix that sums the probabilities of s source classes into ours and, last, `other`.
 
-        Without `source`, a name may be one of ours, `other`, or a name of any known taxonomy, provided that they
-        agree. Raises ConfigError for a name that nobody knows.
+        Without `source`, a name may be one of ours, `other`, or of any known taxonomy, provided that they agree. Raises
+        ConfigError for an unknown name.
         """
         table = np.zeros((len(source_names), len(self.names) + 1), np.float32)
         for row, name in enumerate(source_names):
@@ -109,10 +109,10 @@ class Taxonomy:
     ids: Mapping[str, Mapping[str, int]]
     """For each kind of id (such as `train_id`): class name -> id."""
     void: Mapping[str, tuple[int, ...]]
-    """For each kind of id: the ids that say nothing."""
+    """For each kind of id: the ids without a class."""
 
     def lookup(self, label_set: LabelSet, kind: str, size: int = 256) -> NDArray[np.int16]:
-        """Table from id to class index: c is `other`, -1 void, -2 an id that the taxonomy does not know."""
+        """Table from id to class index: c is `other`, -1 void, -2 an unknown id."""
         table = np.full(size, -2, np.int16)
         table[[i for i in self.void[kind] if 0 <= i < size]] = UNLABELLED
         rows = label_set.table_from(self.names, self.name).argmax(1)

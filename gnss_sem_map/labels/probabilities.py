@@ -1,4 +1,4 @@
-"""What class probabilities must be, whoever made them."""
+"""Class probabilities of images: their types, and the checks that every source of them must pass."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gnss_sem_map.sensor_log import Image
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """A label image as it is: an id for every pixel, and what each id says of the classes."""
+    """A label image: an id for every pixel, and the class probabilities of each id."""
 
     ids: NDArray[np.uint8]
     """(h, w)."""
@@ -23,16 +23,16 @@ class LabelImage:
 
     @property
     def probabilities(self) -> NDArray[np.uint8]:
-        """The same for every pixel, (h, w, c)."""
+        """Class probabilities of every pixel, (h, w, c)."""
         return np.take(self.table, self.ids, axis=0)
 
 
 @runtime_checkable
 class KeepsLabels(Protocol):
-    """A segmenter that has label images: most of their pixels are never asked for."""
+    """A segmenter that has label images. Most of their pixels are never used, so they are not expanded."""
 
     def kept(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
-        """What `Segmenter.__call__` gives, but a label image as it is."""
+        """The result of `Segmenter.__call__`, with a label image not expanded."""
         ...
 
 
@@ -65,7 +65,7 @@ def check_shape(shape: tuple[int, ...], dtype: np.dtype[Any], count: int, where:
 def checked_probabilities(
     probabilities: NDArray[Any], count: int, where: str
 ) -> NDArray[np.uint8] | NDArray[np.float32]:
-    """The array (h, w, count) as uint8 or float32; raises DataError unless every pixel's sum is one, or nothing."""
+    """The array (h, w, count) as uint8 or float32; raises DataError unless the sum of every pixel is one or zero."""
     check_shape(probabilities.shape, probabilities.dtype, count, where)
     one, slack = 1.0, 0.02
     if probabilities.dtype == np.uint8:
@@ -75,7 +75,7 @@ def checked_probabilities(
             probabilities = probabilities.astype(np.float32)
         if not (np.isfinite(probabilities).all() and (probabilities >= 0).all()):
             raise DataError(f"{where}: found probabilities that are negative or not finite, expected 0..1")
-    # Every 64th pixel tells logits, percentages and 0/1 masks from probabilities, at no cost.
+    # Every 64th pixel is enough to tell probabilities from logits, percentages and 0/1 masks.
     largest = float(probabilities[::8, ::8].sum(2, dtype=np.float64).max(initial=0.0))
     if largest > one + slack or 0 < largest < one / 2:
         raise DataError(

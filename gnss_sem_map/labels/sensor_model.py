@@ -1,8 +1,8 @@
-"""What a network's answers are worth, measured where the truth is known: the calibration file.
+"""Segmentation confusion model, measured on drives with known truth: the calibration file.
 
-For every labelled drive it holds counts, and nothing but counts: which answer the network gave to which true class, and
-at which height over ground, and on how flat a surface, each class stands. Likelihoods follow from them, so that files
-of several drives can be put together, and a reader can see what they rest on.
+For every calibration drive it holds counts only: the confusion matrix of true and predicted classes, and a histogram
+of height over ground and flatness per true class. Likelihoods are computed from the counts, so that files of several
+drives can be combined.
 """
 
 from __future__ import annotations
@@ -25,84 +25,88 @@ from gnss_sem_map.labels.label_set import LabelSet
 HEIGHT_EDGES_M = (-0.3, -0.15, -0.05, 0.05, 0.15, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0, 3.0, 4.0, 6.0)
 FLATNESS_EDGES = (0.3, 0.6, 0.8, 0.9, 0.96)
 CELLS = (len(HEIGHT_EDGES_M) + 1, len(FLATNESS_EDGES) + 2)
-"""Bins of height, and of flatness with one more for unknown."""
+"""Bins of height, and of flatness with one more for unknown flatness."""
 ANSWER_PSEUDO_COUNTS, CELL_PSEUDO_COUNTS = 300, 200
-"""So many points, spread as the classes are on average, are added to each class: few points prove little."""
+"""Additive smoothing: so many points, distributed as the average over classes, are added to each class."""
 FORMAT = 1
 LARGEST_COUNT = 10**15
 
 
 @dataclass(frozen=True, eq=False)
-class Street:
-    """What was counted on one labelled drive, c true classes."""
+class CalibrationDrive:
+    """Counts of one drive with known truth, c true classes."""
 
     name: str
     answers: NDArray[np.int64]
-    """(c, c + 1) points by true class and by the network's answer, `other` last."""
+    """(c, c + 1) confusion matrix: points by true class and predicted class, `other` last."""
     cells: NDArray[np.int64]
     """(c, 15, 7) points by true class, height over ground and flatness."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelCalibration:
-    """The counts of one or more streets, and the temperature of the confidence."""
+    """Segmentation confusion model: the counts of one or more drives, and the temperature of the confidence."""
 
     class_set: str
     names: tuple[str, ...]
-    streets: tuple[Street, ...]
+    drives: tuple[CalibrationDrive, ...]
     temperature: float
 
     def __post_init__(self) -> None:
         c = len(self.names)
-        if not self.streets or not np.isfinite(self.temperature) or self.temperature <= 0:
+        if not self.drives or not np.isfinite(self.temperature) or self.temperature <= 0:
             raise ConfigError(
-                f"label calibration: found {len(self.streets)} streets and temperature {self.temperature},"
-                " expected at least one street and a temperature above 0"
+                f"label calibration: found {len(self.drives)} streets and temperature {self.temperature},"
+                " expected at least one drive and a temperature above 0"
             )
-        for street in self.streets:
+        for drive in self.drives:
             for what, counts, shape in (
-                ("answers", street.answers, (c, c + 1)),
-                ("cells", street.cells, (c, *CELLS)),
+                ("answers", drive.answers, (c, c + 1)),
+                ("cells", drive.cells, (c, *CELLS)),
             ):
                 if counts.shape != shape or (counts < 0).any():
                     raise ConfigError(
-                        f"label calibration: street {street.name!r}: found {what} {counts.shape},"
+                        f"label calibration: drive {drive.name!r}: found {what} {counts.shape},"
                         f" expected {shape} counts that are not negative"
                     )
 
     @cached_property
     def log_likelihoods(self) -> NDArray[np.float64]:
-        """(c + 1, c) nat: what each answer of the network says of each true class.
+        """(c + 1, c) nat: log likelihood of each true class for each predicted class.
 
-        ln P(answer | class), the mean over streets before the logarithm so that every street counts the same; shifted
-        so that an answer's probabilities add to one, which changes no decision.
+        ln P(predicted class | true class), averaged over drives before the logarithm, so that every drive has the same
+        weight; shifted so that the probabilities of a row sum to one, which changes no decision. It takes the place of
+        the network's own probabilities in the Bayes update of eq. 6.
         """
-        answers = np.stack([street.answers for street in self.streets])
+        answers = np.stack([drive.answers for drive in self.drives])
         logs = np.log(_mean_share(answers, ANSWER_PSEUDO_COUNTS)).T
         return np.asarray(logs - np.log(np.exp(logs).sum(axis=1, keepdims=True)))
 
     def of_geometry(
         self, heights: NDArray[np.floating], flatness: NDArray[np.floating]
     ) -> NDArray[np.float32]:
-        """ln P(height, flatness | class) (v, c) nat, for heights (v,) m over ground and flatness (v,), NaN unknown."""
-        counts = np.stack([street.cells.reshape(len(self.names), -1) for street in self.streets])
+        """ln P(height, flatness | class) (v, c) nat, for heights (v,) m over ground and flatness (v,), NaN unknown.
+
+        Takes the place of the rules of eq. 8 to 11 where a calibration file is given.
+        """
+        counts = np.stack([drive.cells.reshape(len(self.names), -1) for drive in self.drives])
         logs = np.log(_mean_share(counts, CELL_PSEUDO_COUNTS)).T.astype(np.float32)
         return np.asarray(logs[cells_of(heights, flatness)])
 
     def to_yaml(self) -> str:
         """The file that `read` reads back."""
-        streets = [
-            {"name": s.name, "answers": s.answers.tolist(), "cells": s.cells.tolist()} for s in self.streets
+        drives = [
+            {"name": s.name, "answers": s.answers.tolist(), "cells": s.cells.tolist()} for s in self.drives
         ]
         content = {
             "format": FORMAT, "class_set": self.class_set, "classes": list(self.names),
-            "temperature": round(self.temperature, 4), "streets": streets,
+            "temperature": round(self.temperature, 4), "streets": drives,
         }  # fmt: skip
         return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
 
 
 def _mean_share(counts: NDArray[np.int64], pseudo_counts: int) -> NDArray[np.float64]:
-    """Shares (c, k) from counts (streets, c, k), each street smoothed towards its own average, then averaged."""
+    """Relative frequencies (c, k) from counts (drives, c, k), smoothed for each drive, then averaged over drives."""
     average = counts.sum(axis=1, keepdims=True) + 1.0
     average /= average.sum(axis=2, keepdims=True)
     shares = (counts + pseudo_counts * average) / (counts.sum(axis=2, keepdims=True) + pseudo_counts)
@@ -110,7 +114,7 @@ def _mean_share(counts: NDArray[np.int64], pseudo_counts: int) -> NDArray[np.flo
 
 
 def cells_of(heights: NDArray[np.floating], flatness: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Cell (v,) of the flattened table of heights (v,) m and flatness (v,), NaN for unknown."""
+    """Index (v,) in the flattened histogram for heights (v,) m and flatness (v,), NaN for unknown."""
     row = np.searchsorted(HEIGHT_EDGES_M, heights, side="right")
     column = np.searchsorted(FLATNESS_EDGES, np.nan_to_num(flatness), side="right")
     return np.asarray(row * CELLS[1] + np.where(np.isnan(flatness), CELLS[1] - 1, column), np.int64)
@@ -125,8 +129,8 @@ def read(file: Path, label_set: LabelSet) -> LabelCalibration:
         found = LabelCalibration(
             class_set=str(content["class_set"])[:100],
             names=tuple(str(name)[:100] for name in content["classes"]),
-            streets=tuple(
-                Street(str(s["name"])[:100], _counts(s["answers"]), _counts(s["cells"]))
+            drives=tuple(
+                CalibrationDrive(str(s["name"])[:100], _counts(s["answers"]), _counts(s["cells"]))
                 for s in content["streets"]
             ),
             temperature=float(content["temperature"]),
@@ -153,7 +157,7 @@ def _counts(rows: Any) -> NDArray[np.int64]:
 
 
 def check_replaceable(file: Path) -> None:
-    """Raise DataError when a file is there that is no label calibration: it would be lost."""
+    """Raise DataError when the file exists and is not a label calibration: it would be overwritten."""
     try:
         if not os.path.lexists(file) or file.read_text("utf-8").startswith(f"format: {FORMAT}\nclass_set: "):
             return

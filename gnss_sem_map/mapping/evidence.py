@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import Archive, open_archive
 from gnss_sem_map.files.untrusted import is_file, shown
@@ -37,7 +37,7 @@ class RunEvidence:
     """The points of moving objects, which are not in the map that is refined."""
     moving: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)
     """Frame number -> places of those points among the scan's usable ones."""
-    keyframes: Witnesses | None = None
+    keyframes: KeyframeScans | None = None
     """Scans that say which space is free; None where poses do not come from LiDAR odometry."""
     surface_heights: SurfaceHeights | None = None
     """None where no step asked for them."""
@@ -92,7 +92,7 @@ def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
     return dict(zip(frames.tolist(), parts, strict=True))
 
 
-def _keyframes(path: Path) -> Witnesses:
+def _keyframes(path: Path) -> KeyframeScans:
     with open_archive(path) as archive:
         images, T = _array(archive, path, "images", "u", 3), _array(archive, path, "T_lidar_map", "f", 3)
     if (
@@ -102,7 +102,7 @@ def _keyframes(path: Path) -> Witnesses:
         or not np.isfinite(T).all()
     ):
         raise DataError(f"{shown(path)}: found {len(images)} images and {T.shape} poses; make the run again")
-    return Witnesses(images, T.astype(np.float64))
+    return KeyframeScans(images, T.astype(np.float64))
 
 
 def _heights(path: Path) -> SurfaceHeights:

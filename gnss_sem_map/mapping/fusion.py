@@ -27,7 +27,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.labelled_scans import Drive, look_at
 from gnss_sem_map.mapping.worker_processes import in_processes
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Scan, SensorLog, Skip, file_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
@@ -48,7 +48,7 @@ def build_map(
     trajectory: Trajectory,
     segmenter: Segmenter | None,
     settings: Settings,
-    account: Account,
+    account: RunStats,
     progress: Progress = silent,
 ) -> VoxelMap:
     """Every point of every scan in one map, in memory; see `build_maps`."""
@@ -57,7 +57,7 @@ def build_map(
 
 def build_maps(
     drive: Drive,
-    account: Account,
+    account: RunStats,
     progress: Progress = silent,
     *,
     work: Path | None = None,
@@ -90,7 +90,7 @@ def build_maps(
 def map_chunks(
     drive: Drive,
     work: Path,
-    account: Account,
+    account: RunStats,
     progress: Progress = silent,
     *,
     resume: bool = False,
@@ -116,7 +116,7 @@ def map_chunks(
 
 
 def fuse_scans(
-    drive: Drive, scans: Sequence[Scan], account: Account, progress: Progress = silent
+    drive: Drive, scans: Sequence[Scan], account: RunStats, progress: Progress = silent
 ) -> tuple[VoxelTable, VoxelTable]:
     """Fuse some scans of a drive: what stands, and what belongs to something that moved."""
     settings = drive.settings
@@ -148,14 +148,14 @@ def _table(settings: Settings) -> VoxelTable:
     )
 
 
-def _warn(drive: Drive, account: Account) -> None:
+def _warn(drive: Drive, account: RunStats) -> None:
     if drive.segmenter is None:
         account.warnings.append("no segmenter: the map shows geometry only")
     elif not _has_camera(drive):
         account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _check(drive: Drive, account: Account, maps: Maps) -> None:
+def _check(drive: Drive, account: RunStats, maps: Maps) -> None:
     if not account.counts["scans"]:
         why = _first_reason(account, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
@@ -169,7 +169,7 @@ def _has_camera(drive: Drive) -> bool:
     return bool(drive.log.images) and drive.log.calibration.has_camera
 
 
-def _first_reason(account: Account, what: str) -> str:
+def _first_reason(account: RunStats, what: str) -> str:
     """Why the first one was left out, as the end of a sentence; nothing where none was."""
     return next((f"; first reason: {s.where}: {s.reason}" for s in account.skips if s.what == what), "")
 
@@ -208,7 +208,7 @@ def _map_all(
 
 
 def _map_chunk(drive: Drive, store: ChunkStore, number: int, progress: Progress = silent) -> None:
-    account = Account()
+    account = RunStats()
     static, removed = fuse_scans(drive, _chunks(drive)[number], account, progress)
     record = {"counts": dict(account.counts), "skips": [asdict(skip) for skip in account.skips]}
     store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)

@@ -18,10 +18,10 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, open_label_set
 from gnss_sem_map.labels.probabilities import KeepsLabels
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
     NEAREST_DEPTH_M,
     NO_VIEW,
@@ -59,7 +59,7 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenScan:
+class LabelledScan:
     """The usable points of one scan (m of n), in the map, with what its image shows of them."""
 
     drive: Drive
@@ -92,21 +92,23 @@ class SeenScan:
         return np.asarray(of_pixel[self.pixels], np.int8)
 
 
-def seen_scans(drive: Drive, account: Account | None = None, keep_points: bool = False) -> Iterator[SeenScan]:
+def labelled_scans(
+    drive: Drive, account: RunStats | None = None, keep_points: bool = False
+) -> Iterator[LabelledScan]:
     """Every usable scan in time order, with its points in the map and what its image shows of them.
 
     `keep_points` finds every `p_map` on the way, which takes less time than asking for it later.
     """
-    account = account or Account()
+    account = account or RunStats()
     return (seen for seen in look_at(drive, drive.log.scans, account, keep_points) if seen is not None)
 
 
 def look_at(
-    drive: Drive, scans: Sequence[Scan], account: Account, keep_points: bool = False
-) -> Iterator[SeenScan | None]:
+    drive: Drive, scans: Sequence[Scan], account: RunStats, keep_points: bool = False
+) -> Iterator[LabelledScan | None]:
     """Every scan, or None for one that cannot be used; why is in the account."""
     look, views = _Look(drive.log, drive.segmenter, drive.settings, account), Views(drive, account)
-    for scan, (points, classes) in ahead(look, scans, under_way=READ_AHEAD):
+    for scan, (points, classes) in prefetch(look, scans, under_way=READ_AHEAD):
         yield None if points is None else _see(drive, scan, points, classes, views, account, keep_points)
 
 
@@ -116,9 +118,9 @@ def _see(
     points: Points,
     image: tuple[Image, ClassImage] | None,
     views: Views,
-    account: Account,
+    account: RunStats,
     keep_points: bool = False,
-) -> SeenScan | None:
+) -> LabelledScan | None:
     """Everything between reading a scan and fusing it, in one pass over its points."""
     log, n = drive.log, len(points.xyz)
     mapping, labelling = drive.settings.mapping, drive.settings.labelling
@@ -151,7 +153,7 @@ def _see(
     account.counts["points labelled"] += len(classes)
     account.counts["points unlabelled"] += count - len(classes)
     kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
-    seen_scan = SeenScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
+    seen_scan = LabelledScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
     if not seen_scan.keys.all():
         keys_of(seen_scan.p_map, mapping.voxel_size_m)  # says which point it is
     return seen_scan
@@ -160,7 +162,7 @@ def _see(
 class Views:
     """From where the images of a drive looked at its scans, one after another: each view is written over the last."""
 
-    def __init__(self, drive: Drive, account: Account) -> None:
+    def __init__(self, drive: Drive, account: RunStats) -> None:
         self._drive, self._account, self._last = drive, account, NO_VIEW
 
     def of(self, image: tuple[Image, ClassImage] | None, n: int) -> View:
@@ -190,7 +192,7 @@ class _Look:
     """What a scan's image shows: read, segmented, and counted when there is nothing to see."""
 
     def __init__(
-        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: Account
+        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: RunStats
     ) -> None:
         self._log, self._segmenter, self._account = log, segmenter, account
         self._within_s = settings.labelling.image_within_s

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
@@ -105,10 +105,10 @@ def _merged_evidence(
     moved = merge(first.moved, second.moved, first_frame, second_frame, T)
     T_first_second = _rigid(second_frame, first_frame, np.eye(4) if T is None else T)
     keyframes = [one.keyframes for one in (first, second)]
-    both: Witnesses | None = None
+    both: KeyframeScans | None = None
     if keyframes[0] is not None and keyframes[1] is not None:
         later = keyframes[1].T_lidar_map @ np.linalg.inv(T_first_second)
-        both = Witnesses(
+        both = KeyframeScans(
             np.concatenate([keyframes[0].images, keyframes[1].images]),
             np.concatenate([keyframes[0].T_lidar_map, later]),
         )
@@ -156,7 +156,7 @@ def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
     """Share of the points (n, 3) that lie in a voxel of the map."""
     if not len(p_map):
         return 0.0
-    return float((voxels.places(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
+    return float((voxels.indices_of(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
 
 
 def _known(frame: LocalFrame | None) -> LocalFrame:

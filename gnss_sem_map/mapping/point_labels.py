@@ -16,7 +16,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.mapping.labelled_scans import map_points
 from gnss_sem_map.refinement.kerbs import Kerbs
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of
 
@@ -57,7 +57,7 @@ def label_points(
         if not valid.any():
             return None  # likewise
         keys = keys_of(p_map, settings.mapping.voxel_size_m)
-        places = [m.voxels.places(keys) for m in (maps[:1] if one_grid else maps)]
+        places = [m.voxels.indices_of(keys) for m in (maps[:1] if one_grid else maps)]
         places *= len(maps) // len(places)
         found = [_look_up(m, there, valid) for m, there in zip(maps, places, strict=True)]
         if kerbs is not None:
@@ -68,7 +68,7 @@ def label_points(
             _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
         return found
 
-    for scan, found in ahead(look, log.scans, threads=os.cpu_count() or 1):
+    for scan, found in prefetch(look, log.scans, threads=os.cpu_count() or 1):
         if found is not None:
             yield scan, found
 

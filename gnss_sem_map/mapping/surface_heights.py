@@ -13,7 +13,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.labelled_scans import map_points
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
@@ -32,12 +32,12 @@ def measure_surface_heights(
             p_map, _ = map_points(scan.read(), scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
             return None  # counted when the map was built
-        row = voxels.places(keys_of(p_map, settings.mapping.voxel_size_m))
+        row = voxels.indices_of(keys_of(p_map, settings.mapping.voxel_size_m))
         return row[row >= 0], p_map[row >= 0, 2]
 
     scans = log.scans if len(log.scans) < EVERY * ENOUGH_SCANS else log.scans[::EVERY]
     sums, counts = np.zeros(len(voxels)), np.zeros(len(voxels), np.int64)
-    for _, placed in ahead(place, scans, threads=os.cpu_count() or 1):
+    for _, placed in prefetch(place, scans, threads=os.cpu_count() or 1):
         if placed is not None:
             row, z = placed
             sums += np.bincount(row, z, len(voxels))

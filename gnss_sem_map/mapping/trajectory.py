@@ -9,7 +9,7 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.run_stats import Account, Progress, silent
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings, match_scans
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -31,17 +31,17 @@ class DriveTrajectory:
 
 
 def estimate_trajectory(
-    log: SensorLog, settings: Settings, account: Account, progress: Progress = silent
+    log: SensorLog, settings: Settings, stats: RunStats, progress: Progress = silent
 ) -> tuple[Trajectory, Solution | None]:
     """The trajectory of a drive and its solution; see `locate`."""
-    found = locate(log, settings, account, progress)
+    found = locate(log, settings, stats, progress)
     return found.trajectory, found.solution
 
 
 def locate(
     log: SensorLog,
     settings: Settings,
-    account: Account,
+    stats: RunStats,
     progress: Progress = silent,
     first: Solution | None = None,
 ) -> DriveTrajectory:
@@ -56,14 +56,14 @@ def locate(
     is_matched, without_lidar = False, None
     if settings.trajectory.lidar_odometry and log.scans:
         matches = match_scans(log, found.trajectory, settings.trajectory.scan_matching, progress)
-        account.counts.update(matches.counts)
+        stats.counts.update(matches.counts)
         # a scan that cannot be used at all is reported when the map is built
-        account.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
+        stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
         is_matched = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
         if len(matches.relative_poses):
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
-    account.warnings.extend(found.notes)
+    stats.warnings.extend(found.notes)
     return DriveTrajectory(found.trajectory, found, without_lidar, is_matched)
 
 

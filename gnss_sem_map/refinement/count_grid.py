@@ -14,7 +14,7 @@ from pydantic import Field
 from scipy.special import gammaln
 
 from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings, classes_of
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
@@ -99,7 +99,7 @@ def count_grid(
             keys[part], labels.view(np.uint8)[part], pairs[0], cell_voxels, layer_voxels, reach_layers, pairs[1][part]
         )  # fmt: skip
 
-    for _ in ahead(count, _slabs(keys, cell_voxels), THREADS):
+    for _ in prefetch(count, _slabs(keys, cell_voxels), THREADS):
         pass
     return counts
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.dynamics.visibility import VisibilitySettings, Witnesses, testify
+from gnss_sem_map.dynamics.visibility import KeyframeScans, VisibilitySettings, hits_and_misses
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -30,7 +30,7 @@ class FreeSpaceSettings(VisibilitySettings, StepSettings):
     farthest_m: float = Field(
         default=80.0,
         gt=0,
-        description="Farther scans do not testify, m: a voxel needs no outline, as objects do.",
+        description="Farther scans do not hits_and_misses, m: a voxel needs no outline, as objects do.",
     )
     over_m: tuple[float, float] = Field(
         default=(0.4, 3.0), description="Only what stands over something, so far at least and at most, m."
@@ -51,7 +51,9 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     )
 
 
-def seen_through(voxels: VoxelMap, witnesses: Witnesses, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
+def seen_through(
+    voxels: VoxelMap, witnesses: KeyframeScans, settings: FreeSpaceSettings
+) -> NDArray[np.bool_]:
     """Which voxels (v,) are empty, by what the witnesses say of their centres.
 
     Only with poses that scan matching has made sharp: who stands half a metre off looks through walls. The ground is
@@ -60,7 +62,7 @@ def seen_through(voxels: VoxelMap, witnesses: Witnesses, settings: FreeSpaceSett
     high = np.flatnonzero(
         _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in settings.over_m])
     )
-    hits, throughs = testify(voxels.centres[high], witnesses, settings)
+    hits, throughs = hits_and_misses(voxels.centres[high], witnesses, settings)
     empty = throughs >= settings.least_through
     empty &= throughs > settings.through_per_hit * hits
     empty &= voxels.hits[high] < settings.points_per_through * throughs

@@ -26,7 +26,7 @@ def apply(state: MapState, settings: RemovedLayerSettings) -> MapState:
         raise NotApplicable("moving objects were not sought")
     assert state.decided is not None
     refined = with_removed(state.decided, state.beside.moved)
-    rows = refined.voxels.places(state.voxels.keys)
+    rows = refined.voxels.indices_of(state.voxels.keys)
     count = len(refined)
     removed, inferred = np.ones(count, np.bool_), np.zeros(count, np.bool_)
     removed[rows], inferred[rows] = state.removed, state.inferred
@@ -49,9 +49,9 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     Where something stands, its evidence and its decision stay, and the hits of what moved through are counted beside
     its own, in `hits_removed`: no point is lost. Raises DataError for another voxel size or class set.
     """
-    alone = removed[static.voxels.places(removed.keys) < 0]
+    alone = removed[static.voxels.indices_of(removed.keys) < 0]
     voxels = static.voxels + alone
-    kept, added = voxels.places(static.voxels.keys), voxels.places(alone.keys)
+    kept, added = voxels.indices_of(static.voxels.keys), voxels.indices_of(alone.keys)
     names = voxels.label_set.names
     vehicle = names.index("vehicle") if "vehicle" in names else UNLABELLED
     labels, confidence = np.full(len(voxels), vehicle, np.int8), np.zeros(len(voxels), np.float32)
@@ -69,8 +69,8 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
 def _with_hits(refined: SemanticMap, static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     """The same voxels; those of `static` that things moved through have their hits as well."""
     hits, gone = refined.voxels.hits.copy(), refined.removed_hits.copy()
-    through = removed[static.voxels.places(removed.keys) >= 0]
-    places = refined.voxels.places(through.keys)
+    through = removed[static.voxels.indices_of(removed.keys) >= 0]
+    places = refined.voxels.indices_of(through.keys)
     hits[places] += through.hits
     gone[places] += through.hits
     return replace(refined, voxels=replace(refined.voxels, hits=hits), hits_removed=gone)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gnss_sem_map.dynamics.visibility import Witnesses
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
@@ -51,7 +51,7 @@ class Evidence:
     """The points of moving objects, which were kept out of the map."""
     sensor_model: LabelCalibration | None = None
     """Where the classes were found to stand, in place of rules, and a temperature."""
-    keyframes: Witnesses | None = None
+    keyframes: KeyframeScans | None = None
     """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
     surface_heights: SurfaceHeights | None = None
     """How high the surface in a voxel lies, finer than the voxel."""

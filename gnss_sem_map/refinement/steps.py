@@ -196,7 +196,7 @@ def _changes(before: MapState, after: MapState) -> dict[tuple[str, str], int]:
     source = np.where(before.is_removed, removed, before.labels)
     if after.voxels is not before.voxels:
         known = after.voxels.labels.astype(np.int64)
-        known[after.voxels.places(before.voxels.keys)] = source
+        known[after.voxels.indices_of(before.voxels.keys)] = source
         source = known
     differ = target != source
     pairs, counts = np.unique(np.stack([source[differ], target[differ]]), axis=1, return_counts=True)

@@ -1,1 +1,1 @@
-"""One scan: moved into the map without motion distortion, thinned, projected into its image, matched with others."""
+"""One scan: motion compensation, downsampling, projection into the image, registration and LiDAR odometry."""

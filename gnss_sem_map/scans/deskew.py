@@ -1,7 +1,7 @@
-"""Every point to where it was in the map, at its own stamp (eq. 1).
+"""Deskewing: every point of a sweep is transformed into the map with the pose of its own stamp (eq. 1).
 
-A sweep takes 0.1 s. A vehicle at 50 km/h moves 1.4 m meanwhile, so one pose per scan smears every wall. Raw sweeps are
-moved point by point; sweeps that are already motion-compensated with the one pose of their stamp.
+A sweep takes 0.1 s. A vehicle at 50 km/h moves 1.4 m meanwhile, so one pose per sweep would blur every wall. Raw sweeps
+are transformed point by point; sweeps that are already motion-compensated with one pose, that of their stamp.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from gnss_sem_map.scans import kernels
 from gnss_sem_map.sensor_log import Points
 
 KNOTS_PER_S = 200.0
-"""Poses are computed at whole multiples of 5 ms and blended linearly between: turning at 1 rad/s, a point at 100 m is
-0.3 mm off. Where a point comes to lie depends on its own stamp only, not on what else the sweep holds."""
+"""Poses are computed at whole multiples of 5 ms (knots) and interpolated linearly between them: at 1 rad/s, the error
+of a point at 100 m is 0.3 mm. The position of a point depends on its own stamp only, not on the rest of the sweep."""
 EXTRAPOLATE_S = 0.15
-"""The first and last sweep may reach this far beyond the trajectory: no more than a sweep and a half."""
+"""The first and last sweep may extend this far beyond the trajectory: a sweep and a half."""
 LONGEST_SWEEP_S = 1.0
-"""Stamps that lie farther apart are not all of one sweep: those of points that are left out may be anything."""
+"""Longest sweep: stamps of usable points that are farther apart are an error. Other points may have any stamp."""
 
 
 @dataclass(frozen=True, eq=False)
 class Knots:
-    """Where the lidar was through one sweep."""
+    """Poses of the LiDAR during one sweep."""
 
     first: int
     """Number of the first knot; knot 0 is at stamp 0."""
     poses: NDArray[np.float64]
-    """(k, 3, 8): T_map_lidar (3, 4) at each knot, and beside it what the next one adds."""
+    """(k, 3, 8): T_map_lidar (3, 4) at each knot, and beside it the difference to the next knot (3, 4)."""
 
 
 def points_in_map(
     points: Points, stamp: float, trajectory: Trajectory, T_imu_lidar: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The finite points of one sweep in the map frame, m; else as `usable_points_in_map`."""
+    """The finite points (m, 3) m of one sweep in the map frame; see `usable_points_in_map`."""
     return usable_points_in_map(points, stamp, trajectory, T_imu_lidar)[0]
 
 
@@ -50,7 +50,7 @@ def usable_points_in_map(
     nearest_m: float = 0.0,
     farthest_m: float = np.inf,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The points of one sweep that are finite and in range, in the map frame (m, 3) m, and which those are (n,).
+    """The finite points of one sweep that are in range, in the map frame (m, 3) m, and their mask (n,) (eq. 1).
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
     """
@@ -66,7 +66,7 @@ def usable_points_at_stamp(
     nearest_m: float = 0.0,
     farthest_m: float = np.inf,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The usable points of one sweep as if all were seen at its stamp, (m, 3) m in the lidar frame, and T_map_lidar.
+    """The usable points of one sweep, deskewed to its stamp, (m, 3) m in the LiDAR frame, and T_map_lidar (4, 4).
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
     """
@@ -81,7 +81,7 @@ def usable_points_at_stamp(
 def _moved(
     points: Points, stamps: NDArray[np.float64], knots: Knots, nearest_m: float, farthest_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The usable points (m, 3) where the knots say, in the frame of their poses, and which those are (n,)."""
+    """The usable points (m, 3), transformed with the poses at the knots, and their mask (n,)."""
     valid, moved = np.zeros(len(points.xyz), np.bool_), np.empty(3 * len(points.xyz))
     count = kernels.to_map(
         points.rows, stamps, nearest_m, farthest_m, KNOTS_PER_S, knots.first, knots.poses, valid, moved
@@ -97,7 +97,7 @@ def knots_of(
     nearest_m: float,
     farthest_m: float,
 ) -> tuple[NDArray[np.float64], Knots]:
-    """The stamps of one sweep (n,), or none where one pose holds for all, and the poses that they lie between.
+    """The stamps of one sweep (n,), empty where one pose holds for all points, and the poses that enclose them.
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s, or takes more than a second.
     """

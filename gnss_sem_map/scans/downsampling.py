@@ -1,4 +1,4 @@
-"""A scan with one point per cube: half a metre apart is near enough to find a wall, and a tenth of the points."""
+"""Voxel-grid downsampling: one point per cube. At 0.5 m a tenth of the points remains, enough for registration."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from gnss_sem_map.voxels.kernels import pack_keys
 
 
 def one_per_cube(points: NDArray[np.float64], edge_m: float) -> NDArray[np.float64]:
-    """The mean of the points (n, 3) m in each cube of this edge that holds any, (c, 3) m, in the order of their keys.
+    """The mean (c, 3) m of the points (n, 3) m in each occupied cube of this edge length, in the order of the keys.
 
-    Compiled and without Python's lock, so that scans are prepared while others are matched.
+    Compiled, and releases the GIL: scans are prepared while others are matched.
     """
     keys = np.empty(len(points), np.int64)
     pack_keys(points, edge_m, keys)

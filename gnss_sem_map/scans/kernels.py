@@ -1,9 +1,8 @@
-"""Where the points of a scan fall: in the map, in its voxels, in the image of its moment.
+"""Compiled loops over the points of a scan: deskewing, voxel keys and projection into the image (eq. 1, 3, 4).
 
-A scan is worked through in blocks that stay in the processor's nearest cache, so that nothing but the answer goes
-through memory: keys for every point, and a short list of those that fall into the image. Inside a block the
-coordinates lie axis by axis, which lets every simple loop here work on several points at once. The readable twin of
-each is the numpy oracle in the tests.
+A scan is processed in blocks that fit into the L1 cache; only results are written to memory: the voxel key of every
+point, and a short list of the points in the image. Inside a block the coordinates are stored axis by axis, so that the
+compiler can use SIMD instructions. The tests hold a numpy version of each loop.
 """
 
 from __future__ import annotations
@@ -14,18 +13,18 @@ from numba import int64, njit
 from gnss_sem_map.voxels.kernels import pack_key
 
 BLOCK = 1024
-"""Points at once: three coordinates of each are 24 kB, which fits the first cache of any processor of today."""
+"""Points per block: their coordinates take 24 kB, which fits into the L1 cache."""
 COLUMNS = 4
-"""Of a scan's rows: x, y, z, intensity."""
+"""Columns of a scan: x, y, z, intensity."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, p_map):
-    """Move the usable points of a scan into the map, one after another; returns how many.
+    """Transform the usable points of a scan into the map; returns their number m.
 
-    `rows` (4 n,) as the file has them; `stamps` (n,), or none for a sweep with one pose; `poses` (k, 3, 8), see
-    `_move`, of knots that lie `knots_per_s` in a second, numbered from stamp zero. `valid` (n,) becomes which points
-    are finite and in range, `p_map` (3 m,) where those are.
+    `rows` (4 n,) are the points as in the file; `stamps` (n,) s, or empty for a sweep with one pose; `poses` (k, 3, 8),
+    see `_move`, are those of knots with the rate `knots_per_s`, numbered from stamp zero. Writes `valid` (n,), the mask
+    of the points that are finite and in range, and `p_map` (3 m,) m, their positions.
     """
     count, block, knots = 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
     for start in range(0, len(valid), BLOCK):
@@ -50,10 +49,10 @@ def place(
     rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, voxel_size_m, P, nearest_depth_m, half_columns,
     valid, keys, p_map, points, columns, lines, depths, nearest,
 ):  # fmt: skip
-    """Find the voxels of the usable points of a scan, and those that fall into the image; returns both numbers.
+    """Compute the voxel keys of the usable points of a scan and project them into the image; returns both numbers.
 
-    As `to_map`, but what is kept are the `keys` (m,) of their voxels, 0 where no key can be, and what `project` finds
-    with `P`; without an image `nearest` is empty. Where `p_map` is empty the points themselves are not kept.
+    As `to_map`, but writes the voxel `keys` (m,), 0 for a point outside of the addressable volume, and the results of
+    `project` with `P`; without an image `nearest` is empty. Positions are written only if `p_map` is not empty.
     """
     count, inside, block, knots = 0, 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
     for start in range(0, len(valid), BLOCK):
@@ -77,7 +76,7 @@ def place(
 def _move_block(
     rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
 ):
-    """Move the usable ones of the points from `start` into the first columns of `block`; returns how many."""
+    """Transform the usable points of the block from `start` into the first columns of `block`; returns their number."""
     end = min(start + BLOCK, len(valid))
     here, usable = rows[COLUMNS * start : COLUMNS * end], valid[start:end]
     mark_usable(here, nearest_m, farthest_m, usable)
@@ -105,9 +104,10 @@ def mark_usable(rows, nearest_m, farthest_m, valid):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _transform(rows, valid, knots, poses, p_map):
-    """Move the valid points, stretch by stretch of those between the same two knots; returns how many.
+    """Transform the valid points, run by run of those between the same two knots; returns their number.
 
-    `knots` are stamps as knots since the first: the whole part says which, the rest how far to the next.
+    `knots` are stamps in units of knots since the first: the integer part is the knot, the rest the interpolation
+    weight.
     """
     i, to, n = 0, 0, len(valid)
     while i < n:
@@ -127,7 +127,9 @@ def _transform(rows, valid, knots, poses, p_map):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _move(rows, knots, k, pose, x_map, y_map, z_map):
-    """One stretch, blended linearly between two poses: `pose` (3, 8) is one (3, 4) and what the next one adds."""
+    """Transform one run with poses interpolated linearly: `pose` (3, 8) is a pose (3, 4) and the difference to the
+    next.
+    """
     xx, xy, xz, x0, dxx, dxy, dxz, dx0 = pose[0]
     yx, yy, yz, y0, dyx, dyy, dyz, dy0 = pose[1]
     zx, zy, zz, z0, dzx, dzy, dzz, dz0 = pose[2]
@@ -143,13 +145,13 @@ def _move(rows, knots, k, pose, x_map, y_map, z_map):
 def project(
     x_map, y_map, z_map, first, P, nearest_depth_m, half_columns, points, columns, lines, depths, inside, nearest
 ):  # fmt: skip
-    """Append the points that fall into the image (eq. 3, 4) to the `inside` that do; returns how many do now.
+    """Project points into the image (eq. 3, 4) and append those inside to the `inside` there are; returns their number.
 
-    `points` are numbers, counted from `first`; `columns` and `lines` their pixels, `depths` m. A pixel reaches from its
-    number to the next. That numbers are centres in KITTI's calibration would move points by half a pixel, which a real
-    network's labels do not tell apart (accuracy 80.22 and 80.20 %).
-    `nearest` (h, w) keeps the nearest depth: a point writes into its own line only, `half_columns` to either side;
-    `visible` looks along the columns. Together they are a window, at the price of its edges.
+    Writes the point numbers `points`, counted from `first`, their pixels `columns` and `lines`, and `depths` m. A pixel
+    extends from its number to the next. With pixel centres at integers, as in KITTI's calibration, points would move by
+    half a pixel; with the labels of a real network this makes no difference (accuracy 80.22 and 80.20 %).
+    `nearest` (h, w) m is the depth buffer: a point writes into its own line, `half_columns` to either side; `visible`
+    takes the minimum along the columns. The window minimum is separable, so this costs only its edges.
     """
     height, width = nearest.shape
     for i in range(len(x_map)):
@@ -173,9 +175,10 @@ def project(
 def visible(
     points, columns, lines, depths, nearest, half_lines, ratio, slack_m, line_of, column_of, class_width, pixels
 ):  # fmt: skip
-    """Keep of the `points` in an image those that nothing nearer hides, with the pixel of the class image each sees.
+    """Remove the occluded `points` of an image, and write the pixel of the class image of each of the others (eq. 5).
 
-    `line_of` (h,) and `column_of` (w,) say where a camera pixel lies in the class image. Returns how many stay.
+    `line_of` (h,) and `column_of` (w,) map camera pixels to pixels of the class image. Returns the number of visible
+    points.
     """
     height, kept = len(nearest), 0
     for i in range(len(points)):
@@ -191,7 +194,7 @@ def visible(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def gather(probabilities, pixels, classes):
-    """Copy the class probabilities (h, w, c + 1) of some pixels, however the image lies in memory."""
+    """Copy the class probabilities (h, w, c + 1) of some pixels, for any memory layout of the image."""
     width = np.uint32(probabilities.shape[1])
     for i in range(len(pixels)):
         line = np.uint32(pixels[i]) // width

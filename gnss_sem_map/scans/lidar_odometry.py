@@ -1,8 +1,8 @@
-"""LiDAR odometry: every sweep, deskewed, against a local map of those before it -> relative poses with covariance.
+"""LiDAR odometry: every deskewed sweep is registered to a local map of earlier sweeps -> relative poses, covariances.
 
-The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP); what stands here is what it
-needs to be trusted: a start from the trajectory, a covariance that knows which directions the scene leaves open,
-and a verdict on every match. Positions drift, steps do not: the graph takes the steps. No loop is closed here.
+The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP). This module adds an initial
+guess from the trajectory, a covariance that is large in degenerate directions, and a check of every match. The factor
+graph uses relative poses, because absolute positions drift. There is no loop closure.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
 from gnss_sem_map.scans.downsampling import one_per_cube
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
 Array = NDArray[np.float64]
 
-# Once a sweep is in its place, so much of a voxel's edge is far enough to look for a point's surface. What is farther
-# has moved: a car ahead, half a metre on since the last sweep, would drag the sweep along with it.
+# Correspondence distance of the second registration, as a share of the voxel size. Points that are farther from their
+# surface belong to moving objects: a car ahead, 0.5 m farther since the last sweep, would pull the sweep with it.
 SETTLED = 0.5
-# The first match ends when it goes on by less than the first, the second at less than the other.
+# The two registrations stop when a step is shorter than this.
 COARSE_M, FINE_M = 0.01, 0.001
-# A point's plane is that of so many neighbours: ten and twenty tilt it at edges, and roll the sweep with it.
+# Neighbours for the plane of a point: with ten or twenty, planes tilt at edges, and the sweep rolls with them.
 NEIGHBOURS = 6
 THREADS = min(os.cpu_count() or 1, 4)
 
@@ -47,36 +47,41 @@ class ScanMatchingSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    nearest_m: float = Field(2.5, ge=0, description="Nearer returns are of the car itself.")
+    nearest_m: float = Field(2.5, ge=0, description="Nearer returns, of the vehicle itself, are left out.")
     farthest_m: float = Field(80.0, gt=0, description="Farther returns are too sparse to match.")
     downsampling_m: float = Field(0.5, gt=0, description="One point of a sweep per cube of this edge.")
     voxel_size_m: float = Field(0.5, gt=0, description="Edge of the local map's voxels.")
     map_scans: int = Field(
-        100, gt=0, description="What was not seen for so many sweeps leaves the local map."
+        100, gt=0, description="Voxels not observed for so many sweeps are removed from the local map."
     )
     min_points: int = Field(300, gt=0, description="A sweep with fewer downsampled points is not matched.")
-    min_inlier_share: float = Field(0.25, gt=0, le=1, description="Least share of points that find the map.")
+    min_inlier_share: float = Field(
+        0.25, gt=0, le=1, description="Least share of points with a correspondence."
+    )
     max_correction_m: float = Field(
-        1.0, gt=0, description="A match farther than this from its start diverged."
+        1.0, gt=0, description="A match farther than this from its initial guess has diverged."
     )
     max_correction_deg: float = Field(5.0, gt=0, description="Likewise, in rotation.")
-    max_gap_s: float = Field(1.0, gt=0, description="After a longer gap a new local map is begun.")
+    max_gap_s: float = Field(1.0, gt=0, description="After a longer gap a new local map is started.")
     steps: tuple[int, ...] = Field((1, 10), min_length=1, description="Relative poses over so many sweeps.")
-    # Halves of the sweeps of a real drive (KITTI 0005), matched each for itself, show what a whole sweep is worth: 2 to
-    # 7 mm and 0.2 to 0.5 mrad over a second, several times what its points alone would have it.
-    translation_stddev_m: float = Field(0.005, gt=0, description="No relative position is trusted more.")
-    rotation_stddev_rad: float = Field(0.0005, gt=0, description="No relative rotation is trusted more.")
+    # Halves of the sweeps of a real drive (KITTI 0005), matched separately, show the true noise of a match: 2 to 7 mm
+    # and 0.2 to 0.5 mrad over a second, several times the value that follows from the number of points.
+    translation_stddev_m: float = Field(0.005, gt=0, description="Least standard deviation of translation.")
+    rotation_stddev_rad: float = Field(0.0005, gt=0, description="Least standard deviation of rotation.")
     degenerate_share: float = Field(
-        0.003, gt=0, lt=1, description="A direction that less than this share of the points hold is open."
+        0.003,
+        gt=0,
+        lt=1,
+        description="A direction constrained by less than this share of points is degenerate.",
     )
-    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in an open direction.")
+    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in degenerate directions.")
 
 
 class TrajectorySettings(SmootherSettings):
     """How the trajectory is estimated: GNSS, IMU, and where there are sweeps LiDAR odometry."""
 
     lidar_odometry: bool = Field(
-        True, description="Bind the trajectory by scan matching: sharp surfaces, and outages bridged."
+        True, description="Add relative poses from LiDAR odometry to the factor graph."
     )
     scan_matching: ScanMatchingSettings = Field(ScanMatchingSettings(), description="Sweep to local map.")
 
@@ -88,14 +93,14 @@ class ScanMatches:
     relative_poses: RelativePoses
     """Between the stamps of matched sweeps, in the imu frame."""
     skips: tuple[Skip, ...]
-    """Sweeps that were not matched, each with the reason; a "scan" is not usable at all, for anything."""
+    """Sweeps that were not matched, each with the reason; those named "scan" cannot be read."""
     counts: Counter[str]
     """"scans matched", "scans not matched", "scans with an open direction", "local maps"."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Match:
-    """A sweep in its place in the local map; `covariance` (6, 6) of the tangent in lidar axes."""
+    """Pose of a sweep in the local map; `covariance` (6, 6) of the tangent in LiDAR axes."""
 
     scan: Scan
     local_map: int
@@ -116,18 +121,18 @@ def match_scans(
 ) -> ScanMatches:
     """Relative poses from the sweeps of a drive; a drive without a usable sweep has none.
 
-    `trajectory` is the first guess: it deskews every sweep, and its steps are where each registration starts.
-    Sweeps that cannot be read or matched are left out, and reported.
+    `trajectory` deskews every sweep, and its relative poses are the initial guesses of the registrations. Sweeps that
+    cannot be read or matched are left out and reported in `skips`.
     """
     settings = settings or ScanMatchingSettings()
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips = []
-    # the next sweeps are read, moved and thinned out on a second core while one is matched
+    # the next sweeps are read, deskewed and downsampled on a second core while one is matched
     prepare = partial(
         _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
     )
-    for done, (scan, sweep) in enumerate(ahead(prepare, log.scans), 1):
+    for done, (scan, sweep) in enumerate(prefetch(prepare, log.scans), 1):
         try:
             if isinstance(sweep, Skip):
                 skips.append(sweep)
@@ -150,7 +155,7 @@ def match_scans(
 
 @dataclass(frozen=True, eq=False)
 class _Sweep:
-    """A sweep ready to be matched: its points, downsampled, each with its plane, and T_map_lidar by the trajectory."""
+    """A sweep ready for registration: downsampled points, each with its plane, and T_map_lidar by the trajectory."""
 
     points: small_gicp.PointCloud
     T_map_lidar: Array
@@ -159,7 +164,7 @@ class _Sweep:
 def _prepare(
     scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
 ) -> _Sweep | Skip:
-    """The sweep ready to be matched, or why there is none."""
+    """The sweep ready for registration, or the reason why it is skipped."""
     try:
         return _sweep(scan, trajectory, T_imu_lidar, settings)
     except (DataError, MeasurementError) as error:
@@ -181,13 +186,13 @@ def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: Sca
         raise _NoMatch(
             f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
         )
-    # small_gicp holds Python's lock: its own threads are all that helps, where each point is for itself
+    # small_gicp holds the GIL, so only its own threads help here, where points are independent
     small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS, num_threads=THREADS)
     return _Sweep(points, T_map_lidar)
 
 
 class _Odometry:
-    """The local map, and where the last matched sweep was: in the local map and by the trajectory."""
+    """The local map, and the pose of the last matched sweep in the local map and by the trajectory."""
 
     def __init__(self, settings: ScanMatchingSettings) -> None:
         self.local_maps = 0
@@ -195,7 +200,7 @@ class _Odometry:
         self._last: tuple[Scan, Array, Array] | None = None
 
     def match(self, scan: Scan, sweep: _Sweep) -> _Match:
-        """Register a sweep and add it to the local map; raises _NoMatch, and leaves the map as it was."""
+        """Register a sweep and add it to the local map; raises _NoMatch, and leaves the map unchanged then."""
         if self._last is None or scan.stamp - self._last[0].stamp > self._settings.max_gap_s:
             self._map = small_gicp.GaussianVoxelMap(self._settings.voxel_size_m)
             self._map.set_lru(horizon=self._settings.map_scans)
@@ -215,17 +220,18 @@ class _Odometry:
         found = coarse.num_inliers / points.size()
         if found < settings.min_inlier_share:
             raise _NoMatch(
-                f"{found:.0%} of its points find the local map, expected {settings.min_inlier_share:.0%}"
+                f"{found:.0%} of its points have a correspondence in the local map, expected"
+                f" {settings.min_inlier_share:.0%}"
             )
         settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m, FINE_M)
-        # the coarse match knows what holds the sweep: what moves makes its residuals larger, and it less sure
+        # the information comes from the coarse match: its residuals include moving objects, which makes it smaller
         information, weight = registration.information(coarse, points)
         length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
         T, covariance, is_open = registration.close_open_directions(
             guess, registration.rigid(settled.T_target_source), information, weight, length,
             settings.degenerate_share, settings.degenerate_stddev_m,
         )  # fmt: skip
-        # at its limit, not stuck at a minimum; where a direction is open, sliding along it does no harm
+        # a match in a degenerate direction may slide without harm
         if not is_open and not all(registration.has_converged(result) for result in (coarse, settled)):
             raise _NoMatch(f"the registration did not converge in {registration.MAX_ITERATIONS} iterations")
         _refuse_divergence(registration.inverse(guess) @ T, settings)
@@ -234,7 +240,9 @@ class _Odometry:
     def _align(
         self, points: small_gicp.PointCloud, guess: Array, within_m: float, step_m: float
     ) -> small_gicp.RegistrationResult:
-        """Register by the points that lie so close to the mean of their voxel, until a step is so small."""
+        """Register with this correspondence distance to the means of the voxels, until a step is shorter than
+        `step_m`.
+        """
         return small_gicp.align(
             self._map,
             points,
@@ -250,15 +258,15 @@ def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> Non
     turn = registration.turn_deg(correction)
     if shift > settings.max_correction_m or turn > settings.max_correction_deg:
         raise _NoMatch(
-            f"the registration went {shift:.2f} m and {turn:.1f}° from its start, expected at most"
+            f"the registration moved {shift:.2f} m and {turn:.1f}° from its initial guess, expected at most"
             f" {settings.max_correction_m:g} m and {settings.max_correction_deg:g}°"
         )
 
 
 def _pairs(matches: list[_Match], step: int) -> Iterator[tuple[_Match, _Match]]:
-    """Matched sweeps `step` apart, counted without the missing ones, of one local map.
+    """Pairs of matched sweeps of one local map, `step` apart (sweeps without a match are not counted).
 
-    Over several sweeps only where none in between had an open direction: there the local map itself has slipped.
+    For `step` > 1, pairs with a degenerate match in between are left out: there the local map itself may have moved.
     """
     slips = np.cumsum([0, *(match.is_open for match in matches)])
     for i in range(len(matches) - step):
@@ -270,7 +278,9 @@ def _pairs(matches: list[_Match], step: int) -> Iterator[tuple[_Match, _Match]]:
 def _relative_poses(
     pairs: list[tuple[_Match, _Match]], T_imu_lidar: Array, settings: ScanMatchingSettings
 ) -> RelativePoses:
-    """Pairs of matches as motion of the imu. Both ends err against the local map, and no less than the floor."""
+    """Relative poses of the IMU from pairs of matches; covariances are the sum of both ends, plus the least
+    variances.
+    """
     T_lidar_imu = np.linalg.inv(T_imu_lidar)
     to_imu = registration.adjoint(T_imu_lidar)
     floor = np.diag(np.repeat([settings.rotation_stddev_rad**2, settings.translation_stddev_m**2], 3))

@@ -1,4 +1,4 @@
-"""Work done a few items ahead, in threads, with the results in order."""
+"""Prefetching: items are computed in advance by threads, and returned in order."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 PER_THREAD = 2
-"""Items under way per thread: enough that none waits, few enough that little is held."""
+"""Items in progress per thread: enough to keep every thread busy, with little memory."""
 
 
-def ahead(
+def prefetch(
     make: Callable[[Item], Made], items: Iterable[Item], threads: int = 1, under_way: int | None = None
 ) -> Iterator[tuple[Item, Made]]:
-    """Every item with what `make` makes of it, in order; at most `under_way` (2 per thread) are made in advance.
+    """Pairs (item, make(item)) in order; at most `under_way` items (default: 2 per thread) are computed in advance.
 
-    An error of `make` is raised where its item comes up.
+    An exception of `make` is raised at the position of its item.
     """
     waiting = iter(items)
     with ThreadPoolExecutor(threads) as pool:

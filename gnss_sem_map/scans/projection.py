@@ -1,4 +1,4 @@
-"""From pixels to points: which pixel each map point was seen in, at the moment the image was exposed (eq. 3 to 5)."""
+"""Projection of map points into the image at its moment of exposure, with occlusion (eq. 3 to 5)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_SHRINK = 8
 
 
 class LabellingSettings(BaseModel):
-    """How points find their pixels, and how far a pixel is believed."""
+    """How points get the class probabilities of pixels."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -29,32 +29,37 @@ class LabellingSettings(BaseModel):
         0.05,
         ge=0.01,
         le=0.5,
-        description="No class gets less probability than this from one look (whole percent).",
+        description="Least probability of a class in one observation (whole percent).",
     )
     occlusion_rows_px: int = Field(
-        7, ge=1, le=101, description="Height of the window in which a nearer point hides a farther one (odd)."
+        7,
+        ge=1,
+        le=101,
+        description="Height of the window in which a nearer point occludes a farther one (odd).",
     )
     occlusion_columns_px: int = Field(5, ge=1, le=101, description="Width of that window (odd).")
     occlusion_ratio: float = Field(
-        0.05, ge=0, description="A point is visible up to this share behind the nearest,"
+        0.05,
+        ge=0,
+        description="A point is visible if its depth exceeds the least in the window by up to this share,",
     )
     occlusion_m: float = Field(0.3, ge=0, description="plus this distance.")
     abstain: bool = Field(
         False,
-        description="A pixel where `other` wins says nothing; by default its five classes share its vote.",
+        description="Ignore pixels that are most probably `other`; by default the other classes share their vote.",
     )
     image_within_s: float = Field(
-        0.06, gt=0, description="A scan takes labels from an image at most this far in time."
+        0.06, gt=0, description="Largest time difference between a scan and its image."
     )
     camera_time_offset_s: float | None = Field(
         None,
-        description="Moment of exposure minus image stamp; default: what the drive's format is known to have.",
+        description="Moment of exposure minus image stamp; default: the known offset of the drive's format.",
     )
 
 
 @dataclass(frozen=True, eq=False)
 class ClassImage:
-    """What a network saw in one image, in the map's classes."""
+    """Class probabilities of one image, in the map's classes."""
 
     seen: NDArray[np.uint8] | LabelImage
     """(h, w, c + 1), round(255 p); `other` last. Or a label image of the same classes."""
@@ -74,11 +79,11 @@ class ClassImage:
 
     @property
     def rows(self) -> NDArray[np.uint8]:
-        """The same pixels as one list, (h w, c + 1)."""
+        """Probabilities of the flattened pixels, (h w, c + 1)."""
         return self.probabilities.reshape(-1, self.probabilities.shape[2])
 
     def at(self, pixels: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The probabilities (m, c + 1) of some pixels of that list: however the image lies in memory, only these."""
+        """Probabilities (m, c + 1) of some flattened pixels; for any memory layout only these are copied."""
         if isinstance(self.seen, LabelImage):
             return np.take(self.seen.table, np.take(self.seen.ids, pixels), axis=0)
         classes = np.empty((len(pixels), self.seen.shape[2]), np.uint8)
@@ -88,18 +93,20 @@ class ClassImage:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The image's camera at the moment of exposure, and room for what falls into it: see `scan_kernels.project`."""
+    """Camera at the moment of exposure, with the buffers of the projection: see `kernels.project`."""
 
     P: NDArray[np.float64]
-    """(3, 4), from the map to pixels."""
+    """(3, 4): projection from the map to pixels."""
     inside: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]
-    """Points, columns, lines, depths: (n,) each, of which the first few are filled."""
+    """Points, columns, lines, depths: (n,) each, partly filled."""
     nearest: NDArray[np.float32]
     """(h, w) m; empty where there is no image."""
 
 
 def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int, over: View | None = None) -> View:
-    """Room for the `n` points of a scan in an image of (width, height): that of the view `over`, if it is enough."""
+    """Buffers for the `n` points of a scan in an image of (width, height); those of `over` are reused if large
+    enough.
+    """
     if over is not None and over.nearest.shape == size[::-1] and len(over.inside[0]) >= n:
         over.nearest.fill(np.inf)
         return View(P, over.inside, over.nearest)
@@ -109,7 +116,7 @@ def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int, over: View | 
 
 
 NO_VIEW = view_of(np.zeros((3, 4)), (0, 0), 0)
-"""Where there is no image."""
+"""View without an image."""
 
 
 def class_image(
@@ -119,7 +126,7 @@ def class_image(
     image_size: tuple[int, int],
     where: str,
 ) -> ClassImage:
-    """Sum a network's classes by name into the map's, and find the scale against the camera image.
+    """Sum the classes of a network, by name, into those of the map, and find the scale to the camera image.
 
     `probabilities` (h, w, s): uint8 as round(255 p), or floating in 0..1; (h, w) the camera image's size or that size
     divided by an integer and rounded down. Raises DataError for another size, ConfigError for an unknown class name.
@@ -162,9 +169,9 @@ def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSe
 def view_at(
     stamp: float, trajectory: Trajectory, calibration: Calibration, n: int, over: View | None = None
 ) -> View:
-    """The camera at the moment `stamp`, with room for `n` points; raises DataError when the drive has none.
+    """Camera at the moment `stamp`, with buffers for `n` points; raises DataError for a drive without camera.
 
-    Writes over an earlier view, if one is given: fresh memory costs more than what is done with it.
+    The buffers of the earlier view `over` are reused: allocating memory costs more than the projection.
     """
     if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
         raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
@@ -176,11 +183,11 @@ def view_at(
 def visible(
     view: View, inside: int, classes: ClassImage, settings: LabellingSettings
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Of the `inside` points in the image those that are not hidden (p,), and the pixel of `classes` that each saw.
+    """The visible ones (p,) of the `inside` points in the image, and the pixel of `classes` of each.
 
-    A point is hidden when another one of the same scan, in a window around its pixel that fits the LiDAR's spacing, is
-    nearer by more than the tolerance (real data: 7 x 5 px, 5 % + 0.3 m; the exact pixel alone hides nothing, for the
-    LiDAR is sparser than the image).
+    A point is occluded when another point of the same scan, in a window around its pixel, is nearer by more than the
+    tolerance. The window fits the spacing of the LiDAR, which is sparser than the image (7 x 5 px, 5 % + 0.3 m on real
+    data). Eq. 5 keeps the nearest point of each pixel instead.
     """
     (height, width), (class_height, class_width) = view.nearest.shape, classes.size
     points, columns, lines, depths = view.inside
@@ -202,7 +209,7 @@ def pixels_seen(
     classes: ClassImage,
     settings: LabellingSettings,
 ) -> NDArray[np.int32]:
-    """For every map point (n, 3) the row of `classes.rows` that it was seen in at `stamp`, or -1: see `visible`."""
+    """For every map point (n, 3) m its flattened pixel in `classes` at `stamp`, or -1 if not visible: see `visible`."""
     view = view_at(stamp, trajectory, calibration, len(p_map))
     x, y, z = np.ascontiguousarray(p_map.T)
     inside = kernels.project(

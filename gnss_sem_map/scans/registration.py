@@ -1,4 +1,4 @@
-"""What a registration by `small_gicp` is worth: which directions the scene holds, and which it leaves open."""
+"""Covariance of a registration by `small_gicp`, and its degenerate directions."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-# small_gicp takes every point for a small plane of variances (1e-3, 1, 1) m² along and across its normal. Two of
-# them weigh at least 1/2 in any direction, even along both planes, where nothing is known; and 500 across.
+# small_gicp models every point as a small plane with variances (1e-3, 1, 1) m² along and across its normal. A pair of
+# them has a weight of at least 1/2 in any direction, even along both planes, where nothing is known; 500 across.
 TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
 MAX_ITERATIONS = 30
 
 
 def has_converged(result: small_gicp.RegistrationResult) -> bool:
-    """Whether it ended at a minimum, or at its limit, not stuck before."""
+    """Whether the registration converged, or stopped before the limit of iterations."""
     return bool(result.converged or result.iterations < MAX_ITERATIONS - 1)
 
 
 def information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
-    """What the planes of the scene tell of the pose: (6, 6), source axes, and the weight of one point across its plane.
+    """Information matrix (6, 6) of the pose in source axes from the planes only, and the sum of their normal weights.
 
-    The registration's own Hessian also holds the weight that it gives along the planes. That is no knowledge of the
-    pose: the centre of a voxel's points lies anywhere on its wall. So it is taken off, for T p with
-    T Exp(r, t): J = [-R [p]x, R]. Residuals of another size than small_gicp presumes rescale the rest.
+    The Hessian of the registration also contains the weight along the planes. That is no information about the pose:
+    the mean of a voxel's points lies anywhere on its wall. So it is subtracted, with J = [-R [p]x, R] of T p for T
+    Exp(r, t). The rest is rescaled by the size of the residuals.
     """
     p = np.asarray(points.points())[:, :3]
     along = np.zeros((6, 6))
@@ -47,11 +47,11 @@ def close_open_directions(
     degenerate_share: float,
     degenerate_stddev_m: float,
 ) -> tuple[Array, Array, bool]:
-    """Pose and covariance (6, 6) of a match, and whether any direction is open: along those the guess stays.
+    """Pose and covariance (6, 6) of a match, and whether any direction is degenerate: along those the guess is kept.
 
-    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length_m`, so that they
-    compare with translations. A direction is open when its information is below a share of `weight`, that of all
-    points across their planes; its standard deviation is then the given one.
+    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length_m`, so that they are
+    comparable with translations. A direction is degenerate when its information is below a share of `weight`, that of
+    all points across their planes; its standard deviation is then `degenerate_stddev_m`.
     """
     scale = np.repeat([length_m, 1.0], 3)
     eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
@@ -65,7 +65,7 @@ def close_open_directions(
 
 
 def rigid(T: Array) -> Array:
-    """The nearest rigid transform: products of many drift off the rotations by rounding."""
+    """The nearest rigid transform: corrects the rounding errors of products of many transforms."""
     result = np.eye(4)
     result[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
     result[:3, 3] = T[:3, 3]

@@ -1,4 +1,4 @@
-"""Image in, class probabilities out: what a segmenter is, and how one is opened.
+"""Segmentation: from images to class probabilities. Defines what a segmenter is, and opens one from its SPEC.
 
 Cheap to import: torch, transformers and onnxruntime are imported by the segmenter that needs them, when it is opened.
 """
@@ -21,7 +21,7 @@ from gnss_sem_map.sensor_log import Image
 
 
 class Segmenter(Protocol):
-    """Whatever gives every pixel of a camera image its class probabilities."""
+    """Computes class probabilities for every pixel of a camera image."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -29,7 +29,7 @@ class Segmenter(Protocol):
         ...
 
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
-        """Probabilities (h, w, c): uint8 as round(255 p), or float32 in 0..1; all zero where nothing is known.
+        """Probabilities (h, w, c): uint8 as round(255 p), or float32 in 0..1; all zero for void pixels.
 
         (h, w) is the image's size, or that size divided by an integer and rounded down. Raises DataError.
         """
@@ -37,7 +37,7 @@ class Segmenter(Protocol):
 
 
 class MissingLabels(DataError):
-    """The segmenter has nothing for this one frame; the map goes on without its labels."""
+    """The segmenter has no labels for this frame; mapping continues without them."""
 
 
 SCHEMES = {
@@ -48,19 +48,19 @@ SCHEMES = {
     "python": "python:package.module:callable[?classes=..]",
     "demo": "demo (for the simulator's images only)",
 }
-"""How a segmenter is asked for, by the word before the colon."""
+"""Syntax of the SPEC of a segmenter, by the word before the colon."""
 
 LONGEST_SPEC = 1000
 
 DEMO_NETWORK = Path(__file__).parent / "demo_network" / "network.safetensors"
-"""Trained on simulated streets; its README says how, and how well."""
+"""Trained on simulated streets; see its README."""
 
 DEMO_CALIBRATION = DEMO_NETWORK.with_name("calibration.yaml")
-"""What that network's answers were worth on two other simulated streets: for `--set calibration=FILE`."""
+"""Confusion model of that network, from two other simulated drives: for `--set calibration=FILE`."""
 
 
 def no_segmenter_message(drive: str) -> str:
-    """What to do for a drive of real streets that has no labels: three networks, how to get them, their licences."""
+    """Help text for a drive without labels: three networks for real streets, how to get them, their licences."""
     lines = [f"{drive}: no segmenter given and no labels found; the map needs one of, for instance:"]
     for model, about in (
         ("tue-mps/cityscapes_semantic_eomt_large_1024", "EoMT, best, wants a GPU; MIT licence"),
@@ -85,7 +85,7 @@ def no_segmenter_message(drive: str) -> str:
 def open_segmenter(
     spec: str, label_set: LabelSet, device: str = "auto", expected_size: tuple[int, int] | None = None
 ) -> Segmenter:
-    """Open a segmenter from its one-line description, and try what can be tried before the drive begins.
+    """Open a segmenter from its SPEC, and check as much as possible before the run starts.
 
     `spec` is one of `SCHEMES`; `expected_size` (width, height) is the camera's, px; `device` is auto, cpu, cuda or a
     torch device. Raises ConfigError for a wrong description, DataError for files that are not what they must be.

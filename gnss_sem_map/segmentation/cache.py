@@ -1,4 +1,4 @@
-"""Class probabilities once, for all later runs: one small file per frame, which `labels:` reads."""
+"""Class probabilities on disk: one file per frame, written once and read by all later runs as `labels:FOLDER`."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.files.output_folder import locked, real_path
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
 
 ABOUT = "about.json"
-"""Says who wrote a cache; frames of two segmenters are not mixed."""
+"""Names the segmenter of a cache; frames of two segmenters are not mixed."""
 
 
 PARTIAL = re.compile(r"\.(\d+\.npz|about\.json)\.\d+\.part")
-"""Files that were being written when somebody killed us."""
+"""Unfinished files of a process that was killed."""
 
 STEP = 3
-"""Probabilities are kept to 3/255: no network knows them better, and the files are a third smaller."""
+"""Probabilities are rounded to 3/255, less than the error of any network: the files are a third smaller."""
 
 
 @runtime_checkable
 class BatchSegmenter(Protocol):
-    """A segmenter that sees several images in one go."""
+    """A segmenter that processes several images in one batch."""
 
     def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
         """Class probabilities (h, w, c) of every image."""
@@ -47,21 +47,21 @@ class BatchSegmenter(Protocol):
 
 @runtime_checkable
 class ThreadedSegmenter(Protocol):
-    """A segmenter that answers sooner when several threads ask, each for an image of its own."""
+    """A segmenter that is faster when several threads call it, each with its own image."""
 
     @property
     def threads(self) -> int:
-        """How many should ask."""
+        """Number of threads."""
         ...
 
     def on_one_core(self, image: Image) -> NDArray[np.float32]:
-        """Class probabilities (h, w, c) of one image, by the asking thread alone."""
+        """Class probabilities (h, w, c) of one image, computed by the calling thread alone."""
         ...
 
 
 @dataclass(frozen=True)
 class CacheReport:
-    """What writing a cache came to."""
+    """Result of `write_cache`."""
 
     written: int
     kept: int
@@ -83,8 +83,8 @@ def write_cache(
     """Segment every image that has no file in `folder` yet, and write `<number>.npz`: 8 bits per class and pixel.
 
     Classes are summed by name into those of `label_set` and `other`. A KITTI image at half its size takes 70 to 130 kB.
-    Every file appears whole or not at all, so an interrupted call is simply made again. `description` (the
-    segmenter's SPEC) must be the one that began the folder. Frames whose image is damaged are skipped and reported.
+    Files are written atomically, so an interrupted call can be repeated. `description` (the segmenter's SPEC) must be
+    that of the first call for the folder. Frames with a damaged image are skipped and reported.
     Raises ConfigError for a folder of another segmenter, DataError when it cannot be written or nothing was segmented.
     """
     with _for_us_alone(folder):
@@ -109,10 +109,11 @@ def _write_all(
         lost: list[Skip] = []
         seen = _segment(batch, segmenter, lost, threads > 1)
         small = ((image, quantised(each, segmenter.class_names, label_set)) for image, each in seen)
-        return [_write(_file(folder, image), each, label_set) for image, each in small], lost
+        names = (*label_set.names, OTHER)
+        return [write_probabilities(_file(folder, image), each, names) for image, each in small], lost
 
     batches = (waiting[i : i + batch_size] for i in range(0, len(waiting), batch_size))
-    for _, (written, lost) in ahead(make, batches, threads, under_way=threads):
+    for _, (written, lost) in prefetch(make, batches, threads, under_way=threads):
         sizes += written
         skips += lost
         progress("segmenting", kept + len(sizes) + len(skips), len(images))
@@ -136,7 +137,7 @@ def quantised(
 def _segment(
     batch: list[Image], segmenter: Segmenter, skips: list[Skip], on_one_core: bool
 ) -> Iterator[tuple[Image, NDArray[np.uint8] | NDArray[np.float32]]]:
-    """All at once where the segmenter can; one by one where it cannot, or where one of them is damaged."""
+    """Segment a batch at once if the segmenter can; one by one if it cannot, or if one image is damaged."""
     if isinstance(segmenter, BatchSegmenter) and len(batch) > 1:
         try:
             yield from zip(batch, segmenter.segment_many(batch), strict=True)
@@ -155,7 +156,7 @@ def _segment(
 
 @contextmanager
 def _for_us_alone(folder: Path) -> Iterator[None]:
-    """Two calls do not write one folder at the same time."""
+    """Lock the folder: two calls do not write it at the same time."""
     real = real_path(folder)
     try:
         real.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +185,7 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
     found = read_json(file)
     if found != about:
         raise ConfigError(
-            f"cache {folder}: was begun with {found}, now asked for {about}; choose another folder"
+            f"cache {folder}: was begun with {found}, now called with {about}; choose another folder"
         )
 
 
@@ -192,13 +193,14 @@ def _file(folder: Path, image: Image) -> Path:
     return folder / f"{image.number:010d}.npz"
 
 
-def _write(path: Path, probabilities: NDArray[np.uint8], label_set: LabelSet) -> int:
+def write_probabilities(path: Path, probabilities: NDArray[np.uint8], class_names: Sequence[str]) -> int:
+    """Write the `.npz` that `cached.read_probabilities` reads, atomically; returns its bytes. Raises WriteError."""
     content = io.BytesIO()
-    np.savez_compressed(content, probabilities=probabilities, class_names=np.array([*label_set.names, OTHER]))
+    np.savez_compressed(content, probabilities=probabilities, class_names=np.array(class_names))
     try:
         write_whole(path, content.getvalue())
         return path.stat().st_size
     except OSError as error:
-        raise DataError(
-            f"{path}: cannot be written ({error.strerror}); free some space and run again"
+        raise WriteError(
+            f"{path}: cannot be written ({error.strerror}); free some space and run again; `run` with --resume"
         ) from None

@@ -1,4 +1,4 @@
-"""Class probabilities that are already on disk: one file per frame, found by the frame number in its name."""
+"""Segmenter that reads class probabilities from disk: one file per frame, found by the frame number in its name."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from gnss_sem_map.segmentation import MissingLabels
 from gnss_sem_map.sensor_log import Image
 
 HARD_LABEL_PROBABILITY = 0.9
-"""What a label image's class gets; the rest is spread evenly over the other classes, for no network is always right."""
+"""Probability of the class of a label image; the rest is spread evenly over the other classes."""
 MOST_TRIED = 20
-"""Files, from all over the folder, that are tried before it is given up."""
+"""Number of files, spread over the folder, that are tried before it is refused."""
 
 MOST_NAME_BYTES = 1 << 20
 
@@ -63,7 +63,7 @@ class CachedLabels:
         return seen.probabilities if isinstance(seen, LabelImage) else seen
 
     def kept(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
-        """What `__call__` gives, but a label image as it is: most of its pixels are never asked for."""
+        """The result of `__call__`, with a label image not expanded: most of its pixels are never used."""
         path = self._files.get(image.number)
         if path is None:
             raise MissingLabels(

@@ -1,4 +1,4 @@
-"""RefineNet weights on disk: only tensors are read, never code, and they must fit the network to the last one."""
+"""RefineNet weights on disk: only tensors are read, never code, and all of them must fit the network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 
 METADATA = "gnss_sem_map"
-"""The entry of a safetensors file that holds what we know beyond the tensors, as JSON."""
+"""The entry of a safetensors file with what is stored besides the tensors, as JSON."""
 
 LOAD_ERRORS = (
     pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, IndexError,
@@ -39,7 +39,7 @@ WRAPPERS = ("state_dict", "model", "network", "segmenter")
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """The tensors of a file, and what it says about them."""
+    """The tensors of a file, and its metadata."""
 
     path: Path
     tensors: dict[str, Tensor]

@@ -1,4 +1,4 @@
-"""What the channels of a network are called: from the user's own words, or from how many there are."""
+"""Class names of the channels of a network: given by the user, or derived from their number."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.labels.label_set import LabelSet, taxonomy
 
 VOID = "void"
-"""A channel of this name is dropped before the softmax: it was never trained to mean anything."""
+"""A channel of this name is dropped before the softmax: it has no class."""
 
 BY_COUNT = {6: "kitti6", 11: "camvid", 19: "cityscapes"}
 """Published street networks with that many classes have these, in the order of their ids."""

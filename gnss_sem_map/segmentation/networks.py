@@ -52,11 +52,11 @@ class NetworkSegmenter:
 
     @property
     def threads(self) -> int:
-        """How many should ask at once: one per core, for cores that share an image wait; one for a GPU."""
+        """Number of threads: one per core on a CPU, where cores that share an image would wait; one on a GPU."""
         return torch.get_num_threads() if self._device.type == "cpu" else 1
 
     def on_one_core(self, image: Image) -> NDArray[np.float32]:
-        """Class probabilities (h, w, c) of one image, by the asking thread alone."""
+        """Class probabilities (h, w, c) of one image, computed by the calling thread alone."""
         torch.set_num_threads(1)  # of this thread
         return self(image)
 
@@ -117,8 +117,8 @@ def enough_memory(device: torch.device, advice: str) -> Iterator[None]:
 
 
 def for_inference(network: nn.Module, device: torch.device) -> nn.Module:
-    """The network on its device, ready to answer and no longer to learn: each normalisation is part of the convolution
-    before it, which gives the same logits up to rounding, in two thirds of the time on a processor."""
+    """The network on its device, for inference only: each normalisation is fused into the convolution before it, which
+    gives the same logits up to rounding, in two thirds of the time on a CPU."""
     for module in list(network.eval().modules()):
         for (before, convolution), (name, norm) in pairwise(list(module.named_children())):
             if isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):

@@ -1,4 +1,4 @@
-"""Camera pixels on their way into a network."""
+"""Preparation of camera pixels for a network."""
 
 from __future__ import annotations
 

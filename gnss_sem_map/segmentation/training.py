@@ -47,7 +47,7 @@ from gnss_sem_map.segmentation.training_data import (
 )
 
 NETWORK, STATE, LOG = "network.safetensors", "state.pt", "log.csv"
-"""Files of a training's folder: the best weights so far, what resuming needs, and one row per validation."""
+"""Files in the folder of a training: the best weights so far, the state for resuming, and one row per validation."""
 
 
 class TrainingSettings(BaseModel):
@@ -89,7 +89,7 @@ class TrainingSettings(BaseModel):
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What a training came to."""
+    """Result of a training."""
 
     network: Path
     """Safetensors file for `refinenet:`, the best of all validations."""

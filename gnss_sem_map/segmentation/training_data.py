@@ -1,4 +1,4 @@
-"""Images with their label images, cut, stretched, mirrored and recoloured: what a network learns from."""
+"""Training data: images with label images, augmented by cropping, scaling, mirroring and colour changes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
 from gnss_sem_map.segmentation.cached import read_class_ids
 
 IGNORE = 255
-"""Truth of a pixel that nothing is learnt from."""
+"""Label of pixels that are ignored in training."""
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -30,7 +30,7 @@ class LabelledFolder:
     images: Path
     labels: Path
     every: int = 1
-    """Of the images in the order of their names, every so manieth is used: neighbours in a drive are much alike."""
+    """Use every n-th image, in the order of names: consecutive images of a drive are very similar."""
 
     @classmethod
     def parse(cls, text: str) -> LabelledFolder:
@@ -133,7 +133,7 @@ def augmented(
     scales: tuple[float, float],
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """A random cut of (width, height) `crop` at a random scale, mirrored every other time, in another light.
+    """A random crop of (width, height) at a random scale, mirrored with probability 1/2, with changed colours.
 
     Scales are drawn evenly in their logarithm; what lies outside a small image is black and IGNORE.
     """

@@ -1,27 +1,27 @@
-"""A town to drive through, and the sensors of a car that does: KITTI raw drives with exact truth.
+"""Simulation of a town, a vehicle and its sensors: drives in KITTI raw format with exact truth.
 
 `simulate(folder, seconds, seed)` writes one drive; `prepare(seconds, seed)` builds the same in memory, and its
 `scan(k)` and `image(k)` render single frames. The same seed gives the same bytes, whatever the number of threads.
 
 How the drive's sensors measure (KITTI's conventions, where they were measured on the real data):
 
-- A sweep begins behind the car and turns clockwise; a point of azimuth a is of the time
+- A sweep begins behind the car and turns clockwise; a point of azimuth a has the stamp
   start + (0.5 - a / 2 pi) (end - start), and a scan's stamp is the middle. Files hold ring after ring, azimuth
-  increasing from 0. Points are not motion-compensated; whatever moves is hit where it is at the ray's own time.
+  increasing from 0. Points are not motion-compensated; moving objects are at their position of the ray's own time.
 - An image is exposed 2 ms after its scan's stamp and stamped 10.5 ms after it: exposure = stamp - 8.5 ms.
 - oxts rows of the drive follow the scans by 10.7 to 22.6 ms, jittering; the `_extract` twin has all rows, 100 Hz.
-  The position is wrong by a slowly drifting 0.35 m (0.5 m up), as `pos_accuracy` says.
+  The position error drifts slowly, 0.35 m (0.5 m up), as `pos_accuracy` says.
 
-What lies in `truth/` in the drive's folder (stamps in s since the first row of the drive's oxts, positions in m, east,
-north, up of the LocalFrame at that row's position):
+Files in `truth/` in the drive's folder (stamps in s since the first row of the drive's oxts, positions in m: east,
+north, up in the LocalFrame at that row's position):
 
 - `world.json`: `epoch_ns` (Unix time of stamp zero), `lat_deg`, `lon_deg`, `alt_m` (the LocalFrame), `seed`.
 - `trajectory.tum` (100 Hz) and `trajectory_lidar.tum` (at the scans' stamps): T_map_imu, `stamp tx ty tz qx qy qz qw`.
-- `labels/<frame>.label`: SemanticKITTI, uint32 per point: class in the low 16 bits (252 and above for whoever moves at
-  any time of the drive, also while waiting), instance in the high ones.
+- `labels/<frame>.label`: SemanticKITTI, uint32 per point: class in the low 16 bits (252 and above for objects that move
+  at any time of the drive, also while they wait), instance in the high ones.
 - `train_ids/<frame>.png`: the class image, Cityscapes trainIds, 255 void (parking bays). Sky is 10.
-- `single_frame/<frame>.label`: what that image alone says of each point it shows (40 48 10 50 70), 0 elsewhere.
-- `vehicles.csv`: everybody within 120 m at every scan's stamp: middle of the bottom, yaw, size, moving or not.
+- `single_frame/<frame>.label`: class of each visible point in that image alone (40 48 10 50 70), 0 elsewhere.
+- `vehicles.csv`: all vehicles within 120 m at every scan's stamp: centre of the bottom, yaw, size, moving or not.
 """
 
 from gnss_sem_map.simulation.camera import Camera as Camera

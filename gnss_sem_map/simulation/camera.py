@@ -8,12 +8,12 @@ import numpy.typing as npt
 
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
 from gnss_sem_map.simulation.ground import FAR, to_town
-from gnss_sem_map.simulation.hits import surface_at
+from gnss_sem_map.simulation.id_buffer import pixel_ray, see
 from gnss_sem_map.simulation.noise import gaussian, value_noise
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray
+from gnss_sem_map.simulation.surface_at import surface_at
 from gnss_sem_map.simulation.surfaces import TRAIN_IDS
 from gnss_sem_map.simulation.textures import ground_colour, thing_colour
-from gnss_sem_map.simulation.view import pixel_ray, see
 from gnss_sem_map.simulation.world import World
 
 _NEAR_M = 12.0
@@ -48,7 +48,7 @@ class SimulatedImage:
 
 @kernel
 def _sky(dx: float, dy: float, dz: float, sx: float, sy: float, sz: float) -> Triple:
-    """Blue that pales towards the horizon, a few clouds, and the glow around the sun."""
+    """Colour of the sky: blue, paler towards the horizon, with a few clouds and a glow around the sun."""
     up = max(dz, 0.02)
     pale = 1.0 / (1.0 + 6.0 * up)
     r, g, b = 0.28 + 0.62 * pale, 0.45 + 0.47 * pale, 0.80 + 0.14 * pale
@@ -64,7 +64,7 @@ def _sky(dx: float, dy: float, dz: float, sx: float, sy: float, sz: float) -> Tr
 def _openness(
     scene: Scene, thing: int, x: float, y: float, z: float, nx: float, ny: float, nz: float, sun: Triple
 ) -> int:
-    """1 where the sun shines, plus 2 where the sky is open: a car above the ground hides it."""
+    """1 if the sun is visible, plus 2 if the sky is visible: a car above the ground occludes it."""
     x, y, z = x + 0.02 * nx, y + 0.02 * ny, z + 0.02 * nz
     open_sky = thing >= 0 or cast_ray(scene, 1.3, True, 0.5, x, y, z, 0.0, 0.0, 1.0)[0] >= FAR
     facing = nx * sun[0] + ny * sun[1] + nz * sun[2]
@@ -77,7 +77,7 @@ def _openness(
 
 @kernel
 def _light(openness: int, nx: float, ny: float, nz: float, sun: Triple) -> Triple:
-    """Light that arrives at a point: from the sky, bounced from the ground, and from the sun."""
+    """Light at a point: from the sky, reflected by the ground, and from the sun."""
     sky = 0.5 + 0.5 * nz
     bounce = 0.16 * (1.0 - sky)
     r, g, b = _SKY[0] * sky + bounce * 1.1, _SKY[1] * sky + bounce, _SKY[2] * sky + bounce * 0.9
@@ -103,7 +103,7 @@ def _expose(
     depth: Singles,
     light: npt.NDArray[np.int8],
 ) -> None:
-    """Colour what every pixel shows. `lens`: focal length and centre in pixels; `sun`: direction towards it.
+    """Compute the colour of every pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it.
 
     Shadows are traced once for two neighbouring pixels where these show the same shape, near the camera for four.
     """
@@ -153,7 +153,7 @@ def _expose(
 
 @kernel
 def _develop(linear: Singles, gain: float, key: int, display: Bytes, rgb: Bytes) -> None:
-    """From light to bytes: the blur of the optics, vignetting, shot and read noise, the display curve."""
+    """From radiance to bytes: optical blur, vignetting, shot and read noise, gamma curve."""
     height, width, _ = linear.shape
     for v in range(height):
         above, below = max(v - 1, 0), min(v + 1, height - 1)
@@ -200,7 +200,7 @@ def render_image(
     scene, sun = world.scene(stamp, stamp), sun_direction(seed)
     see(scene, T_map_camera, lens, distance, things, shapes)
     _expose(scene, T_map_camera, lens, sun, distance, things, shapes, linear, kinds, depth, light)
-    # the meter looks at the lower half and follows slowly changing light and its own hunting
+    # exposure is metered on the lower half; it follows slow changes of light, with some oscillation
     brightness = max(float(linear[size[0] // 3 :: 4, ::4].mean()), 0.05)
     gain = 0.62 * (0.42 / brightness) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))
     rgb = np.zeros((*size, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Class probabilities as a network would give them, made from true class images: a stand-in until one is at hand.
+"""Simulated segmentation errors: class probabilities as of a network, computed from true class images.
 
 Borders wobble and are blurred, coherent patches take the look-alike for the truth (building and vegetation, road and
 sidewalk, vehicle and what is behind it), and every pixel keeps some doubt. Patches change slowly from frame to frame,
@@ -26,7 +26,7 @@ _CLASSES[[0, 1, 2, 8]] = _ROAD, _SIDEWALK, _BUILDING, _VEGETATION
 _CLASSES[13:18] = _VEHICLE
 
 _FRAMES_PER_PATTERN: Final = 12
-# what each class is taken for, above which value of the noise this begins, and how strongly
+# confusions: the wrong class of each class, the threshold of the noise, and the strength
 _LOOKALIKES: Final = np.array([_SIDEWALK, _ROAD, _OTHER, _VEGETATION, _BUILDING, _BUILDING], np.int64)
 _THRESHOLDS: Final = np.array([0.84, 0.74, 0.84, 0.78, 0.76, 0.78])
 _STRENGTH: Final = 0.78
@@ -78,7 +78,7 @@ def corrupt_class_image(
 ) -> npt.NDArray[np.uint8]:
     """Probabilities of CLASS_NAMES, (h // 2, w // 2, 6) as round(255 p), from a class image (h, w) of trainIds.
 
-    The same arguments give the same bytes; frames that follow each other err in similar places.
+    The same arguments give the same bytes; consecutive frames have errors in similar positions.
     """
     if train_ids.ndim != 2 or train_ids.dtype != np.uint8:
         raise DataError(

@@ -38,7 +38,7 @@ _PLACE = LocalFrame(lat_deg=49.0131, lon_deg=8.4044, alt_m=115.0)
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A drive before it is written: the world, when the sensors measure, and what the navigation unit says.
+    """A drive before it is written: world, times of the measurements, rows of the navigation unit.
 
     Stamps are seconds since the first row of the drive's oxts; the map is the LocalFrame of that row's position.
     """
@@ -89,8 +89,8 @@ class Simulation:
     def project(
         self, frame: int, scan: SimulatedScan
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Floats]:
-        """Pixels u, v and depths of a scan's points in the frame's image: each point where it was at its own stamp,
-        seen from where the camera was at the exposure."""
+        """Pixels u, v and depths of a scan's points in the frame's image: each point at its position of its own stamp,
+        the camera at its pose of the exposure."""
         start, end = self.sweeps[frame]
         columns, column = np.unique(scan.fractions, return_inverse=True)
         stamps = np.append(start + columns * (end - start), self.stamps[frame] + EXPOSURE_AFTER_SCAN_S)
@@ -106,7 +106,7 @@ class Simulation:
 def prepare(
     seconds: float, seed: int, lidar: Lidar | None = None, camera: Camera | None = None
 ) -> Simulation:
-    """Build the town, let everybody drive, and let the navigation unit measure; renders nothing yet."""
+    """Build the town, the traffic and the measurements of the navigation unit; nothing is rendered yet."""
     frames = round(10.0 * seconds)
     if frames < 3:
         raise DataError(
@@ -171,7 +171,7 @@ def simulate(
 
 @contextmanager
 def _for_us_alone(drive: Path) -> Iterator[Path]:
-    """A marked folder beside a drive, to write it in; what an interrupted simulation left there goes."""
+    """A marked work folder beside a drive; the rest of an interrupted simulation in it is removed."""
     partial = drive.with_name(f".{drive.name}.partial")
     try:
         drive.parent.mkdir(parents=True, exist_ok=True)
@@ -193,7 +193,7 @@ def _for_us_alone(drive: Path) -> Iterator[Path]:
 
 
 def _clear(partial: Path) -> None:
-    """Remove an unfinished drive, last of all what says that it is ours."""
+    """Remove an unfinished drive; its ownership marker last."""
     if partial.is_dir():
         for part in ("sync", "extract", "calibration"):
             shutil.rmtree(partial / part, ignore_errors=True)

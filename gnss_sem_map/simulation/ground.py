@@ -45,7 +45,7 @@ def to_town(ground: Ground, x: float, y: float) -> tuple[float, float]:
 
 @inlined
 def street_height(ground: Ground, x: float, y: float) -> float:
-    """Height of the street's sheet, without kerbs."""
+    """Height of the street surface, without kerbs."""
     q = ground.curvature
     return (
         ground.slope[0] * x + ground.slope[1] * y + 0.5 * (q[0] * x * x + 2.0 * q[1] * x * y + q[2] * y * y)
@@ -183,7 +183,7 @@ def _marked(along: float, across: float, half: float, crossing: Floats) -> bool:
 
 @merged
 def ground_surface(ground: Ground, x: float, y: float, kerb_face: bool) -> int:
-    """What the ground is made of at a point that a ray met."""
+    """Material of the ground at the hit point of a ray."""
     if kerb_face:
         return _KERB
     u, v = to_town(ground, x, y)

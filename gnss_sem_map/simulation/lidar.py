@@ -1,9 +1,8 @@
 """A simulated Velodyne HDL-64E: one sweep, every column at its own time.
 
 Conventions of KITTI's raw scans: the sweep begins behind the car (azimuth 180 degrees) and runs clockwise; a point of
-azimuth a is of the time start + (0.5 - a / 2 pi) (end - start), a in (-pi, pi]; the file holds ring after ring from the
-top, azimuth increasing from 0 in each; coordinates are what the sensor measured, not compensated for its own motion,
-in whole millimetres.
+azimuth a has the stamp start + (0.5 - a / 2 pi) (end - start), a in (-pi, pi]; the file holds ring after ring from the
+top, azimuth increasing from 0 in each; coordinates are raw (not motion-compensated), in whole millimetres.
 """
 
 from dataclasses import dataclass, field
@@ -13,17 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
-from gnss_sem_map.simulation.fan import SECTOR, Sweep, Work, list_near, look, room_for
 from gnss_sem_map.simulation.ground import FAR
-from gnss_sem_map.simulation.hits import surface_at
 from gnss_sem_map.simulation.noise import gaussian, uniform
-from gnss_sem_map.simulation.raycast import Scene
+from gnss_sem_map.simulation.raycast import Scene, cast_ray
+from gnss_sem_map.simulation.surface_at import surface_at
 from gnss_sem_map.simulation.surfaces import RAW_IDS, REFLECTANCES, Surface
 from gnss_sem_map.simulation.textures import window_at
 from gnss_sem_map.simulation.world import World
 
 _CABIN, _FACADE = int(Surface.CABIN), int(Surface.FACADE)
-_NOTHING = 255  # the kind of a ray that brought nothing back
+_NOTHING = 255  # the kind of a ray without a return
 
 
 def _hdl_64e() -> Floats:
@@ -61,13 +59,6 @@ class Lidar:
         parts = np.broadcast_arrays(np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
         return np.stack(parts, axis=-1)
 
-    @cached_property
-    def planes(self) -> Floats:
-        """Across, ahead and up of the vertical plane of every column in the LiDAR's axes, (columns, 3, 3)."""
-        c, s, zero = np.cos(self.azimuths), np.sin(self.azimuths), np.zeros(self.columns)
-        rows = [[s, -c, zero], [c, s, zero], [zero, zero, zero + 1.0]]
-        return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
-
 
 @dataclass(frozen=True, eq=False)
 class SimulatedScan:
@@ -82,8 +73,10 @@ class SimulatedScan:
 @kernel
 def _sweep(
     scene: Scene,
-    sweep: Sweep,
-    work: Work,
+    T: Floats,
+    fractions: Floats,
+    directions: Floats,
+    reach: float,
     reflectances: Floats,
     lidar: Triple,
     key: int,
@@ -91,26 +84,25 @@ def _sweep(
     kinds: Bytes,
     things: Integers,
 ) -> None:
-    """Cast all rays of a sweep, column after column; what comes back fills the ray's row, ring after ring.
+    """Cast all rays of a sweep, column by column; a return is written to the ray's row, ring by ring.
 
-    `lidar`: blind range, range noise, dropout. Coordinates are whole millimetres; `kinds` of the others stay.
+    `T` (columns, 4, 4) T_map_lidar, `fractions` (columns,) of the sweep, `directions` (columns, rings, 3) in LiDAR
+    axes. `lidar`: blind range, range noise, dropout. Coordinates are whole millimetres; `kinds` of rays without a
+    return stay.
     """
     blind, noise, dropout = lidar
-    directions, rays, listed = sweep.directions, work.rays, 0
     count = directions.shape[0]
     for column in range(count):
-        if column % SECTOR == 0:
-            listed = list_near(sweep, column, min(column + SECTOR, count), work)
-        look(scene, sweep, column, listed, work)
-        ox, oy, oz = sweep.T[column, 0, 3], sweep.T[column, 1, 3], sweep.T[column, 2, 3]
+        ox, oy, oz, fraction = T[column, 0, 3], T[column, 1, 3], T[column, 2, 3], fractions[column]
         for ring in range(directions.shape[1]):
-            t, thing, shape = work.distance[ring], work.things[ring], work.shapes[ring]
+            x, y, z = directions[column, ring, 0], directions[column, ring, 1], directions[column, ring, 2]
+            dx = T[column, 0, 0] * x + T[column, 0, 1] * y + T[column, 0, 2] * z
+            dy = T[column, 1, 0] * x + T[column, 1, 1] * y + T[column, 1, 2] * z
+            dz = T[column, 2, 0] * x + T[column, 2, 1] * y + T[column, 2, 2] * z
+            t, thing, shape = cast_ray(scene, reach, False, fraction, ox, oy, oz, dx, dy, dz)
             if t >= FAR or t < blind or uniform(key, ring, column, 1) < dropout:
                 continue
-            dx, dy, dz = rays[ring, 0], rays[ring, 1], rays[ring, 2]
-            surface, kind, n, p, _ = surface_at(
-                scene, thing, shape, sweep.fractions[column], ox, oy, oz, dx, dy, dz, t
-            )
+            surface, kind, n, p, _ = surface_at(scene, thing, shape, fraction, ox, oy, oz, dx, dy, dz, t)
             slant = abs(n[0] * dx + n[1] * dy + n[2] * dz)
             chance = uniform(key, ring, column, 2)
             # glass mirrors the beam away, and little comes back from dark ground at a grazing angle
@@ -132,7 +124,7 @@ def _sweep(
 
 @kernel
 def _close_up(fractions: Floats, points: Singles, kinds: Bytes, things: Integers, measured: Floats) -> int:
-    """Move the rows that came back to the front, in order, and say when each was `measured`; returns how many."""
+    """Move the rows with a return to the front, in order, and write their times `measured`; returns their number."""
     count = 0
     for row in range(len(kinds)):
         if kinds[row] != _NOTHING:
@@ -161,14 +153,12 @@ def render_scan(
     lidar = lidar or Lidar()
     scene, fractions = world.scene(start, end), lidar.fractions
     T = world.ego.poses(start + fractions * (end - start)) @ T_imu_lidar
-    fans = lidar.planes @ T[:, :3, :3].transpose(0, 2, 1)
-    sweep = Sweep(T, fans, fractions, lidar.directions, np.tan(lidar.elevations), lidar.range_m)
     rays = lidar.columns * len(lidar.elevations)
     points, measured = np.empty((rays, 4), np.float32), np.empty(rays)
     kinds, things = np.full(rays, _NOTHING, np.uint8), np.empty(rays, np.int32)
     _sweep(
-        scene, sweep, room_for(scene, sweep), REFLECTANCES, (lidar.blind_m, lidar.range_stddev_m, lidar.dropout),
-        seed * 1_000_003 + frame, points, kinds, things,
+        scene, T, fractions, lidar.directions, lidar.range_m, REFLECTANCES,
+        (lidar.blind_m, lidar.range_stddev_m, lidar.dropout), seed * 1_000_003 + frame, points, kinds, things,
     )  # fmt: skip
     count = _close_up(fractions, points, kinds, things, measured)
     labels = hit_labels(world, kinds[:count], things[:count])

@@ -1,4 +1,4 @@
-"""Models of what stands in a town: a handful of shapes each, x forward or along, y left or inwards, z up."""
+"""Models of the things of a town: a few shapes each, x forward or along, y left or inwards, z up."""
 
 from dataclasses import dataclass
 
@@ -151,7 +151,7 @@ def truck() -> Model:
 
 
 def person() -> Model:
-    """Somebody who stands or walks."""
+    """A pedestrian."""
     kind = Kind.PERSON
     limbs = [
         _block((-0.10, 0.08), (s - 0.07, s + 0.07), (0.0, 0.86), Surface.CLOTH, kind) for s in (-0.11, 0.11)
@@ -171,7 +171,7 @@ def person() -> Model:
 
 
 def cyclist() -> Model:
-    """Somebody on a bicycle."""
+    """A cyclist."""
     kind = Kind.CYCLIST
     wheels = [
         _round(Form.AXLE, (x, 0.0, 0.34), (0.34, 0.025, 0.34), Surface.RUBBER, kind) for x in (0.52, -0.52)

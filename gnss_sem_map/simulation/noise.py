@@ -1,4 +1,4 @@
-"""Counter-based randomness: every number is a hash of what it belongs to, so no order of computing changes it."""
+"""Counter-based random numbers: each is a hash of its indices, so the order of computation does not matter."""
 
 import numpy as np
 

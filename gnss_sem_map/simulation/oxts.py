@@ -1,4 +1,4 @@
-"""The navigation unit: what KITTI's oxts files say about an exact motion, 100 times a second.
+"""Simulated navigation unit: KITTI's oxts rows of an exact motion, at 100 Hz.
 
 Like the real unit it reports a fused solution, smooth and wrong by slowly drifting amounts: position by decimetres,
 velocity by centimetres per second, attitude by hundredths of a degree.

@@ -1,8 +1,8 @@
 """One ray through the town: the ground in closed form, everything else through a grid of cells.
 
-A *thing* stands in the map (position, heading, shear that lets it follow a slope, and how these change during one
-sweep) and is made of a run of shapes. A 2D grid lists the things of every cell; a ray walks its cells and stops at
-the first one that it enters behind its best hit. What moves is listed in chains beside the grid, anew for every frame.
+A *thing* is an object in the map (position, heading, shear that lets it follow a slope, and their change during one
+sweep); it consists of a range of shapes. A 2D grid lists the things of every cell; a ray traverses the cells and stops
+at the first cell that it enters behind its nearest hit. Moving things are in linked lists, rebuilt for every frame.
 """
 
 from typing import Final, NamedTuple
@@ -23,7 +23,7 @@ THING_COLUMNS: Final = 22
 
 
 class Scene(NamedTuple):
-    """Everything that a ray may meet during one sweep."""
+    """All things that a ray may hit during one sweep."""
 
     ground: Ground
     things: Floats  # (things, THING_COLUMNS)
@@ -149,7 +149,7 @@ def cast_ray(
 ) -> tuple[float, int, int]:
     """First hit of a ray within `reach`: distance (FAR if none), thing (GROUND or KERB for these), shape.
 
-    A shadow ray asks whether anything stands in its way: any thing will do, and the ground does not count.
+    A shadow ray tests whether any thing is in its way; the ground does not count.
     """
     things, shapes, top, chain = scene.things, scene.shapes, scene.top, scene.chain
     start, members, links = scene.start, scene.members, scene.links

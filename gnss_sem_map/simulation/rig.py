@@ -1,4 +1,4 @@
-"""How the sensors sit on the recording vehicle, and the calibration files that say so."""
+"""Mounting of the sensors on the vehicle, and their calibration files."""
 
 from pathlib import Path
 from typing import Final

@@ -1,4 +1,4 @@
-"""What the town is made of: surfaces (how they look and reflect) and classes (what they are).
+"""Materials of the town: surfaces (appearance and reflectance) and classes.
 
 A shape carries one of each: a wheel's rubber looks the same on a car and on a truck, and means another class.
 """
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 
 class Surface(IntEnum):
-    """How a surface looks to the camera and how strongly it answers the laser."""
+    """Surface: determines the colour in the image and the reflectance for the LiDAR."""
 
     ASPHALT = 0
     MARKING = 1
@@ -41,7 +41,7 @@ class Surface(IntEnum):
 
 
 class Kind(IntEnum):
-    """What a thing is."""
+    """Kind of a thing."""
 
     NOTHING = 0
     ROAD = 1
@@ -91,7 +91,7 @@ RAW_IDS: Final[npt.NDArray[np.uint32]] = np.array([_CODES[kind][:2] for kind in 
 TRAIN_IDS: Final[npt.NDArray[np.uint8]] = np.array([_CODES[kind][2] for kind in Kind], np.uint8)
 """(kinds,): the Cityscapes trainId of a kind; nothing at all is sky, parking is void as in Cityscapes."""
 
-# Share of the laser light that comes back at normal incidence; painted signs and lamps are retro-reflectors.
+# Reflectance at normal incidence; painted signs and lamps are retro-reflectors.
 _REFLECTANCES: Final = {
     Surface.ASPHALT: 0.24,
     Surface.MARKING: 0.62,

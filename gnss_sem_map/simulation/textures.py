@@ -1,4 +1,4 @@
-"""Procedural colours: what share of red, green and blue light a point of a surface throws back."""
+"""Procedural textures: the albedo (red, green, blue) of a point of a surface."""
 
 import numpy as np
 
@@ -173,7 +173,7 @@ def thing_colour(
     clump: float,
     near: float,
 ) -> Colour:
-    """Colour at a point of a thing's model (coordinates and normal in its axes), and how much it mirrors the sky."""
+    """Colour at a point of a thing's model (coordinates and normal in its axes), and how much it reflects the sky."""
     surface = int(shapes[row, 12])
     if surface == _LEAVES:
         light = 0.50 + 0.75 * clump + 1.5 * (value_noise(41, (x + z) * 16.0, (y - z) * 16.0) - 0.45) * near
@@ -213,7 +213,7 @@ def thing_colour(
 def _small_part(
     surface: int, thing: int, r: float, g: float, b: float, y: float, z: float, nx: float
 ) -> Colour:
-    """Everything that is too small to need a pattern of its own."""
+    """Colours of small things without a pattern."""
     if surface == _SIGN:
         return _sign(thing, y, z, nx)
     if surface == _LIGHT:

@@ -35,7 +35,7 @@ _LOT_DEPTH_M = 14.0
 
 @dataclass(frozen=True)
 class Thing:
-    """Something that stands in the town: model number, place in town axes, heading from u, colour, vehicle or not."""
+    """Static thing of the town: model number, position in town axes, heading from u, colour, vehicle or not."""
 
     model: int
     u: float
@@ -47,7 +47,7 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class Town:
-    """Everything that stands still, and the route of the drive through it."""
+    """All static things, and the route of the drive."""
 
     streets: Streets
     route: list[Node]
@@ -72,7 +72,7 @@ class Town:
 
 @dataclass(eq=False)
 class _Builder:
-    """What is being collected while a town is built."""
+    """State of the construction of a town."""
 
     rng: np.random.Generator
     models: list[Model]
@@ -165,7 +165,7 @@ def _patch_table(
 
 
 def _plan(route: list[Node]) -> dict[tuple[tuple[Node, Node], bool], tuple[str, list[str]]]:
-    """What the first streets of the route must show: (street, kerb) -> parking and first lots.
+    """Required content of the first streets of the route: (street, kerb) -> parking and first lots.
 
     A row of cars bumper to bumper, cars on the sidewalk, parking bays, and trees that stand against walls.
     """
@@ -186,7 +186,7 @@ def _plan(route: list[Node]) -> dict[tuple[tuple[Node, Node], bool], tuple[str, 
 
 
 def _line_with_lots(builder: _Builder, side: Side, ground: Ground, first: list[str]) -> None:
-    """Houses, gardens, parks and parking courts behind the sidewalk, one beside the other."""
+    """Houses, gardens, parks and parking areas behind the sidewalk, side by side."""
     rng, w = builder.rng, ground.sidewalk_width
     along, end = (w, side.length - w) if side.deep else (w + _LOT_DEPTH_M, side.length - w - _LOT_DEPTH_M)
     while end - along > 7.0:
@@ -267,7 +267,7 @@ def _court(builder: _Builder, side: Side, along: float, width: float, depth: flo
 
 
 def _furnish(builder: _Builder, side: Side, parking: str, trees: bool) -> None:
-    """What stands along one kerb: parked cars, trees, lamps, signs, bollards."""
+    """Things along one kerb: parked cars, trees, lamps, signs, bollards."""
     rng = builder.rng
     if parking != "none":
         _park_row(builder, side, on_sidewalk=parking == "sidewalk", tight=parking == "tight")

@@ -1,4 +1,4 @@
-"""KITTI's tracklet_labels.xml: boxes of what the camera sees, frame by frame, in the LiDAR's axes."""
+"""KITTI's tracklet_labels.xml: boxes of visible objects per frame, in the LiDAR's axes."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Who moves: the recording vehicle on its route, and the others, none of whom runs into anybody."""
+"""Traffic: the recording vehicle on its route, and other moving objects without collisions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ _CLOTHES: list[Colour] = [
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """A way on the ground of the map: points (k, 3) and their distance along it (k,)."""
+    """A path on the ground of the map: points (k, 3) m and their arc length (k,) m."""
 
     points: Floats
     way: Floats
@@ -39,7 +39,7 @@ class _Path:
         return np.column_stack([np.interp(at, self.way, c) for c in self.points.T])
 
     def nearest(self, point: Floats) -> float:
-        """How far along the way it comes nearest to a point."""
+        """Arc length of the point of the path nearest to a position."""
         return float(self.way[np.argmin(((self.points[:, :2] - point[:2]) ** 2).sum(1))])
 
 
@@ -56,7 +56,7 @@ def _profile(
     stops: Sequence[tuple[float, float]],
     seconds: float,
 ) -> tuple[Floats, Floats]:
-    """Stamps and speeds of somebody who keeps a limit, slows in curves, and waits at stops (way, until stamp)."""
+    """Stamps and speeds on a path with a speed limit, slower in curves, with stops (arc length, until stamp)."""
     way = np.arange(start, path.way[-1] - 0.5, 0.25)
     xy = np.column_stack([np.interp(way, path.way, c) for c in path.points[:, :2].T])
     course = np.unwrap(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
@@ -102,7 +102,7 @@ def _drive(
 
 
 class _Crowd:
-    """Those who are on the road already; a newcomer who would touch one of them is turned away."""
+    """Moving objects placed so far; a new one that would collide with them is refused."""
 
     def __init__(self, town: Town, ego: Motion, seconds: float) -> None:
         self.town, self.stamps = town, np.arange(-EARLY_S, seconds + 0.5, 0.2)
@@ -111,12 +111,12 @@ class _Crowd:
 
     @staticmethod
     def _discs(T: Floats, length: float) -> Floats:
-        """Circles that cover somebody at every stamp: (stamps, 3, 2) centres; all have a radius of about 1 m."""
+        """Circles that cover an object at every stamp: (stamps, 3, 2) centres; all have a radius of about 1 m."""
         ahead = np.array([-0.5, 0.0, 0.5]) * length
         return np.asarray(T[:, None, :2, 3] + ahead[:, None] * T[:, None, :2, 0])
 
     def admit(self, name: str, model: int, colour: Colour, motion: Motion) -> bool:
-        """Take somebody in who keeps clear of all others."""
+        """Add an object if it does not collide with any other."""
         bounds = self.town.models[model].bounds
         mine, radius = (
             self._discs(motion.poses(self.stamps), 0.75 * (bounds[3] - bounds[0])),
@@ -174,7 +174,7 @@ def _length(town: Town, a: Node, b: Node) -> float:
 
 
 def _meet_at_the_light(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
-    """Somebody waits opposite until it is green, and others cross before."""
+    """A vehicle waits on the other side until the light is green, and others cross before."""
     before, here = town.route[0], town.route[1]
     step = (here[0] - before[0], here[1] - before[1])
     across = (-step[1], step[0])

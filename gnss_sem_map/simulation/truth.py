@@ -1,4 +1,4 @@
-"""What really was: trajectory, poses of all vehicles, and what a single image tells of a scan."""
+"""Truth of a drive: trajectory, poses of all vehicles, and the labels of each scan by its image."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +35,7 @@ def write_trajectory(
 
 
 def vehicle_poses(world: World, stamp: float) -> tuple[npt.NDArray[np.int32], Floats]:
-    """Instance numbers (k,) of everybody with one, and x, y, z, yaw (k, 4) of the middle of their bottoms."""
+    """Instance numbers (k,) of all vehicles, and x, y, z, yaw (k, 4) of the centres of their bottoms."""
     rows = world.scene(stamp, stamp).things
     who = np.flatnonzero(world.instances > 0)
     return world.instances[who], rows[who, :4]
@@ -44,7 +44,7 @@ def vehicle_poses(world: World, stamp: float) -> tuple[npt.NDArray[np.int32], Fl
 def write_vehicles(
     path: Path, world: World, stamps: Floats, zero_s: float, to_map: Callable[[Floats], Floats]
 ) -> None:
-    """Who stood or drove where at every scan's stamp: everybody within the LiDAR's range, moving or not."""
+    """Poses of all vehicles within the LiDAR's range at every scan's stamp, moving or not."""
     details = {number: (name, _size(model), moving) for number, name, model, moving in _everybody(world)}
     lines = ["stamp_s,instance,name,moving,x_m,y_m,z_m,yaw_rad,length_m,width_m,height_m\n"]
     for stamp in stamps:
@@ -80,7 +80,7 @@ def _size(model: Model) -> tuple[float, float, float]:
 
 
 def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]]) -> list[Tracklet]:
-    """A tracklet for everybody who is seen, from the first frame to the last one that shows it."""
+    """A tracklet for every visible object, from the first to the last frame that shows it."""
     details = {number: (name, model) for number, name, model, _ in _everybody(world)}
     span: dict[int, tuple[int, int]] = {}
     for frame, shown in enumerate(seen):
@@ -109,7 +109,7 @@ def seen_boxes(world: World, sweeps: Floats, seen: list[npt.NDArray[np.uint16]])
 def seen_alone(
     image: SimulatedImage, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], z: Floats
 ) -> npt.NDArray[np.uint32]:
-    """What the true class image says of every point of its scan: 40 48 10 50 70, and 0 where it shows another thing.
+    """Label of every point of a scan by the true class image: 40 48 10 50 70, 0 where it shows another thing.
 
     `u`, `v`, `z`: the points' pixels and depths. A point counts as seen when the image's true depth there is its own.
     """

@@ -1,4 +1,4 @@
-"""The town with its traffic at a moment: from things and movers to the arrays that rays are cast into."""
+"""The town with its traffic during a sweep, as arrays for ray casting."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ _MARGIN_M = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Mover:
-    """Somebody on the move: model number, colour, exact motion (of the point on the ground below its middle)."""
+    """A moving object: model number, colour, exact motion (of the point on the ground below its centre)."""
 
     name: str
     model: int
@@ -65,7 +65,7 @@ class World:
             self._poses.update(zip(stamps.tolist(), np.stack(poses, axis=1), strict=True))
 
     def scene(self, start: float, end: float) -> Scene:
-        """The scene of a sweep from `start` to `end` (s); what moves does so steadily in between."""
+        """The scene of a sweep from `start` to `end` (s); motion in between is linear."""
         moving = self._moving.copy()
         if self.movers:
             self._move(moving, *(self._poses_at(stamp) for stamp in (start, 0.5 * (start + end), end)))
@@ -81,7 +81,7 @@ class World:
         return np.concatenate([m.motion.poses([stamp]) for m in self.movers]) if known is None else known
 
     def _move(self, rows: Floats, before: Floats, T: Floats, after: Floats) -> None:
-        """Place the movers: where they are in the middle of the sweep, and what changes from start to end."""
+        """Poses of the moving objects in the middle of the sweep, and their change from start to end."""
         yaw = np.unwrap([np.arctan2(t[:, 1, 0], t[:, 0, 0]) for t in (before, T, after)], axis=0)
         ground, (x, y, _) = self.town.ground, T[:, :3, 3].T
         xx, xy, yy = ground.curvature
@@ -93,7 +93,7 @@ class World:
         rows[:, 19] += 0.5 * np.hypot(rows[:, 8], rows[:, 9])
 
     def _make_grid(self) -> None:
-        """List what stands still by the cells that it touches."""
+        """List the static things by the cells that they touch."""
         places = self._still[:, :2]
         self._corner = places.min(0) - _MARGIN_M
         nx, ny = np.ceil((places.max(0) + _MARGIN_M - self._corner) / CELL_M).astype(int)

@@ -1,1 +1,1 @@
-"""The voxel map: integer log-likelihood sums per voxel, in memory and in tiles."""
+"""The voxel map: integer sums of log-likelihoods per voxel, in memory and in tiles."""

@@ -1,4 +1,4 @@
-"""Which of many voxel keys are the same: `np.unique` by a hash table, for keys that mostly repeat."""
+"""`np.unique` with inverse by a hash table: faster where most keys repeat, as the voxel keys of a scan do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ LEAST_BITS = 10
 
 
 def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """The distinct keys in ascending order (u,), and which of them every key (n,) is; as `np.unique` says it."""
+    """The distinct keys (u,) in ascending order, and the index (n,) of every key among them; as `np.unique`."""
     found, numbers = _numbered(keys)
     order = np.argsort(found)
     rank = np.empty(len(found), np.int32)
@@ -20,12 +20,12 @@ def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int
 
 @njit(cache=True, nogil=True)
 def _numbered(keys):
-    """The distinct keys in order of appearance, and the number of each key (n,) among them.
+    """The distinct keys in order of appearance, and the index of each key (n,) among them.
 
-    Neighbours in a scan are neighbours in the world: a key that repeats the one before it needs no look-up.
+    Consecutive points of a scan are often in the same voxel: a key that repeats the one before needs no look-up.
     """
     bits, count = LEAST_BITS, 0
-    table = np.full(1 << bits, -1, np.int32)  # numbers, found by open addressing
+    table = np.full(1 << bits, -1, np.int32)  # indices, found by open addressing
     found, numbers = np.empty(len(keys), np.int64), np.empty(len(keys), np.int32)
     for i in range(len(keys)):
         if i > 0 and keys[i] == keys[i - 1]:
@@ -46,7 +46,7 @@ def _numbered(keys):
 
 @njit(cache=True, nogil=True, inline="always")
 def _slot_of(key, found, table, bits):
-    """Where a key is in the table, or where it would be."""
+    """Slot of a key in the table, or the empty slot for it."""
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h = (h ^ (h >> uint64(29))) * uint64(0xD6E8FEB86659FD93)
     slot = h >> uint64(64 - bits)

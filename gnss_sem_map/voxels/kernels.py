@@ -1,8 +1,8 @@
-"""The compiled loops over voxels: every point of every scan passes through them.
+"""Compiled loops over voxels: fusion (eq. 6), hash table, merging.
 
-All are module-level (numba caches those only), release the GIL, and are exact: sums are integers, minima do not
-depend on order, so any order of scans and any number of threads give the same bits. The readable twin of each is
-the numpy oracle in the tests.
+All are module-level functions (numba caches only those), release the GIL, and are exact: sums are integers and minima
+do not depend on order, so any order of scans and any number of threads give the same bits. The tests hold a numpy
+version of each.
 
 A voxel is one row of a hash table: int64 key, c int32 log-likelihood sums, uint32 hits (32 bytes for five classes,
 half a cache line), found by open addressing with linear probing. Key 0 marks an empty row.
@@ -23,11 +23,11 @@ AXIS_OFFSET = 1 << 20
 """Voxel indices lie in [-2^20, 2^20): +-209 km at 0.2 m."""
 AXIS_MASK = (1 << AXIS_BITS) - 1
 UNITS_PER_NAT = 1024
-"""Log-likelihoods are sums of round(1024 ln p): exact, and finer than any network is right."""
+"""Log-likelihoods are sums of round(1024 ln p): exact, with a resolution far below the errors of any network."""
 EVIDENCE_LIMIT = 1 << 30
-"""No sum may fall below minus this; at the floor of 1 % that is 200,000 looks at one voxel."""
+"""No sum may fall below minus this: 200,000 observations of one voxel at the floor of 1 %."""
 HITS_LIMIT = (1 << 31) - 1
-"""No voxel may count more points than this."""
+"""Most points of one voxel."""
 PREFETCH_AHEAD = 16
 FIRST_SUM = 2
 """Column of the first sum in the int32 view of a row (the key fills the two before it)."""
@@ -35,7 +35,7 @@ FIRST_SUM = 2
 
 @intrinsic
 def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
-    """Ask for a table row before it is needed: a random row of a large map is a cache miss of ~100 ns."""
+    """Prefetch a table row into the cache: a random row of a large map is a cache miss of about 100 ns."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])
@@ -55,8 +55,8 @@ def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
 def _home(key, size):
     """Row where the search for a key begins: a multiplicative hash, scaled to any table size.
 
-    It is always the first of two rows that share a cache line. Rows are in the order of their hash, so that a larger
-    table is filled from front to back, never at random.
+    It is always the first of two rows that share a cache line. Rows are in the order of their hash, so that rehashing
+    into a larger table writes from front to back.
     """
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h ^= h >> uint64(32)
@@ -66,7 +66,7 @@ def _home(key, size):
 
 @njit(cache=True, nogil=True)
 def find_or_insert(rows, key):
-    """Row of a key in a hash table (slots, words), or the empty row where it belongs; one must be empty."""
+    """Row of a key in a hash table (slots, words), or the empty row for it; at least one row must be empty."""
     slot = _home(key, len(rows))
     while rows[slot, 0] != key and rows[slot, 0] != 0:
         slot += 1
@@ -77,7 +77,7 @@ def find_or_insert(rows, key):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def pack_key(x, y, z, voxel_size_m):
-    """Key of the voxel that holds a point, or 0 for one that is NaN or beyond the addressable volume."""
+    """Key of the voxel of a point, or 0 for a point that is NaN or outside of the addressable volume."""
     i = np.floor(x / voxel_size_m) + AXIS_OFFSET
     j = np.floor(y / voxel_size_m) + AXIS_OFFSET
     k = np.floor(z / voxel_size_m) + AXIS_OFFSET
@@ -93,16 +93,16 @@ def pack_keys(p_map, voxel_size_m, keys):
 
 
 @njit(cache=True, nogil=True)
-def fuse(rows, ints, count, capacity, start, keys, pixels, looks, classes):
+def fuse(rows, ints, count, capacity, start, keys, pixels, observations, classes):
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
-    `pixels[i]` is the row of `looks` (p, c) that point i saw, or -1; `classes` are their columns, as a tuple: their
-    number is then known when this is compiled. Returns the number of voxels and the first point that is not in yet,
-    or -1 - i for a point i whose voxel overflows.
+    `pixels[i]` is the row of `observations` (p, c) of point i, or -1 without a pixel; `classes` are the columns, as a
+    tuple, so that their number is known at compile time. Returns the number of voxels and the first point that is not
+    added yet, or -1 - i for a point i whose voxel overflows.
     """
     hits = FIRST_SUM + len(classes)
-    starts, looking = _run_starts(keys, start), np.flatnonzero(pixels >= 0)
-    runs, look = len(starts) - 1, np.searchsorted(looking, start)
+    starts, observed = _run_starts(keys, start), np.flatnonzero(pixels >= 0)
+    runs, next_observed = len(starts) - 1, np.searchsorted(observed, start)
     for run in range(runs):
         if run + PREFETCH_AHEAD < runs:
             _prefetch(rows, _home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
@@ -116,28 +116,28 @@ def fuse(rows, ints, count, capacity, start, keys, pixels, looks, classes):
         if ints[slot, hits] > HITS_LIMIT - (end - first):
             return count, -1 - first
         ints[slot, hits] += end - first
-        while look < len(looking) and looking[look] < end:
-            pixel, lowest = pixels[looking[look]], int64(0)
+        while next_observed < len(observed) and observed[next_observed] < end:
+            pixel, lowest = pixels[observed[next_observed]], int64(0)
             for c in range(len(classes)):
-                ints[slot, FIRST_SUM + c] += looks[pixel, c]
+                ints[slot, FIRST_SUM + c] += observations[pixel, c]
                 lowest = min(lowest, int64(ints[slot, FIRST_SUM + c]))
             if lowest < -EVIDENCE_LIMIT:
-                return count, -1 - looking[look]
-            look += 1
+                return count, -1 - observed[next_observed]
+            next_observed += 1
     return count, len(keys)
 
 
 @njit(cache=True, nogil=True)
 def _run_starts(keys, start):
-    """Where each run of points in one voxel starts, and where the last one ends.
+    """Start of each run of consecutive points in one voxel, and the end of the last one.
 
-    Neighbours in a scan are neighbours in the world: a run is three points long, so a scan asks the table for a third
-    of its points.
+    Consecutive points of a scan are often in the same voxel: a run has three points on average, which saves two thirds
+    of the table look-ups.
     """
     starts = np.empty(len(keys) - start + 1, np.int64)
     runs, previous = 0, int64(0)
     for i in range(start, len(keys)):
-        starts[runs] = i  # kept only if a run starts here: cheaper than a branch that cannot be foreseen
+        starts[runs] = i  # kept only if a run starts here: cheaper than an unpredictable branch
         runs += keys[i] != previous
         previous = keys[i]
     starts[runs] = len(keys)
@@ -146,20 +146,20 @@ def _run_starts(keys, start):
 
 @njit(cache=True, nogil=True)
 def log_likelihoods(
-    probabilities, log_table, log_percent, floor_percent, answers, abstain, classes, looks
+    probabilities, log_table, log_percent, floor_percent, answers, abstain, classes, observations
 ):  # fmt: skip
-    """Find what each pixel adds to the sums of a voxel that is seen in it: `looks` (p, c) in 2^-10 nat.
+    """Log-likelihoods of each pixel, to be added to the sums of a voxel (eq. 6): `observations` (p, c) in 2^-10 nat.
 
     `probabilities` (p, c + 1) uint8: those of the map's `classes`, a tuple of columns, are renormalised without
     `other`, floored, and renormalised again, all in integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table.
-    `answers` (c + 1, c), or (0, c) for none, is added for what is most probable in the pixel, `other` included; with
-    `abstain` a pixel that is most probably `other` says nothing.
+    Of `answers` (c + 1, c), or (0, c) without a confusion model, the row of the predicted class is added, `other`
+    included. With `abstain`, a pixel with the predicted class `other` is ignored.
     """
     other = len(classes)
-    for i in range(len(looks)):
+    for i in range(len(observations)):
         total, answer = int64(0), 0
         for c in range(len(classes)):
-            looks[i, c] = 0
+            observations[i, c] = 0
             total += probabilities[i, c]
         if len(answers) > 0 or abstain:
             for c in range(1, other + 1):
@@ -169,7 +169,7 @@ def log_likelihoods(
                 continue
         if len(answers) > 0:
             for c in range(len(classes)):
-                looks[i, c] = answers[answer, c]
+                observations[i, c] = answers[answer, c]
         if total == 0:
             continue
         floor, denominator = floor_percent * total, int64(0)
@@ -177,12 +177,12 @@ def log_likelihoods(
             denominator += max(100 * int64(probabilities[i, c]), floor)
         log_floor, log_sum = log_table[floor], log_table[denominator]
         for c in range(len(classes)):
-            looks[i, c] += max(log_percent[probabilities[i, c]], log_floor) - log_sum
+            observations[i, c] += max(log_percent[probabilities[i, c]], log_floor) - log_sum
 
 
 @njit(cache=True, nogil=True)
 def rehash(old, new):
-    """Move every voxel of a table into a larger, empty one."""
+    """Copy every voxel of a table into a larger, empty one."""
     for i in range(len(old)):
         if old[i, 0] != 0:
             slot = find_or_insert(new, old[i, 0])
@@ -192,7 +192,7 @@ def rehash(old, new):
 
 @njit(cache=True, nogil=True)
 def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence, hits):
-    """Add two maps, both sorted by key, into room for both; returns how many voxels came out, or -1 on overflow."""
+    """Add two maps, both sorted by key; returns the number of voxels of the result, or -1 on overflow."""
     a, b, to = 0, 0, 0
     while a < len(keys_a) or b < len(keys_b):
         from_a = b == len(keys_b) or (a < len(keys_a) and keys_a[a] <= keys_b[b])
@@ -214,12 +214,12 @@ def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence
 
 
 @njit(cache=True, nogil=True)
-def find(keys, wanted, places):
-    """Place of every wanted key in sorted `keys`, or -1; neighbours in a scan are often the same voxel."""
-    previous_key, previous_place = int64(-1), int64(-1)
+def find(keys, wanted, rows):
+    """Row of every wanted key in the sorted `keys`, or -1; consecutive points of a scan are often in the same voxel."""
+    previous_key, previous_row = int64(-1), int64(-1)
     for i in range(len(wanted)):
         if wanted[i] != previous_key:
             previous_key = wanted[i]
-            place = np.searchsorted(keys, previous_key)
-            previous_place = place if place < len(keys) and keys[place] == previous_key else -1
-        places[i] = previous_place
+            row = np.searchsorted(keys, previous_key)
+            previous_row = row if row < len(keys) and keys[row] == previous_key else -1
+        rows[i] = previous_row

@@ -1,10 +1,10 @@
-"""The map on disk: Parquet tiles of 512 x 512 columns, and `map.json` that says what they mean.
+"""The map on disk: Parquet tiles of 512 x 512 columns of voxels, described by `map.json`.
 
 A tile `x_y.parquet` holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key
-(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the decision for each voxel. A refined map
-counts all hits, and in `hits_removed` those of points that moved; its sums are of what stands. Keys are sorted and
-delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is there, whole, or not
-there; `map.json` knows the checksum of every tile.
+(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the label, confidence and state of each
+voxel. A refined map counts all hits, and in `hits_removed` those of moving objects; its sums are of static objects
+only. Keys are sorted and delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is
+written completely or not at all; `map.json` holds the checksum of every tile.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Z_BITS = 14
 Z_OFFSET = 1 << (Z_BITS - 1)
 FORMAT = 2
 HITS_REMOVED = "hits_removed"
-"""Column of maps in which something moved through voxels that stand."""
+"""Column of maps in which objects moved through static voxels."""
 Tile = tuple[int, int]
 NAME = re.compile(r"(-?\d{1,6})_(-?\d{1,6})\.parquet", re.ASCII)
 
@@ -42,7 +42,7 @@ NAME = re.compile(r"(-?\d{1,6})_(-?\d{1,6})\.parquet", re.ASCII)
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
     """Write a map into a new folder; raises DataError for voxels more than 2^13 above or below the origin."""
     voxels = semantic_map.voxels
-    pieces = ((tile, _piece(semantic_map, places)) for tile, places in _places_by_tile(voxels.keys))
+    pieces = ((tile, _piece(semantic_map, indices)) for tile, indices in _indices_by_tile(voxels.keys))
     write_tiles(pieces, folder, frame, voxels.voxel_size_m, voxels.label_set)
 
 
@@ -53,7 +53,7 @@ def write_tiles(
     voxel_size_m: float,
     label_set: LabelSet,
 ) -> None:
-    """Write a map that comes tile by tile, each tile once, into a new folder: one tile at a time is in memory.
+    """Write a map tile by tile, each tile once, into a new folder: one tile at a time is in memory.
 
     Raises DataError when the folder exists, the disk is full, or a voxel is more than 2^13 above or below the origin.
     """
@@ -84,10 +84,10 @@ def write_tiles(
 def read(
     folder: Path, label_set: LabelSet | None = None, box: tuple[ArrayLike, ArrayLike] | None = None
 ) -> SemanticMap:
-    """Read a map, or only the voxels whose centres lie in a box (low, high), each (3,) m: only its tiles are opened.
+    """Read a map, or the voxels with centres in a box (low, high), each (3,) m; only the tiles of the box are opened.
 
-    Without `label_set` the class set that the map names. Raises DataError when the map is damaged, incomplete, or of
-    another class set.
+    Without `label_set` the class set is the one that the map names. Raises DataError when the map is damaged,
+    incomplete, or of another class set.
     """
     about = _read_about(folder / "map.json")
     label_set = label_set or open_label_set(str(about.get("class_set")))
@@ -109,12 +109,12 @@ def read(
 
 def by_tile(voxels: VoxelMap) -> Iterator[tuple[Tile, VoxelMap]]:
     """The voxels of each tile, tile by tile in order."""
-    for tile, places in _places_by_tile(voxels.keys):
-        yield tile, voxels[places]
+    for tile, indices in _indices_by_tile(voxels.keys):
+        yield tile, voxels[indices]
 
 
-def _places_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
-    """Where in sorted keys the voxels of each tile are, sorted by key."""
+def _indices_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
+    """For each tile the indices of its voxels in the sorted keys, in ascending order."""
     x = keys >> (2 * AXIS_BITS + TILE_BITS)
     y = (keys >> (AXIS_BITS + TILE_BITS)) & ((1 << (AXIS_BITS - TILE_BITS)) - 1)
     found, numbers = np.unique(x << AXIS_BITS | y, return_inverse=True)
@@ -126,13 +126,13 @@ def _places_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.
         yield xy, order[edges[i] : edges[i + 1]]
 
 
-def _piece(semantic_map: SemanticMap, places: NDArray[np.int64]) -> SemanticMap:
+def _piece(semantic_map: SemanticMap, indices: NDArray[np.int64]) -> SemanticMap:
     return SemanticMap(
-        semantic_map.voxels[places],
-        semantic_map.labels[places],
-        semantic_map.confidence[places],
-        semantic_map.states[places],
-        hits_removed=None if semantic_map.hits_removed is None else semantic_map.hits_removed[places],
+        semantic_map.voxels[indices],
+        semantic_map.labels[indices],
+        semantic_map.confidence[indices],
+        semantic_map.states[indices],
+        hits_removed=None if semantic_map.hits_removed is None else semantic_map.hits_removed[indices],
     )
 
 

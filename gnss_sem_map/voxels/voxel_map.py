@@ -1,8 +1,8 @@
-"""The map: a set of voxels with class evidence, in which Bayes' rule (eq. 6) is addition.
+"""The voxel map: class evidence per voxel, fused by addition (Bayes' rule, eq. 6, in logarithms).
 
-Evidence is kept as integer sums of log-likelihoods, so adding is exact: any order of scans, any chunking and
-any merge give the same map, bit for bit. `VoxelTable` collects, `VoxelMap` is the value that comes out, and
-`SemanticMap` is a map with a decision for every voxel.
+Evidence is stored as integer sums of log-likelihoods, so addition is exact: any order of scans, any chunking and any
+merge give the same map, bit for bit. `VoxelTable` is the mutable table that scans are added to, `VoxelMap` its
+immutable result, and `SemanticMap` a map with a label for every voxel.
 """
 
 from __future__ import annotations
@@ -22,47 +22,44 @@ from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, FIRST
 
 SMALLEST_TABLE = 1 << 18
 LARGE_TABLE = 1 << 20
-"""Rows (32 MB for five classes) up to which a table doubles; beyond, it grows by a twelfth and stays under 50 bytes
-per voxel, for growing reads and writes memory in order and is cheap."""
+"""Rows (32 MB for five classes) up to which a table doubles. A larger table grows by a twelfth, to stay under 50 bytes
+per voxel; growing is cheap, for it reads and writes memory in order."""
 HIGHEST_LOAD = 0.7
 ANSWER_SHARE = 0.5
-"""With a calibrated network a look is half its answer's measured meaning and half its probabilities: of all mixtures
-tried on held-out streets the most robust."""
+"""With a confusion model, an observation is half the likelihood of the predicted class and half the probabilities of
+the network: of all mixtures tried on held-out drives this was the most robust."""
 
 
 class MappingSettings(BaseModel):
-    """How points become voxels."""
+    """How points are put into voxels."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
+    voxel_size_m: float = Field(0.2, ge=0.03, le=10, description="Edge of a voxel (the paper: 0.2 m).")
     nearest_m: float = Field(
         2.4,
         ge=0,
-        description="Returns nearer to the LiDAR than this are left out: the car itself (KITTI's reaches that far).",
+        description="Returns nearer to the LiDAR are left out: the vehicle itself (2.4 m on KITTI's).",
     )
-    farthest_m: float = Field(
-        120.0, gt=0, description="Returns farther from the LiDAR than this are left out."
-    )
+    farthest_m: float = Field(120.0, gt=0, description="Returns farther from the LiDAR are left out.")
     scans_per_chunk: int = Field(
         100,
         ge=1,
-        description="Scans that one process maps before it puts them away: its memory, and what an interruption loses."
-        " The map is the same.",
+        description="Scans per chunk: limits memory and the work lost by an interruption. The map is the same.",
     )
 
 
 class State(IntEnum):
-    """Where the label of a voxel comes from."""
+    """Source of the label of a voxel."""
 
     UNOBSERVED = 0
-    """No camera saw it: no label."""
+    """Not visible in any image: no label."""
     OBSERVED = 1
-    """The label is what the fused images say."""
+    """Label of the fused images."""
     INFERRED = 2
-    """No camera saw it; its label comes from its surroundings."""
+    """Not visible in any image; label inferred from its surroundings."""
     REFINED = 3
-    """Refinement changed the label that the images gave."""
+    """Label of the images, changed by refinement."""
     REMOVED = 4
     """Part of something that moved: kept as a layer, not shown in the map."""
     SPLIT = 5
@@ -71,16 +68,16 @@ class State(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class VoxelMap:
-    """Voxels with their evidence; `a + b` merges, `a - b` takes a part out again, `a[mask]` selects."""
+    """Voxels with their evidence; `a + b` merges, `a - b` subtracts a part, `a[mask]` selects."""
 
     voxel_size_m: float
     label_set: LabelSet
     keys: NDArray[np.int64]
     """(v,) packed indices, sorted, unique."""
     evidence: NDArray[np.int32]
-    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no camera saw the voxel."""
+    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no image shows the voxel."""
     hits: NDArray[np.uint32]
-    """(v,) LiDAR points that fell into the voxel."""
+    """(v,) LiDAR points in the voxel."""
 
     def __post_init__(self) -> None:
         v, c = len(self.keys), len(self.label_set.names)
@@ -97,7 +94,7 @@ class VoxelMap:
 
     @classmethod
     def of_rows(cls, rows: NDArray[np.int64], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
-        """The map of table rows (v, words) in any order: key, sums and hits, as `voxel_kernels` lays them out."""
+        """The map of table rows (v, words) in any order: key, sums and hits, in the layout of `voxels.kernels`."""
         rows = rows[np.argsort(rows[:, 0])]
         ints, end = rows.view(np.int32), FIRST_SUM + len(label_set.names)
         return cls(
@@ -109,7 +106,7 @@ class VoxelMap:
         )
 
     def to_rows(self) -> NDArray[np.int64]:
-        """The same voxels as table rows (v, words): 32 bytes each for five classes."""
+        """The voxels as table rows (v, words): 32 bytes each for five classes."""
         rows = np.zeros((len(self), self.words(self.label_set)), np.int64)
         ints, end = rows.view(np.int32), FIRST_SUM + len(self.label_set.names)
         rows[:, 0], ints[:, FIRST_SUM:end], ints[:, end] = self.keys, self.evidence, self.hits
@@ -121,7 +118,7 @@ class VoxelMap:
         return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
 
     def __add__(self, other: VoxelMap) -> VoxelMap:
-        """Both maps' evidence, voxel by voxel; raises DataError for another voxel size or class set."""
+        """Sum of the evidence of both maps per voxel; raises DataError for another voxel size or class set."""
         if self.voxel_size_m != other.voxel_size_m or self.label_set.names != other.label_set.names:
             raise DataError(
                 f"cannot add a map of {other.voxel_size_m} m voxels and classes {list(other.label_set.names)} to one of"
@@ -138,22 +135,20 @@ class VoxelMap:
         return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
 
     def __sub__(self, part: VoxelMap) -> VoxelMap:
-        """What is left of this map without a part that was added to it; raises DataError for what is no part of it."""
-        places = self.places(part.keys)
+        """This map without a part that was added to it; raises DataError if `part` is not a part of it."""
+        rows = self.indices_of(part.keys)
         is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
-        if not is_part or (places < 0).any() or (self.hits[places] < part.hits).any():
-            raise DataError("cannot take one map out of another that does not hold it; were both of one run?")
+        if not is_part or (rows < 0).any() or (self.hits[rows] < part.hits).any():
+            raise DataError("cannot subtract a map that is not part of the other; were both of one run?")
         evidence, hits = self.evidence.copy(), self.hits.copy()
-        evidence[places] -= part.evidence
-        hits[places] -= part.hits
+        evidence[rows] -= part.evidence
+        hits[rows] -= part.hits
         if evidence[hits == 0].any():
-            raise DataError(
-                "cannot take one map out of another that has other evidence; were both of one run?"
-            )
+            raise DataError("cannot subtract a map with other evidence; were both of one run?")
         return replace(self, evidence=evidence, hits=hits)[hits > 0]
 
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
-        """The voxels where a boolean mask holds, or those at increasing places."""
+        """The voxels of a boolean mask (v,), or those at increasing indices."""
         return replace(
             self, keys=self.keys[selection], evidence=self.evidence[selection], hits=self.hits[selection]
         )
@@ -170,21 +165,21 @@ class VoxelMap:
 
     @cached_property
     def observed(self) -> NDArray[np.bool_]:
-        """(v,) whether any camera saw the voxel."""
+        """(v,) whether any image shows the voxel."""
         return np.asarray(self.evidence.any(axis=1))
 
     @cached_property
     def labels(self) -> NDArray[np.int8]:
-        """(v,) most probable class (eq. 7), -1 where no camera saw the voxel."""
+        """(v,) most probable class (eq. 7), -1 where no image shows the voxel."""
         return np.where(self.observed, self.evidence.argmax(axis=1), UNLABELLED).astype(np.int8)
 
     @cached_property
     def probabilities(self) -> NDArray[np.float32]:
-        """(v, c) class probabilities (eq. 6, normalised); even where no camera saw the voxel."""
+        """(v, c) class probabilities (eq. 6, normalised); uniform where no image shows the voxel."""
         return softmax(self.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT))
 
-    def places(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Row of each of these keys in the map, or -1."""
+    def indices_of(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Index (n,) in the map of each voxel key (n,), or -1 where the map has no such voxel."""
         found = np.empty(len(keys), np.int64)
         kernels.find(self.keys, keys, found)
         return found
@@ -192,7 +187,7 @@ class VoxelMap:
 
 @dataclass(frozen=True, eq=False)
 class SemanticMap:
-    """A voxel map with a decision for every voxel: its class, how sure, and where that comes from."""
+    """A voxel map with the label, confidence and state of every voxel."""
 
     voxels: VoxelMap
     labels: NDArray[np.int8]
@@ -202,9 +197,9 @@ class SemanticMap:
     states: NDArray[np.uint8]
     """(v,) of `State`."""
     entropy: NDArray[np.float32] | None = None
-    """(v,) nat, of the class distribution behind `confidence`; None where a map was read from disk."""
+    """(v,) nat: entropy of the class distribution; None for a map that was read from disk."""
     hits_removed: NDArray[np.uint32] | None = None
-    """(v,) how many of the hits are of points that moved; None: those of the removed voxels, and no others."""
+    """(v,) hits of moving objects; None: the hits of the removed voxels, and no others."""
 
     def __post_init__(self) -> None:
         for name, values in (
@@ -219,7 +214,7 @@ class SemanticMap:
 
     @classmethod
     def of(cls, voxels: VoxelMap) -> SemanticMap:
-        """The map as fusion leaves it, before any refinement."""
+        """The fused map, before refinement."""
         probability = voxels.probabilities.max(axis=1, initial=0.0)
         return cls(
             voxels=voxels,
@@ -245,26 +240,26 @@ class SemanticMap:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
-        """(v,) voxels with a label that belong to the map: all but the removed ones."""
+        """(v,) mask of the labelled voxels without the removed ones."""
         return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
 
     @property
     def removed_hits(self) -> NDArray[np.uint32]:
-        """(v,) how many of the hits are of points that moved."""
+        """(v,) hits of moving objects."""
         if self.hits_removed is not None:
             return self.hits_removed
         return np.where(self.states == State.REMOVED, self.voxels.hits, np.uint32(0))
 
     @property
     def standing(self) -> VoxelMap:
-        """What stands: without the removed voxels, and without the hits of what moved through the others."""
-        stands = self.states != State.REMOVED
-        voxels = self.voxels[stands]
-        return replace(voxels, hits=voxels.hits - self.removed_hits[stands])
+        """The static map: without the removed voxels, and without the hits of moving objects in the others."""
+        static = self.states != State.REMOVED
+        voxels = self.voxels[static]
+        return replace(voxels, hits=voxels.hits - self.removed_hits[static])
 
 
 class VoxelTable:
-    """Collects scans into voxels: a hash table that grows, and never loses anything."""
+    """Hash table of voxels that scans are added to; it grows as needed."""
 
     def __init__(
         self,
@@ -274,10 +269,10 @@ class VoxelTable:
         answers: NDArray[np.float64] | None = None,
         abstain: bool = False,
     ) -> None:
-        """`probability_floor`: no class gets less than this from one look, in whole percent (real_data: 0.05).
+        """`probability_floor`: least probability of a class in one observation, in whole percent (real data: 0.05).
 
-        `answers` (c + 1, c) nat, where a network was calibrated: what its answer says of the true class; every look is
-        then half that and half the network's probabilities. `abstain`: a pixel where `other` wins says nothing.
+        `answers` (c + 1, c) nat: the confusion model's log-likelihoods of the true classes for each predicted class;
+        see ANSWER_SHARE. `abstain`: pixels with the predicted class `other` are ignored.
         """
         if not voxel_size_m > 0:
             raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
@@ -307,29 +302,29 @@ class VoxelTable:
         pixels: NDArray[np.int32] | None = None,
         classes: NDArray[np.uint8] | None = None,
     ) -> None:
-        """Add the points of one scan: their voxel keys (n,) and, where a camera saw them, what it saw.
+        """Add the points of one scan: their voxel keys (n,) and their class probabilities (eq. 6).
 
-        `pixels` (n,) is the row of `classes` that each point saw, -1 for none; `classes` (p, c + 1) are uint8
-        probabilities, `other` last. Raises DataError when a voxel's evidence would overflow.
+        `pixels` (n,) is the row in `classes` of each point, -1 for none; `classes` (p, c + 1) are uint8 probabilities,
+        `other` last. Raises DataError when a voxel's evidence would overflow.
         """
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
             classes = np.zeros((0, len(self._columns) + 1), np.uint8)
-        looks = np.empty((len(classes), len(self._columns)), np.int32)
+        observations = np.empty((len(classes), len(self._columns)), np.int32)
         kernels.log_likelihoods(
             classes, self._log_table, self._log_percent, self._floor_percent, self._answers, self._abstain,
-            self._columns, looks,
+            self._columns, observations,
         )  # fmt: skip
         done = 0
         while done < len(keys):
             self._count, done = kernels.fuse(
                 self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
-                keys, pixels, looks, self._columns,
+                keys, pixels, observations, self._columns,
             )  # fmt: skip
             if done < 0:
-                place = unpack(keys[[-1 - done]])[0]
+                voxel = unpack(keys[[-1 - done]])[0]
                 raise DataError(
-                    f"voxel {place.tolist()} was seen so often that its evidence overflows; does the vehicle stand"
+                    f"voxel {voxel.tolist()} was observed so often that its evidence overflows; does the vehicle stand"
                     " there for hours?"
                 )
             if done < len(keys):
@@ -337,16 +332,16 @@ class VoxelTable:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the table takes."""
+        """Size of the table in memory."""
         return self._rows.nbytes
 
     def to_map(self) -> VoxelMap:
-        """Everything collected so far, sorted by key."""
+        """The voxels so far, sorted by key."""
         return VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
 
 
 def _empty_table(size: int, words: int) -> NDArray[np.int64]:
-    """Zeros that begin at a cache line, so that no row of 32 bytes lies across two."""
+    """Zeros, aligned to cache lines, so that no row of 32 bytes lies across two."""
     line = 8  # words of 8 bytes
     memory = np.zeros(size * words + line, np.int64)
     start = -(memory.ctypes.data // 8) % line
@@ -380,7 +375,7 @@ def pack(indices: NDArray[np.integer]) -> NDArray[np.int64]:
 
 @cache
 def log_table(number_of_classes: int, floor_percent: int, share: float = 1.0) -> NDArray[np.int32]:
-    """round(1024 share ln i) for every integer that a floored, normalised uint8 probability can meet; read-only."""
+    """round(1024 share ln i) for every integer i in the normalisation of floored uint8 probabilities; read-only."""
     largest = number_of_classes * max(100 * 255, floor_percent * 255 * number_of_classes)
     numbers = np.arange(largest + 1, dtype=np.float64)
     numbers[0] = 1.0
@@ -390,14 +385,14 @@ def log_table(number_of_classes: int, floor_percent: int, share: float = 1.0) ->
 
 
 def answer_table(answers: NDArray[np.float64] | None, number_of_classes: int) -> NDArray[np.int32]:
-    """The calibrated half of a look in 2^-10 nat, (c + 1, c); no rows where nothing was calibrated."""
+    """The confusion model's share of an observation in 2^-10 nat, (c + 1, c); no rows without a confusion model."""
     if answers is None:
         return np.empty((0, number_of_classes), np.int32)
     return np.asarray(np.rint(ANSWER_SHARE * UNITS_PER_NAT * answers), np.int32)
 
 
 def entropy_of(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Entropy (v,) nat of class distributions (v, c): 0 where one class is certain, ln c where nothing is known."""
+    """Entropy (v,) nat of class distributions (v, c): 0 for a certain class, ln c for a uniform distribution."""
     return np.asarray(-(probabilities * np.log(np.maximum(probabilities, 1e-30))).sum(axis=1), np.float32)
 
 

@@ -94,9 +94,9 @@ def write_run_like(out: Path, files: Mapping[str, str]) -> None:
 def map_street(drive: Path, probabilities: Path, work: Path) -> None:
     """Map a drive in chunks of four scans into a work folder, going on with what is there."""
     from gnss_sem_map.mapping.fusion import map_chunks
-    from gnss_sem_map.run_stats import Account
+    from gnss_sem_map.run_stats import RunStats
 
-    map_chunks(street_drive(drive, probabilities), work, Account(), resume=True)
+    map_chunks(street_drive(drive, probabilities), work, RunStats(), resume=True)
 
 
 def street_drive(drive: Path, probabilities: Path) -> Any:

@@ -27,8 +27,8 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.export.run_folder import about_run, write_point_labels
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.labelled_scans import Drive, SeenScan, seen_scans
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -239,11 +239,11 @@ class Clean:
 
     place: Place
     trajectory: Trajectory
-    seen: dict[int, SeenScan]
+    seen: dict[int, LabelledScan]
 
 
-def look(log: SensorLog, trajectory: Trajectory, segmenter: Segmenter | None) -> dict[int, SeenScan]:
-    return {seen.scan.number: seen for seen in seen_scans(Drive(log, trajectory, segmenter, SETTINGS))}
+def look(log: SensorLog, trajectory: Trajectory, segmenter: Segmenter | None) -> dict[int, LabelledScan]:
+    return {seen.scan.number: seen for seen in labelled_scans(Drive(log, trajectory, segmenter, SETTINGS))}
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +262,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Clean]:
     found = {}
     for place in places:
         log = open_drive(place.drive)
-        trajectory, _ = pipeline.estimate_trajectory(log, SETTINGS, Account())
+        trajectory, _ = pipeline.estimate_trajectory(log, SETTINGS, RunStats())
         found[place.layout] = Clean(place, trajectory, look(log, trajectory, place.segmenter(log)))
     return found
 

@@ -25,7 +25,7 @@ from street import Street
 
 from gnss_sem_map.files.ownership import MARKER, is_partial
 from gnss_sem_map.mapping.fusion import REMOVED, STATIC, build_maps, map_chunks
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 
 OLD = {
     "run.json": "{}",
@@ -118,7 +118,7 @@ def test_the_command_that_puts_it_right_may_be_killed_too(results, trial, tmp_pa
 
 
 def assert_same_chunks(small_drive: Street, work: Path, at_once) -> None:
-    drive, account = street_drive(small_drive.drive, small_drive.labels), Account()
+    drive, account = street_drive(small_drive.drive, small_drive.labels), RunStats()
     store = map_chunks(drive, work, account, resume=True)
     for layer, expected in ((STATIC, at_once[0].static), (REMOVED, at_once[0].removed)):
         found = store.whole(layer)
@@ -130,7 +130,7 @@ def assert_same_chunks(small_drive: Street, work: Path, at_once) -> None:
 
 @pytest.fixture(scope="module")
 def at_once(small_drive: Street):
-    account = Account()
+    account = RunStats()
     return build_maps(street_drive(small_drive.drive, small_drive.labels), account), account
 
 

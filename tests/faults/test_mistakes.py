@@ -20,7 +20,7 @@ from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.evaluation import preflight
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
 
@@ -81,7 +81,7 @@ def layouts_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., dict[s
             folder = tmp_path_factory.mktemp("layouts")
             raw = copy_of(drive, folder, frames)
             log = open_drive(raw)
-            trajectory, _ = pipeline.estimate_trajectory(log, config.load(), Account())
+            trajectory, _ = pipeline.estimate_trajectory(log, config.load(), RunStats())
             made[drive] = {
                 "kitti-raw": raw,
                 "table": as_table_log(raw, folder),

@@ -16,19 +16,19 @@ from street import Street
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 
 UNGUARDED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from faults.killing import street_drive
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.fusion import build_maps
 
 try:
-    build_maps(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), Account(), work=Path(sys.argv[4]), workers=2)
+    build_maps(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), RunStats(), work=Path(sys.argv[4]), workers=2)
 except DataError as error:
     print(error)
 """
@@ -109,5 +109,5 @@ def test_a_worker_that_is_killed_is_an_error_and_what_is_mapped_stays(
     drive = street_drive(small_drive.drive, small_drive.labels)
     deadly = Drive(drive.log, drive.trajectory, Deadly(), drive.settings)
     with pytest.raises(DataError, match="a worker process died"):
-        build_maps(deadly, Account(), work=tmp_path / "work", workers=2)
+        build_maps(deadly, RunStats(), work=tmp_path / "work", workers=2)
     trial("workers")

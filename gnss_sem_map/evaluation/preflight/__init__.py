@@ -1,4 +1,4 @@
-"""The pre-flight: a log tested against physics, and its sensors against each other, before any work.
+"""Pre-flight check: a log is tested against physics, and its sensors against each other, before any work.
 
 `check` runs every check of this folder on a small sample of the drive. Every wrong sensor convention that we know makes
 one of them amber or red, and the finding names the probable mistake and the line that mends it.

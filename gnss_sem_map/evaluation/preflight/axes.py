@@ -1,4 +1,4 @@
-"""Which mistake in the axes explains what an IMU answered: every known one is tried, the simplest that fits is named.
+"""Mistakes in the axes of an IMU: every known one is tested, and the simplest one that explains the data is named.
 
 A mistake says how to make the accelerometer's and the gyroscope's columns right. What was measured, the direction that
 is up, the directions that answer to speeding up and to a bend to the left, and the sign of the turn, must then be
@@ -31,7 +31,7 @@ class Seen:
     """Directions in the accelerometer's axes, (3,) unit vectors or None where the drive does not show them."""
 
     up: Array
-    """The way that the force at rest points."""
+    """Direction of the specific force at rest."""
     ahead: Array | None
     left: Array | None
     turn: int
@@ -53,7 +53,7 @@ class AxesMistake:
     mirrored: bool = False
 
     def misfit(self, seen: Seen) -> float:
-        """Largest angle, rad, between what was seen and what a right IMU would show; infinite for a wrong turn."""
+        """Largest angle, rad, between observed directions and those of a correct IMU; infinite for a wrong turn."""
         wanted = ((seen.up, Z), (seen.ahead, X), (seen.left, -Y if self.mirrored else Y))
         angles = [_angle(self.force @ d, w) for d, w in wanted if d is not None]
         # the turn was taken about what the accelerometer calls up, whatever axes the gyroscope has
@@ -95,7 +95,7 @@ def askew(seen: Seen, mistake: AxesMistake) -> tuple[float, float, float]:
 
 
 def _known() -> Iterator[AxesMistake]:
-    """From the usual to the odd."""
+    """Known mistakes, the common ones first."""
     yield RIGHT
     yield _of_axes("frd")
     flipped, same = -np.eye(3), np.eye(3)

@@ -1,4 +1,4 @@
-"""The camera: its matrix, its images' size and clock, then depth edges against image edges, and labels likewise."""
+"""Checks of the camera: matrix, image size, clock; then depth edges against edges of images and labels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gnss_sem_map.evaluation.preflight.sample import Sample
 
 
 def check(sample: Sample) -> Iterator[Finding]:
-    """What costs nothing first; a camera that cannot be used is not looked through."""
+    """Cheap checks first; the images of an unusable camera are not checked."""
     log = sample.log
     if not log.images or not log.calibration.has_camera:
         return

@@ -1,4 +1,4 @@
-"""Is K the matrix of a camera, and of images of this size?"""
+"""Check of the camera matrix K: plausible, and for images of this size."""
 
 from __future__ import annotations
 

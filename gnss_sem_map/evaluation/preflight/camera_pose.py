@@ -1,4 +1,4 @@
-"""Where the camera is, when it sees and how wide: the change under which depth edges and image edges agree best.
+"""Check of camera pose, time offset and focal length: the change for which depth edges and image edges agree best.
 
 Every kind of mistake is a family of changes: a turn about an axis, another moment, another focal length. Tried one
 family at a time, the one that makes the edges agree names the mistake; gains are paired over the images.
@@ -45,9 +45,9 @@ class Family:
     name: str
     of: Callable[[float], Change]
     reach: tuple[float, ...]
-    """What is tried."""
+    """Candidate changes."""
     same: float
-    """A difference that is no reason to warn."""
+    """Differences below this give no warning."""
 
 
 def _about(axis: int) -> Callable[[float], Change]:

@@ -1,4 +1,4 @@
-"""How late the fixes are: the lag at which their way and their course agree best with the IMU's."""
+"""Time offset of the fixes: the lag at which their positions and course agree best with the IMU."""
 
 from __future__ import annotations
 

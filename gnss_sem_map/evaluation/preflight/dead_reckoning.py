@@ -1,4 +1,4 @@
-"""The way of the fixes against the way that the IMU went, window by window.
+"""Positions of the fixes against dead reckoning of the IMU, window by window.
 
 In a window the fixes are a slope in time, a parabola (tilt, bias), and the twice integrated force turned by a first
 heading. The last one is compared, so neither attitude nor velocity need be known; and it is late where the clock is.

@@ -1,4 +1,4 @@
-"""Depth edges of the LiDAR against edges of an image, or borders of labels: is the camera where, and when, it is said?
+"""Depth edges of the LiDAR against edges of images or borders of labels: tests the pose and the clock of the camera.
 
 Where a ring jumps from something near to something far, the image has an edge, too, if time and mounting are right.
 The agreement is how strong the image's edges are at such points, against their strength all over the image. Source:

@@ -1,4 +1,4 @@
-"""What is probably wrong with an IMU: tested against gravity, against a vehicle's limits, and against the fixes."""
+"""Diagnosis of an IMU: tested against gravity, against the limits of a vehicle, and against the fixes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SLOW_HZ = 50.0
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What is probably wrong with the IMU, and the IMU as it probably is, for the checks that come after."""
+    """Probable mistakes of the IMU, and the corrected IMU for the checks that follow."""
 
     findings: tuple[Finding, ...]
     force: Array

@@ -1,4 +1,4 @@
-"""`T_imu_lidar` by the agreement of two motions: as the LiDAR saw it, and as the trajectory has it.
+"""Check of `T_imu_lidar`: the motion by LiDAR against the motion of the trajectory (hand-eye calibration).
 
 Both sensors sit on one body: R_x turns every motion of the LiDAR into that of the IMU (hand-eye calibration). The way
 driven tells its yaw and pitch, the ground its roll, turns tell all three and the lever arm, and the lengths a scale.
@@ -21,7 +21,7 @@ from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 Array = NDArray[np.float64]
 NAME, LEVER, SCALE, FIT = "T_imu_lidar rotation", "T_imu_lidar position", "scale of motion", "motion"
 LONGEST_LEVER_M = 20.0
-"""No vehicle on a road is longer."""
+"""Longest vehicle on a road."""
 LEAST_WAY_M, LEAST_TURN_RAD = 1.0, np.radians(3.0)
 WAY_STDDEV_M, TURN_STDDEV_RAD, GROUND_STDDEV_RAD = 0.05, np.radians(0.15), np.radians(1.5)
 """How well a match knows the way and the turn of a second; and how far roads and loaded vehicles tilt."""

@@ -1,4 +1,4 @@
-"""What the pre-flight says: one finding per check; amber and red ones name the probable mistake and its remedy."""
+"""Findings of the pre-flight check: one per check; amber and red ones name the probable mistake and its remedy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gnss_sem_map.errors import DataError
 
 
 class Level(StrEnum):
-    """How bad a finding is: green fits, amber is in doubt, red makes a wrong map."""
+    """Severity of a finding: green is good, amber is doubtful, red would make a wrong map."""
 
     GREEN = "green"
     AMBER = "amber"
@@ -23,14 +23,14 @@ class Finding:
     """The result of one check; `mistake` and `remedy` are empty where it is green."""
 
     check: str
-    """What was looked at, in a few words: "IMU axes"."""
+    """Name of the check, such as "IMU axes"."""
     level: Level
     evidence: str
     """What was found and what was expected, with figures and units."""
     mistake: str = ""
     """The probable mistake: "z points down: FRD axes"."""
     remedy: str = ""
-    """The line that mends it: "set imu_axes: frd"."""
+    """The setting that corrects it: "set imu_axes: frd"."""
 
     def __str__(self) -> str:
         parts = (f"{self.check}: {self.evidence}", self.mistake, self.remedy)
@@ -44,7 +44,7 @@ class Preflight:
     findings: tuple[Finding, ...]
     seconds: float
     solution: Solution | None = None
-    """The drive as a run smooths it first, where the checks needed the same; None: not known."""
+    """First smoothed trajectory of the drive, where the checks computed it; else None."""
 
     @property
     def level(self) -> Level:
@@ -66,7 +66,7 @@ class Preflight:
 
 
 class PreflightError(DataError):
-    """The pre-flight found what makes a wrong map; `page` holds all findings."""
+    """The pre-flight check has a red finding; `page` holds all findings."""
 
     def __init__(self, name: str, page: Preflight) -> None:
         red = page.of(Level.RED)
@@ -76,15 +76,15 @@ class PreflightError(DataError):
 
 
 def green(check: str, evidence: str) -> Finding:
-    """A check that fits."""
+    """A finding without a problem."""
     return Finding(check, Level.GREEN, evidence)
 
 
 def amber(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
-    """A check that leaves doubt."""
+    """A doubtful finding."""
     return Finding(check, Level.AMBER, evidence, mistake, remedy)
 
 
 def red(check: str, evidence: str, mistake: str, remedy: str) -> Finding:
-    """A check that says that the map would be wrong."""
+    """A finding that would make a wrong map."""
     return Finding(check, Level.RED, evidence, mistake, remedy)

@@ -1,4 +1,4 @@
-"""By which fixes an IMU can be judged: no outliers, and none that stand still while the vehicle drives."""
+"""Fixes for the diagnosis of the IMU: without outliers and without frozen positions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Fixes:
     usable: GnssFixes
     """Those by which an IMU can be judged; as metres even where the log has radians."""
     implausible: int
-    """How many a vehicle cannot have driven to."""
+    """Number of fixes that a vehicle cannot have reached."""
     frozen: Array
     """(k, 2) first and last stamp, s, of runs that stand still while the vehicle drives."""
     are_radians: bool

@@ -1,4 +1,4 @@
-"""Images as files: of the size that the calibration says, and of the time of the scans."""
+"""Checks of image files: size as in the calibration, stamps close to those of the scans."""
 
 from __future__ import annotations
 

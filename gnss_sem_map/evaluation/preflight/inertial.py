@@ -9,6 +9,6 @@ from gnss_sem_map.evaluation.preflight.sample import Sample
 
 
 def check(sample: Sample) -> Iterator[Finding]:
-    """What the IMU's probable mistakes are; nothing where poses are given."""
+    """Findings about the IMU; none where poses are given."""
     if sample.diagnosis is not None:
         yield from sample.diagnosis.findings

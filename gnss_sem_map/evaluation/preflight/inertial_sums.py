@@ -1,4 +1,4 @@
-"""An IMU as running integrals: its mean over any window, and the way that it went."""
+"""Running integrals of an IMU: means over any window, and dead-reckoned positions."""
 
 from __future__ import annotations
 

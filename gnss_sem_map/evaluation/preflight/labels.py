@@ -1,4 +1,4 @@
-"""Labels that were made beforehand: do they hold something, and are they of these images?
+"""Checks of labels from files: they are not empty or constant, and they belong to these images.
 
 A network is not asked: that is what takes the time of a run.
 """

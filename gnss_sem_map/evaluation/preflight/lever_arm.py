@@ -1,4 +1,4 @@
-"""Where the antenna is: in turns it goes another way than the IMU."""
+"""Check of the lever arm of the antenna: in turns, its velocity differs from that of the IMU."""
 
 from __future__ import annotations
 

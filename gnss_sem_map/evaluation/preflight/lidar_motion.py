@@ -1,4 +1,4 @@
-"""How the LiDAR itself moved, seen by matching a few of its sweeps: only points are trusted, no calibration, no clock.
+"""Motion of the LiDAR from registration of a few sweeps: uses points only, no calibration and no clock.
 
 A stretch is five sweeps over about a second: the first two tell the speed, the others are matched with the first, each
 started where that speed takes it. With times for the points every sweep is deskewed by this motion, not by the
@@ -44,7 +44,7 @@ EVERY = 4
 """Of a sweep's points, this part tells how thick its surfaces are."""
 CUBE_M, LEAST_IN_CUBE, LEAST_SWEEPS = 0.5, 10, 3
 SMOOTH_M = 0.02
-"""No surface is called thinner than the noise of a LiDAR."""
+"""Least thickness of a surface: the noise of a LiDAR."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class Target:
         self._p, self._normals, self._tree = p_lidar, normals, small_gicp.KdTree(p_lidar)
 
     def match(self, p: Array, guess: Array, steps_m: tuple[float, ...]) -> Match | None:
-        """The points (m, 3) of another sweep laid onto this one; None where too few find a surface."""
+        """Register the points (m, 3) of another sweep to this one; None if too few have a correspondence."""
         T, share, off, held = guess, 0.0, 0.0, 0.0
         for within_m in steps_m:
             moved = p @ T[:3, :3].T + T[:3, 3]

@@ -1,4 +1,4 @@
-"""What a drive's own navigation unit says of its attitude (KITTI raw), against its gyroscope and the course."""
+"""Check of the attitude of a drive's own navigation unit (KITTI raw) against its gyroscope and the course."""
 
 from __future__ import annotations
 

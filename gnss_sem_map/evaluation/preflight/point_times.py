@@ -1,4 +1,4 @@
-"""When the points of a sweep were measured: their times against the thickness of surfaces that a second of sweeps sees.
+"""Check of the point times of a sweep: wrong times make the surfaces in a second of sweeps thicker.
 
 A moving scanner bends what it sees by how far it moves in a sweep. Deskewed with the right times, by the LiDAR's own
 motion, surfaces of several sweeps lie on each other; with other times they are thicker. Every cube of space is compared

@@ -1,4 +1,4 @@
-"""Poses that came with a drive, against what a vehicle can do."""
+"""Check of given poses against the dynamics of a vehicle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DRIVING_MPS = 2.0
 
 
 def check(given: Trajectory) -> Iterator[Finding]:
-    """Jumps, speeds and turns; and whether it drives where it looks."""
+    """Checks of jumps, speeds and turns, and whether the vehicle drives in the direction of its x axis."""
     if len(given) < 3:
         yield green("Poses", f"{len(given)} poses: too few to judge")
         return

@@ -1,4 +1,4 @@
-"""GNSS fixes and given poses against what a vehicle can do, and the fixes against the IMU."""
+"""Check of GNSS fixes and given poses against the dynamics of a vehicle, and of the fixes against the IMU."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How an IMU answered to what the track did: its turns to the course, its forces to speeding up and to bends.
+"""Response of an IMU to the track: angular rates against the course, forces against acceleration and curves.
 
 Axes, signs and units need no attitude for this: a right accelerometer answers to one m/s² of speeding up with one m/s²
 along x, and to one m/s² of a bend to the left with one along y; a right gyroscope turns as far as the course.

@@ -1,4 +1,4 @@
-"""The part of a drive that the pre-flight looks at, each thing computed once and only when a check asks for it."""
+"""The sample of a drive for the pre-flight check; every value is computed once, when a check first needs it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When sweeps began and ended: one after the other, as long as the time to the next, their stamp in the middle."""
+"""Check of sweep times: consecutive, as long as the time to the next sweep, with the stamp in the middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LiDAR sweeps: stamps, points, times of points, and the motion that they see against the trajectory."""
+"""Checks of LiDAR sweeps: stamps, points, point times, and their motion against the trajectory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCANS = "scans"
 
 
 def check(sample: Sample) -> Iterator[Finding]:
-    """Stamps first, which cost nothing; then a few seconds of scans."""
+    """Stamps first, which are cheap; then a few seconds of scans."""
     yield from sweep_stamps.check(sample)
     if not sample.log.scans:
         return
@@ -24,7 +24,7 @@ def check(sample: Sample) -> Iterator[Finding]:
 
 
 def _scans(sample: Sample) -> Iterator[Finding]:
-    """Whether scans can be read, and laid onto each other."""
+    """Whether scans can be read and registered to each other."""
     tried = sample.tried
     if not tried:
         yield green(SCANS, "not observable: no ten scans in a row")

@@ -1,4 +1,4 @@
-"""The track of the fixes as it is: velocity by lines through neighbouring fixes, no wider than their noise needs."""
+"""Velocities of the fixes: slopes of lines through neighbouring fixes, over windows as short as the noise allows."""
 
 from __future__ import annotations
 

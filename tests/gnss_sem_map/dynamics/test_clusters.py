@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnss_sem_map.dynamics.clusters import find_segments, take_apart
+from gnss_sem_map.dynamics.clusters import find_segments, split_segments
 
 
 def side(x, y, length, height=1.5, step=0.1):
@@ -17,7 +17,7 @@ def test_where_no_image_looks_a_lorry_is_an_object_and_a_wall_is_not(length, cou
     p_map = side(0.0, 5.0, length, height=3.0)
     nothing = np.zeros(len(p_map), bool)
     segments = find_segments(p_map, nothing, 0.7)
-    assert len(segments.cut) == count
+    assert len(segments.truncated) == count
     assert (segments.of_points == count - 1).all()
 
 
@@ -26,13 +26,13 @@ def test_what_is_asked_of_a_segment_is_what_its_points_say():
     east = p_map[:, 0] > 2.0
     segments = find_segments(p_map, east & (p_map[:, 1] < 8), 0.7)
     whole, of_points = segments.whole, segments.of_points
-    assert len(segments.cut) == 2
+    assert len(segments.truncated) == 2
     np.testing.assert_array_equal(of_points < 0, p_map[:, 1] > 8)
     np.testing.assert_array_equal(segments.points_of(np.array([False, True])), of_points == 1)
     for number in range(2):
         points = p_map[of_points == number]
         assert whole.points[number] == len(points)
-        assert whole.named[number] == np.count_nonzero(points[:, 0] > 2.0)
+        assert whole.labelled[number] == np.count_nonzero(points[:, 0] > 2.0)
         np.testing.assert_allclose(whole.sums[number], points.sum(axis=0))
         np.testing.assert_array_equal(whole.lowest[number], points.min(axis=0))
         np.testing.assert_array_equal(whole.highest[number], points.max(axis=0))
@@ -40,10 +40,10 @@ def test_what_is_asked_of_a_segment_is_what_its_points_say():
 
 def test_of_a_wall_that_the_image_half_calls_a_vehicle_the_named_points_are_a_cut_segment():
     p_map = side(0.0, 5.0, 30.0)
-    named = p_map[:, 0] < 4.05
-    segments = find_segments(p_map, named, 0.7)
-    np.testing.assert_array_equal(segments.of_points, np.where(named, 0, -1))
-    assert segments.cut.tolist() == [True]
+    labelled = p_map[:, 0] < 4.05
+    segments = find_segments(p_map, labelled, 0.7)
+    np.testing.assert_array_equal(segments.of_points, np.where(labelled, 0, -1))
+    assert segments.truncated.tolist() == [True]
 
 
 def test_a_mover_that_passes_a_parked_car_closely_is_taken_off_it():
@@ -53,7 +53,7 @@ def test_a_mover_that_passes_a_parked_car_closely_is_taken_off_it():
     segments = find_segments(p_map, np.ones(len(p_map), bool), 0.7)
     assert (segments.of_points == 0).all()
     of_mover = np.bincount(segments.voxel, is_mover) > 0
-    apart = take_apart(segments, np.full(len(of_mover), 20), np.where(of_mover, 30, 0), 0.7, 0.25)
+    apart = split_segments(segments, np.full(len(of_mover), 20), np.where(of_mover, 30, 0), 0.7, 0.25)
     np.testing.assert_array_equal(apart.of_points, is_mover)
 
 
@@ -63,5 +63,5 @@ def test_one_object_stays_whole_whatever_is_said_of_its_parts():
     for p_map in (car, far):
         segments = find_segments(p_map, np.ones(len(p_map), bool), 0.7)
         east = segments.parts.highest[:, 0] > 2.2
-        apart = take_apart(segments, np.full(len(east), 20), np.where(east, 30, 0), 0.7, 0.25)
+        apart = split_segments(segments, np.full(len(east), 20), np.where(east, 30, 0), 0.7, 0.25)
         np.testing.assert_array_equal(apart.of_points, 0)

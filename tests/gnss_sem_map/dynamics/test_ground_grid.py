@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from gnss_sem_map.dynamics.ground_grid import GROUND_CELL_M, height_over_ground, near, reached
+from gnss_sem_map.dynamics.ground_grid import GROUND_CELL_M, closer_than, height_over_ground, in_cells_near
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def test_near_is_in_a_marked_cell_or_beside_one(p_map, reach_m):
     marked = np.arange(len(p_map)) % 37 == 0
     expected = (neighbours(p_map, reach_m) & marked).any(axis=1)
     assert marked.sum() < expected.sum() < len(p_map)
-    np.testing.assert_array_equal(near(p_map, marked, reach_m), expected)
+    np.testing.assert_array_equal(in_cells_near(p_map, marked, reach_m), expected)
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -39,11 +39,11 @@ def test_reached_are_those_asked_for_that_are_nearer_than_the_reach_to_a_marked_
     asked = np.arange(len(p_map)) % 3 > 0
     expected = asked & (cdist(points, points[marked]) < reach_m).any(axis=1)
     assert 0 < (expected & ~marked).sum() < asked.sum()
-    np.testing.assert_array_equal(reached(points, marked, asked, reach_m), expected)
+    np.testing.assert_array_equal(closer_than(points, marked, asked, reach_m), expected)
 
 
 def test_no_reach_and_no_mark_find_no_more(p_map):
     marked = np.arange(len(p_map)) == 3
-    np.testing.assert_array_equal(near(p_map, marked, 0.0), marked)
-    assert not near(p_map, np.zeros(len(p_map), bool), 1.0).any()
-    assert not reached(p_map, marked, marked, 0.0).any()
+    np.testing.assert_array_equal(in_cells_near(p_map, marked, 0.0), marked)
+    assert not in_cells_near(p_map, np.zeros(len(p_map), bool), 1.0).any()
+    assert not closer_than(p_map, marked, marked, 0.0).any()

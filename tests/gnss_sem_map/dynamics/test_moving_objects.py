@@ -201,7 +201,7 @@ def test_only_points_of_the_mover_are_removed_and_no_scans_are_no_error():
 
 
 def seen(scan, p_map, T_map_lidar, is_object):
-    """A scan of a camera that looks all around."""
+    """A scan of a camera that counts all around."""
     known = np.ones(len(p_map), bool)
     return observe(scan, scan * SCAN_S, p_map, T_map_lidar, is_object, known, MotionSettings())
 

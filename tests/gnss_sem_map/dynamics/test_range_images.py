@@ -1,4 +1,4 @@
-"""Range images: what a scan says of a place that it hit, looked through, or could not see."""
+"""Range images: what a scan says of a place that it hit, counted through, or could not see."""
 
 import numpy as np
 import pytest
@@ -25,10 +25,10 @@ def wall_image(hole=None):
 
 def seen_at(image, places, T_lidar_map=None):
     places = np.asarray(places, float).reshape(-1, 3)
-    hits, throughs = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
+    hits, misses = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
     poses = np.eye(4)[None] if T_lidar_map is None else T_lidar_map[None]
-    range_images.look_at(places, image[None], poses, 3.0, 40.0, 0.3, 0.01, hits, throughs)
-    return hits - throughs
+    range_images.count_hits_and_misses(places, image[None], poses, 3.0, 40.0, 0.3, 0.01, hits, misses)
+    return hits - misses
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 179.9, -180.0, -35.0])

@@ -1,16 +1,16 @@
-"""Tracks and their displacement, and the verdicts that follow from evidence."""
+"""Tracks, their displacement, and the motion states that follow from hits and misses."""
 
 import numpy as np
 import pytest
 
-from gnss_sem_map.dynamics.motion_state import MotionSettings, judge
+from gnss_sem_map.dynamics.motion_state import MotionSettings, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
 from gnss_sem_map.refinement.vehicles import Motion
 
 
-def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, cut=False):
+def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, truncated=False):
     centre, half = np.array([x, y]), np.array([length / 2, 0.9])
-    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, cut)
+    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, truncated)
 
 
 def test_two_cars_that_pass_each_other_keep_their_tracks():
@@ -30,9 +30,9 @@ def test_a_track_survives_five_scans_out_of_sight_and_not_six():
 
 
 def test_on_a_highway_a_fleeting_segment_is_followed_as_far_as_it_drives_and_a_standing_one_is_not():
-    for speed, fleeting, count in ((33.0, True, 1), (33.0, False, 8), (60.0, True, 8)):
+    for speed, mostly_free, count in ((33.0, True, 1), (33.0, False, 8), (60.0, True, 8)):
         segments = [segment(scan, scan * 0.1 * speed) for scan in range(8)]
-        assert len(track(segments, 1.5, np.full(8, fleeting))) == count
+        assert len(track(segments, 1.5, np.full(8, mostly_free))) == count
 
 
 def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
@@ -69,46 +69,48 @@ def test_a_car_that_goes_and_then_waits_for_long_is_displaced_all_the_same():
 
 
 def test_what_the_edge_of_the_view_cuts_says_nothing_of_motion():
-    assert displacement_of([segment(scan, scan, cut=True) for scan in range(20)]) is None
+    assert displacement_of([segment(scan, scan, truncated=True) for scan in range(20)]) is None
     assert displacement_of([segment(scan, scan) for scan in range(3)]) is None
 
 
-def verdict(segments, hits, throughs):
-    objects = judge(segments, np.asarray(hits, float), np.asarray(throughs, float), MotionSettings())
+def motion_states(segments, hits, misses):
+    objects = classify_motion(segments, np.asarray(hits, float), np.asarray(misses, float), MotionSettings())
     return [(o.motion, len(o.segments)) for o in objects]
 
 
-def test_verdicts_follow_the_evidence():
+def test_motion_states_follow_hits_and_misses():
     parked = [segment(scan, 0.0) for scan in range(10)]
     going = [segment(scan, scan * 0.8) for scan in range(10)]
     many, none = np.full(10, 500.0), np.zeros(10)
-    assert verdict(parked, many, none) == [(Motion.PARKED, 10)]
-    assert verdict(parked, none, none) == [(Motion.UNKNOWN, 10)]
-    assert verdict(parked, many / 10, many) == [(Motion.STOPPED_AND_LEFT, 10)]
-    assert verdict(going, many, many / 2) == [(Motion.MOVING, 10)]
-    assert verdict(going, many, none) == [(Motion.PARKED, 10)], "a window between others, never seen through"
+    assert motion_states(parked, many, none) == [(Motion.PARKED, 10)]
+    assert motion_states(parked, none, none) == [(Motion.UNKNOWN, 10)]
+    assert motion_states(parked, many / 10, many) == [(Motion.STOPPED_AND_LEFT, 10)]
+    assert motion_states(going, many, many / 2) == [(Motion.MOVING, 10)]
+    assert motion_states(going, many, none) == [(Motion.PARKED, 10)], (
+        "a window between others, never seen through"
+    )
 
 
 def test_what_no_image_shows_needs_both_motion_and_free_space():
     going = [segment(scan, scan * 0.8, shown=False) for scan in range(10)]
     parked = [segment(scan, 0.0, shown=False) for scan in range(10)]
     many, few = np.full(10, 500.0), np.full(10, 50.0)
-    assert verdict(going, few, many) == [(Motion.MOVING, 10)]
-    assert verdict(going, many, few) == []
-    assert verdict(parked, few, many) == []
+    assert motion_states(going, few, many) == [(Motion.MOVING, 10)]
+    assert motion_states(going, many, few) == []
+    assert motion_states(parked, few, many) == []
 
 
 def test_the_last_scan_of_a_fast_car_goes_with_it_though_nobody_saw_its_place_empty():
     going = [segment(scan, scan * 2.8) for scan in range(10)]
-    throughs = np.full(10, 50.0)
-    throughs[-1] = 0.0
-    assert verdict(going, np.full(10, 5.0), throughs) == [(Motion.MOVING, 10)]
+    misses = np.full(10, 50.0)
+    misses[-1] = 0.0
+    assert motion_states(going, np.full(10, 5.0), misses) == [(Motion.MOVING, 10)]
 
 
 def test_probability_grows_with_the_evidence():
     parked = [segment(scan, 0.0) for scan in range(10)]
     probabilities = [
-        judge(parked, np.full(10, 2.0 * n), np.full(10, 6.0 * n), MotionSettings())[0].probability
+        classify_motion(parked, np.full(10, 2.0 * n), np.full(10, 6.0 * n), MotionSettings())[0].probability
         for n in (0.1, 1, 10)
     ]
     assert 0.5 < probabilities[0] < probabilities[1] < probabilities[2] < 1

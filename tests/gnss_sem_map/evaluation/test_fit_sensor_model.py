@@ -25,7 +25,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration, read
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.sensor_log import Image
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -69,7 +69,7 @@ def confused(small_drive: Street) -> Drive:
 
 
 def mapped(drive: Drive) -> VoxelMap:
-    return build_maps(drive, Account()).static
+    return build_maps(drive, RunStats()).static
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +88,9 @@ def test_the_answers_that_were_counted_are_the_ones_that_were_given(
     street, _ = measure(honest, mapped(honest), label_files(truth))
     expected = np.zeros((5, 6), np.int64)
     np.add.at(expected.T, np.array(names), street.answers.T)
-    np.testing.assert_array_equal(learnt.streets[0].answers, expected)
+    np.testing.assert_array_equal(learnt.drives[0].answers, expected)
     assert expected.sum() > 5000
-    np.testing.assert_array_equal(learnt.streets[0].cells, street.cells)
+    np.testing.assert_array_equal(learnt.drives[0].cells, street.cells)
     np.testing.assert_array_equal(street.cells.sum(axis=(1, 2)), street.answers.sum(axis=1))
 
 
@@ -167,7 +167,7 @@ def test_a_run_folder_and_its_truth_become_a_file_that_the_next_run_uses(
     said = ask("calibrate", tmp_path / "a", "--truth", truth, "-o", tmp_path / "calibration.yaml")
     assert "--set calibration=" in said
     found = read(tmp_path / "calibration.yaml", URBAN)
-    assert found.streets[0].answers.trace() > 0.95 * found.streets[0].answers.sum()
+    assert found.drives[0].answers.trace() > 0.95 * found.drives[0].answers.sum()
     chosen = f"calibration={tmp_path / 'calibration.yaml'}"
     ask("run", small_drive.drive, "--segmenter", segmenter, "-o", tmp_path / "b", "--set", chosen)
     with pytest.raises(DataError, match="made with a calibration file"):

@@ -20,8 +20,8 @@ from gnss_sem_map.labels.sensor_model import (
     CELLS,
     FLATNESS_EDGES,
     HEIGHT_EDGES_M,
+    CalibrationDrive,
     LabelCalibration,
-    Street,
     cells_of,
     read,
 )
@@ -33,12 +33,14 @@ from gnss_sem_map.voxels.voxel_map import pack
 URBAN = open_label_set()
 
 
-def street(seed: int, most: int = 100_000) -> Street:
+def street(seed: int, most: int = 100_000) -> CalibrationDrive:
     rng = np.random.default_rng(seed)
-    return Street(f"street {seed}", rng.integers(0, most, (5, 6)), rng.integers(0, most, (5, *CELLS)))
+    return CalibrationDrive(
+        f"street {seed}", rng.integers(0, most, (5, 6)), rng.integers(0, most, (5, *CELLS))
+    )
 
 
-def of(*streets: Street, temperature: float = 2.0) -> LabelCalibration:
+def of(*streets: CalibrationDrive, temperature: float = 2.0) -> LabelCalibration:
     return LabelCalibration(URBAN.name, URBAN.names, streets, temperature)
 
 
@@ -90,7 +92,7 @@ def test_a_file_reads_back_as_it_was_written(tmp_path: Path) -> None:
     file.write_text(written.to_yaml())
     found = read(file, URBAN)
     assert (found.names, found.class_set, found.temperature) == (written.names, "urban", 1.7)
-    assert [s.name for s in found.streets] == ["street 1", "street 2"]
+    assert [s.name for s in found.drives] == ["street 1", "street 2"]
     np.testing.assert_array_equal(found.log_likelihoods, written.log_likelihoods)
     heights, flat = np.array([0.0, 2.2]), np.array([1.0, np.nan])
     np.testing.assert_array_equal(found.of_geometry(heights, flat), written.of_geometry(heights, flat))

@@ -25,11 +25,11 @@ from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.fusion import STATIC, Drive, Maps, build_maps, fingerprint, map_chunks
-from gnss_sem_map.mapping.labelled_scans import seen_scans
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.mapping.labelled_scans import labelled_scans
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
-from gnss_sem_map.segmentation.remembered import RememberedSegmenter
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 from gnss_sem_map.sensor_log import Image, Skip, file_of
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
@@ -48,8 +48,8 @@ def drive(small_drive: Street) -> Drive:
 
 
 @pytest.fixture(scope="module")
-def at_once(drive: Drive) -> tuple[Maps, Account]:
-    account = Account()
+def at_once(drive: Drive) -> tuple[Maps, RunStats]:
+    account = RunStats()
     return build_maps(drive, account), account
 
 
@@ -65,16 +65,16 @@ def assert_same(a: VoxelMap, b: VoxelMap) -> None:
 
 
 def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
-    drive: Drive, at_once: tuple[Maps, Account]
+    drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
     """All images but two: the map is that of the others' labels, with every point in it."""
-    kept, account = drive.log.images[3:5], Account()
+    kept, account = drive.log.images[3:5], RunStats()
     found = build_maps(replace(drive, log=replace(drive.log, images=kept)), account).static
     np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
     np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
     shown = [scan for scan in drive.log.scans if scan.number in [image.number for image in kept]]
-    few = build_maps(replace(drive, log=replace(drive.log, scans=tuple(shown))), Account()).static
-    places = found.places(few.keys)
+    few = build_maps(replace(drive, log=replace(drive.log, scans=tuple(shown))), RunStats()).static
+    places = found.indices_of(few.keys)
     np.testing.assert_array_equal(found.evidence[places], few.evidence)
     assert found.observed.sum() == few.observed.sum() > 0
     reasons = [(skip.what, skip.reason) for skip in account.skips]
@@ -82,9 +82,9 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
 
 
 def test_points_that_are_kept_on_the_way_are_those_that_are_found_later(drive: Drive) -> None:
-    on_the_way = list(seen_scans(drive, keep_points=True))
+    on_the_way = list(labelled_scans(drive, keep_points=True))
     assert len(on_the_way) == len(drive.log.scans)
-    for seen, asked in zip(on_the_way, seen_scans(drive), strict=True):
+    for seen, asked in zip(on_the_way, labelled_scans(drive), strict=True):
         assert asked.kept is None
         np.testing.assert_array_equal(seen.p_map, asked.p_map)
         np.testing.assert_array_equal(seen.keys, asked.keys)
@@ -92,9 +92,9 @@ def test_points_that_are_kept_on_the_way_are_those_that_are_found_later(drive: D
 
 
 def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_scans(
-    drive: Drive, at_once: tuple[Maps, Account]
+    drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
-    settings, account = drive.settings, Account()
+    settings, account = drive.settings, RunStats()
     late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0})
     found = build_maps(
         replace(drive, settings=settings.model_copy(update={"labelling": late})), account
@@ -120,15 +120,15 @@ class Refusing:
 
 
 def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
-    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     """A live network's answers are remembered between the two passes; so is nothing that it refused."""
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size
     assert size is not None
-    refusing = RememberedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
+    refusing = CachedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
     for _ in range(2):
-        account = Account()
+        account = RunStats()
         found = build_maps(replace(drive, segmenter=refusing), account)
         assert account.skips == [Skip("labels", "frame 5", "this image is damaged")]
         np.testing.assert_array_equal(found.static.hits, at_once[0].static.hits)
@@ -145,7 +145,7 @@ def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive
         def __call__(self, image: Image) -> NDArray[np.uint8]:
             raise DataError("this network is broken")
 
-    account = Account()
+    account = RunStats()
     assert len(build_maps(replace(drive, segmenter=Hopeless()), account).static) > 1000
     assert account.counts["points labelled"] == 0
     first = drive.log.scans[0].number
@@ -159,18 +159,18 @@ def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size
     assert size is not None
-    nowhere = RememberedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
-    with pytest.raises(WriteError, match="cannot keep what the network said"):
-        build_maps(replace(drive, segmenter=nowhere), Account())
+    nowhere = CachedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
+    with pytest.raises(WriteError, match="cannot be written"):
+        build_maps(replace(drive, segmenter=nowhere), RunStats())
 
 
 @pytest.mark.parametrize(
     ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
 )
 def test_chunks_and_processes_give_the_same_map_and_account(
-    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, chunk: int, workers: int
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, chunk: int, workers: int
 ) -> None:
-    account = Account()
+    account = RunStats()
     maps = build_maps(by_chunks(drive, chunk), account, work=tmp_path / "work", workers=workers)
     assert_same(maps.static, at_once[0].static)
     assert len(maps.removed) == 0
@@ -179,10 +179,10 @@ def test_chunks_and_processes_give_the_same_map_and_account(
 
 
 def test_tiles_come_from_the_chunks_one_by_one(
-    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     """The folder written tile by tile, never holding the map, has the bytes of the one written at once."""
-    store = map_chunks(by_chunks(drive, 3), tmp_path / "work", Account())
+    store = map_chunks(by_chunks(drive, 3), tmp_path / "work", RunStats())
     pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
     tiles.write_tiles(pieces, tmp_path / "a", drive.log.frame, store.voxel_size_m, URBAN)
     tiles.write(SemanticMap.of(at_once[0].static), tmp_path / "b", drive.log.frame)
@@ -196,7 +196,7 @@ MAP = """
 import sys
 from pathlib import Path
 from gnss_sem_map.mapping import fusion
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
@@ -208,9 +208,9 @@ if __name__ == "__main__":
     log = open_drive(drive)
     segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
     job = Drive(log, log.reference, segmenter, Settings(mapping={"scans_per_chunk": 1}))
-    fusion.fuse_scans(job, log.scans[:1], Account())  # compiled code is loaded: the kills fall into the mapping
+    fusion.fuse_scans(job, log.scans[:1], RunStats())  # compiled code is loaded: the kills fall into the mapping
     print("ready", flush=True)
-    fusion.map_chunks(job, work, Account(), resume=True)
+    fusion.map_chunks(job, work, RunStats(), resume=True)
     print("done", flush=True)
 """
 
@@ -243,10 +243,10 @@ def kill_at_random(small_drive: Street, work: Path, times: int, seed: int) -> li
 
 
 def resumed_after_kills(
-    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], work: Path, times: int, seed: int
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], work: Path, times: int, seed: int
 ) -> list[int]:
     done = kill_at_random(small_drive, work, times, seed)
-    account = Account()
+    account = RunStats()
     maps = build_maps(by_chunks(drive, 1), account, work=work, resume=True)
     assert_same(maps.static, at_once[0].static)
     assert account.counts == at_once[1].counts
@@ -256,14 +256,14 @@ def resumed_after_kills(
 
 @pytest.mark.integration
 def test_a_killed_run_goes_on_to_the_same_map(
-    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 2, 1)
 
 
 @pytest.mark.slow
 def test_a_run_killed_many_times_goes_on_to_the_same_map(
-    drive: Drive, small_drive: Street, at_once: tuple[Maps, Account], tmp_path: Path
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     partly = 0
     for seed in range(8):
@@ -274,7 +274,7 @@ def test_a_run_killed_many_times_goes_on_to_the_same_map(
 
 def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> None:
     work, drive = tmp_path / "work", by_chunks(drive, 4)
-    build_maps(drive, Account(), work=work)
+    build_maps(drive, RunStats(), work=work)
     other = Settings.model_validate({"mapping": {"voxel_size_m": 0.3}})
     for changed in (
         replace(drive, settings=other),
@@ -282,13 +282,13 @@ def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> Non
         replace(drive, moving={3: np.array([5])}),
     ):
         with pytest.raises(DataError, match="another drive, trajectory, labels or settings"):
-            build_maps(changed, Account(), work=work, resume=True)
+            build_maps(changed, RunStats(), work=work, resume=True)
     with pytest.raises(DataError, match="another drive"):
-        build_maps(drive, Account(), work=work, resume=True, labels_from="labels:elsewhere")
+        build_maps(drive, RunStats(), work=work, resume=True, labels_from="labels:elsewhere")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("important")
     with pytest.raises(DataError, match="holds no interrupted run"):
-        build_maps(drive, Account(), work=tmp_path / "mine")
+        build_maps(drive, RunStats(), work=tmp_path / "mine")
     assert (tmp_path / "mine/thesis.txt").exists()
 
 
@@ -310,13 +310,13 @@ def doubled(path: Path) -> None:
 @pytest.mark.parametrize("damage", [flipped, halved, doubled, Path.unlink])
 @pytest.mark.parametrize("what", ["static/*.npy", "record.json"])
 def test_a_damaged_chunk_is_mapped_again(
-    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path, damage: Callable[[Path], None], what: str
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, damage: Callable[[Path], None], what: str
 ) -> None:
     drive = by_chunks(drive, 4)
-    build_maps(drive, Account(), work=tmp_path / "work")
+    build_maps(drive, RunStats(), work=tmp_path / "work")
     others = {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
     damage(sorted((tmp_path / "work/1").glob(what))[0])
-    account = Account()
+    account = RunStats()
     maps = build_maps(drive, account, work=tmp_path / "work", resume=True)
     assert_same(maps.static, at_once[0].static)
     assert account.counts == at_once[1].counts
@@ -324,7 +324,7 @@ def test_a_damaged_chunk_is_mapped_again(
 
 
 def test_a_chunk_that_is_damaged_under_way_is_named_and_never_used(drive: Drive, tmp_path: Path) -> None:
-    store = map_chunks(by_chunks(drive, 4), tmp_path / "work", Account())
+    store = map_chunks(by_chunks(drive, 4), tmp_path / "work", RunStats())
     part = sorted((tmp_path / "work/1").glob("static/*.npy"))[0]
     flipped(part)
     with pytest.raises(DataError, match=rf"{part.name}: damaged voxels .*--resume maps them again"):
@@ -367,18 +367,18 @@ def test_every_reader_says_which_files_it_reads(small_drive: Street, tmp_path: P
 
 
 def test_what_moved_goes_into_a_map_of_its_own_and_nothing_is_lost(
-    drive: Drive, at_once: tuple[Maps, Account], tmp_path: Path
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     """Everything that its image calls a vehicle is taken out: by chunks and at once alike."""
     vehicle = URBAN.index("vehicle")
-    moving = {seen.scan.number: np.flatnonzero(seen.labels == vehicle) for seen in seen_scans(drive)}
+    moving = {seen.scan.number: np.flatnonzero(seen.labels == vehicle) for seen in labelled_scans(drive)}
     taken = replace(drive, moving=moving)
-    maps = build_maps(taken, Account())
+    maps = build_maps(taken, RunStats())
     assert maps.removed.hits.sum() == sum(map(len, moving.values())) > 100
     assert set(maps.removed.labels) == {vehicle}
     assert not (maps.static.labels == vehicle).any()
     assert_same(maps.static + maps.removed, at_once[0].static)
-    chunked = build_maps(by_chunks(taken, 5), Account(), work=tmp_path / "work")
+    chunked = build_maps(by_chunks(taken, 5), RunStats(), work=tmp_path / "work")
     assert_same(chunked.static, maps.static)
     assert_same(chunked.removed, maps.removed)
 
@@ -399,7 +399,7 @@ class Unsendable:
 def test_a_segmenter_that_cannot_be_shared_is_refused_before_any_work(drive: Drive, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot work in several processes"):
         build_maps(
-            by_chunks(replace(drive, segmenter=Unsendable()), 2), Account(), work=tmp_path / "w", workers=2
+            by_chunks(replace(drive, segmenter=Unsendable()), 2), RunStats(), work=tmp_path / "w", workers=2
         )
 
 
@@ -441,11 +441,11 @@ def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path)
     assert {path.name for path in (tmp_path / "work").iterdir()} == {"chunks.json", MARKER}
 
 
-def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: tuple[Maps, Account]) -> None:
+def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: tuple[Maps, RunStats]) -> None:
     """Deskewing, keys, projection, occlusion and fusion, scan by scan and as a map."""
     settings, log = drive.settings, drive.log
     plain = numpy_chain.NumpyMap(settings.mapping.voxel_size_m, URBAN)
-    for seen in seen_scans(drive):
+    for seen in labelled_scans(drive):
         points = seen.scan.read()
         p_map = numpy_chain.points_in_map(
             points, seen.scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, settings.mapping
@@ -471,7 +471,7 @@ def test_the_car_itself_is_not_mapped(real_data: Path) -> None:
     log = open_drive(real_data / "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync")
     assert log.reference is not None
     there, kept = 0, 0
-    for seen in seen_scans(Drive(log, log.reference, None, Settings())):
+    for seen in labelled_scans(Drive(log, log.reference, None, Settings())):
         x, y, z = seen.points.xyz.T
         of_the_car = (np.abs(x) < 2) & (np.abs(y) < 1.5) & (z > -1.2)
         there, kept = there + int(of_the_car.sum()), kept + int(of_the_car[seen.valid].sum())

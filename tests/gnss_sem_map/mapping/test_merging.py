@@ -74,7 +74,7 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
     assert URBAN.index("building") not in stands.labels
     again, _ = refine(stands, beside=Evidence(moved=removed))
     assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
-        stands.places(removed.keys) < 0
+        stands.indices_of(removed.keys) < 0
     )
 
 

@@ -12,7 +12,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.mapping import surface_heights
 from gnss_sem_map.mapping.fusion import build_map
 from gnss_sem_map.mapping.labelled_scans import map_points
-from gnss_sem_map.run_stats import Account
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxels.voxel_map import SemanticMap, keys_of
 
@@ -26,8 +26,8 @@ def test_heights_are_those_of_numpy_and_part_of_a_drive_tells_nearly_as_well(
     drive: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, settings = open_drive(drive), config.Settings()
-    trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
-    semantic_map = SemanticMap.of(build_map(log, trajectory, None, settings, Account()))
+    trajectory, _ = pipeline.estimate_trajectory(log, settings, RunStats())
+    semantic_map = SemanticMap.of(build_map(log, trajectory, None, settings, RunStats()))
     voxels = semantic_map.voxels
     heights = surface_heights.measure_surface_heights(log, trajectory, settings, voxels).of(voxels)
 
@@ -46,8 +46,8 @@ def test_heights_are_those_of_numpy_and_part_of_a_drive_tells_nearly_as_well(
 
 def test_a_damaged_scan_is_left_out(drive: Path, tmp_path: Path) -> None:
     log, settings = open_drive(drive), config.Settings()
-    trajectory, _ = pipeline.estimate_trajectory(log, settings, Account())
-    semantic_map = SemanticMap.of(build_map(log, trajectory, None, settings, Account()))
+    trajectory, _ = pipeline.estimate_trajectory(log, settings, RunStats())
+    semantic_map = SemanticMap.of(build_map(log, trajectory, None, settings, RunStats()))
     first = drive / "velodyne_points" / "data" / f"{log.scans[0].name}.bin"
     whole = first.read_bytes()
     try:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images, visibility
 from gnss_sem_map.dynamics.motion_state import MotionSettings
-from gnss_sem_map.dynamics.visibility import PLACES_AT_ONCE, AlongTheDrive, Witnesses
+from gnss_sem_map.dynamics.visibility import POINTS_PER_BLOCK, KeyframeScans, KeyframeSelector
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings, seen_through
 from gnss_sem_map.refinement.state import Evidence
@@ -60,7 +60,7 @@ def street_map(*more: NDArray[np.float64]) -> VoxelMap:
 
 
 def cleared(voxels: VoxelMap, settings: FreeSpaceSettings | None = None) -> NDArray[np.bool_]:
-    witnesses = Witnesses.of([witness(x) for x in STREET])
+    witnesses = KeyframeScans.of([witness(x) for x in STREET])
     return seen_through(voxels, witnesses, settings or FreeSpaceSettings())
 
 
@@ -89,25 +89,25 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     """In a drive of kilometres most scans are far from a place: leaving them out changes nothing."""
     rng = np.random.default_rng(0)
     far = [float(x) for x in range(0, 2000, 20)]
-    witnesses = Witnesses(np.stack([witness(0.0)[0]] * len(far)), np.linalg.inv([pose(x) for x in far]))
-    places = rng.uniform([0, -8, 0], [2000, 8, 3], (PLACES_AT_ONCE + 5000, 3))
+    witnesses = KeyframeScans(np.stack([witness(0.0)[0]] * len(far)), np.linalg.inv([pose(x) for x in far]))
+    places = rng.uniform([0, -8, 0], [2000, 8, 3], (POINTS_PER_BLOCK + 5000, 3))
     places = places[np.argsort(places[:, 0])]
     settings = MOTION.model_copy(update={"farthest_m": reach_m})
     assert len(witnesses.near(places[:1000], reach_m).images) < len(far) / 5
-    looks = visibility.testify(places, witnesses, settings)
-    hits, throughs = np.zeros((2, len(places)), np.int32)
-    range_images.look_at(
+    looks = visibility.hits_and_misses(places, witnesses, settings)
+    hits, misses = np.zeros((2, len(places)), np.int32)
+    range_images.count_hits_and_misses(
         places, witnesses.images, witnesses.T_lidar_map, settings.nearest_m, reach_m,
-        settings.margin_m, settings.margin_ratio, hits, throughs,
+        settings.margin_m, settings.margin_ratio, hits, misses,
     )  # fmt: skip
-    np.testing.assert_array_equal(looks, [hits, throughs])
+    np.testing.assert_array_equal(looks, [hits, misses])
     assert looks.any(axis=1).all()
 
 
 def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
     voxels = street_map(GHOST)
     ghost = np.isin(voxels.keys, keys_of(GHOST, 0.2))
-    witnesses = Witnesses.of([witness(x) for x in STREET])
+    witnesses = KeyframeScans.of([witness(x) for x in STREET])
     refined, report = refine(voxels, beside=Evidence(keyframes=witnesses))
     np.testing.assert_array_equal(refined.states == State.REMOVED, ghost)
     assert {step.name: step.changed for step in report.steps}["free_space"] == ghost.sum()
@@ -120,11 +120,11 @@ def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
 def test_witnesses_are_a_metre_or_a_second_apart() -> None:
     """However long the drive stands or how fast it goes, they take no more memory than the map that they are for."""
     stood = [0.0] * 20 + [0.5 * k for k in range(1, 11)]
-    along = AlongTheDrive()
-    assert along.witnesses() is None
+    along = KeyframeSelector()
+    assert along.keyframes() is None
     for k, x in enumerate(stood):
         along.add(0.1 * k, range_images.empty_image(), np.linalg.inv(pose(x)))
-    kept = along.witnesses()
+    kept = along.keyframes()
     assert kept is not None
     x = np.linalg.inv(kept.T_lidar_map)[:, 0, 3]
     np.testing.assert_allclose(x, [0, 0, 0.5, 1.5, 2.5, 3.5, 4.5], atol=1e-9)

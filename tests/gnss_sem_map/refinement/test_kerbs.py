@@ -38,7 +38,7 @@ class Scene:
 
     @property
     def places(self) -> NDArray[np.int64]:
-        return self.semantic_map.voxels.places(keys_of(self.p_map, SIZE_M))
+        return self.semantic_map.voxels.indices_of(keys_of(self.p_map, SIZE_M))
 
     @property
     def heights(self) -> NDArray[np.float64]:

@@ -1,11 +1,11 @@
-"""What is made ahead comes in order, and never much of it at once."""
+"""Prefetched items come in order, and only a few are held at a time."""
 
 import threading
 import time
 
 import pytest
 
-from gnss_sem_map.scans.prefetch import ahead
+from gnss_sem_map.scans.prefetch import prefetch
 
 
 @pytest.mark.parametrize(("threads", "under_way"), [(1, None), (1, 4), (3, None)])
@@ -16,7 +16,7 @@ def test_results_come_in_the_order_of_the_items_whichever_is_made_first(
         time.sleep(0.002 * (item % 3 == 0))
         return item * item
 
-    assert list(ahead(make, range(20), threads, under_way)) == [(i, i * i) for i in range(20)]
+    assert list(prefetch(make, range(20), threads, under_way)) == [(i, i * i) for i in range(20)]
 
 
 def test_no_more_than_asked_for_is_made_before_it_is_taken() -> None:
@@ -27,7 +27,7 @@ def test_no_more_than_asked_for_is_made_before_it_is_taken() -> None:
             made[0] += 1
         return item
 
-    for taken, _ in ahead(make, range(50), threads=2, under_way=3):
+    for taken, _ in prefetch(make, range(50), threads=2, under_way=3):
         assert made[0] <= taken + 4  # it, those under way, and the one that took its place
 
 
@@ -39,12 +39,12 @@ def test_an_error_is_raised_where_its_item_comes_up() -> None:
 
     taken = []
     with pytest.raises(ValueError, match="the third"):
-        taken.extend(item for item, _ in ahead(make, range(5)))
-    results = ahead(make, range(5))
+        taken.extend(item for item, _ in prefetch(make, range(5)))
+    results = prefetch(make, range(5))
     assert [next(results)[0], next(results)[0]] == [0, 1]
     with pytest.raises(ValueError, match="the third"):
         next(results)
 
 
 def test_nothing_to_do_is_nothing() -> None:
-    assert list(ahead(str, [])) == []
+    assert list(prefetch(str, [])) == []

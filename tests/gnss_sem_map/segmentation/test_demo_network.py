@@ -50,7 +50,7 @@ def test_it_knows_the_classes_of_the_map_in_streets_it_has_not_seen(
 
 def test_its_calibration_is_of_other_streets_than_the_demos_and_trusts_its_answers() -> None:
     found = sensor_model.read(DEMO_CALIBRATION, URBAN)
-    seeds = {int(street.name.split("_drive_")[1].split("_")[0]) for street in found.streets}
+    seeds = {int(street.name.split("_drive_")[1].split("_")[0]) for street in found.drives}
     assert seeds == {101, 102}
     assert found.log_likelihoods[:5].argmax(axis=1).tolist() == [0, 1, 2, 3, 4]
 

@@ -7,7 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.simulation import Simulation, World, build_town
-from gnss_sem_map.simulation.fan import SECTOR, Sweep, list_near, look, room_for
 from gnss_sem_map.simulation.ground import FAR, Ground, height_gradient, hit_ground
 from gnss_sem_map.simulation.raycast import GROUND, KERB, cast_ray, hit_thing
 from gnss_sem_map.simulation.rig import T_IMU_LIDAR
@@ -181,24 +180,6 @@ def test_the_grid_forgets_nothing(whole_drive: Simulation) -> None:
             if which >= 0:
                 best, expected = closer, (closer, k, which)
         assert (t, thing, shape) == expected
-
-
-def test_a_fan_of_rays_hits_what_each_ray_alone_does(whole_drive: Simulation) -> None:
-    lidar, (start, end) = whole_drive.lidar, whole_drive.sweeps[120]
-    scene = whole_drive.world.scene(start, end)
-    T = whole_drive.world.ego.poses(start + lidar.fractions * (end - start)) @ T_IMU_LIDAR
-    fans = lidar.planes @ T[:, :3, :3].transpose(0, 2, 1)
-    sweep = Sweep(T, fans, lidar.fractions, lidar.directions, np.tan(lidar.elevations), lidar.range_m)
-    work = room_for(scene, sweep)
-    for first in range(0, lidar.columns, SECTOR):
-        last = min(first + SECTOR, lidar.columns)
-        listed = list_near(sweep, first, last, work)
-        for column in range(first, last, 5):
-            look(scene, sweep, column, listed, work)
-            o, late = T[column, :3, 3], lidar.fractions[column]
-            for ring, d in enumerate(work.rays):
-                alone = cast_ray(scene, lidar.range_m, False, late, *o, *d)
-                assert (work.distance[ring], work.things[ring], work.shapes[ring]) == alone
 
 
 def test_a_shadow_ray_agrees_with_a_full_one(whole_drive: Simulation) -> None:

@@ -118,7 +118,7 @@ def test_the_fixed_point_sums_are_the_logarithms_of_eq_6() -> None:
     p = p[p.any(axis=1)], keys[p.any(axis=1)]
     probability = np.maximum(p[0] / p[0].sum(axis=1, keepdims=True), 0.05)
     probability /= probability.sum(axis=1, keepdims=True)
-    places = fused.places(p[1])
+    places = fused.indices_of(p[1])
     exact = np.zeros(fused.evidence.shape)
     np.add.at(exact, places, np.log(probability))
     looks = np.bincount(places, minlength=len(fused))
@@ -140,7 +140,7 @@ def test_what_was_added_can_be_taken_out_again() -> None:
     assert_same(whole + part - part, whole)
     assert len(whole - whole) == 0
     for other in (part, replace(whole, hits=whole.hits + np.uint32(1)), replace(whole, voxel_size_m=0.4)):
-        with pytest.raises(DataError, match="does not hold it"):
+        with pytest.raises(DataError, match="not part of the other"):
             whole - other
     with pytest.raises(DataError, match="other evidence"):
         whole - replace(whole, evidence=whole.evidence - np.int32(1))
@@ -207,8 +207,8 @@ def test_a_selection_keeps_what_the_mask_says() -> None:
     part = fused[fused.observed]
     assert len(part) == int(fused.observed.sum()) > 0
     assert part.observed.all()
-    np.testing.assert_array_equal(fused.places(part.keys), np.flatnonzero(fused.observed))
-    assert (fused.places(np.array([1, part.keys[0] + 1], np.int64))[:1] == -1).all()
+    np.testing.assert_array_equal(fused.indices_of(part.keys), np.flatnonzero(fused.observed))
+    assert (fused.indices_of(np.array([1, part.keys[0] + 1], np.int64))[:1] == -1).all()
 
 
 def test_a_large_table_takes_at_most_50_bytes_per_voxel_and_keeps_all() -> None:

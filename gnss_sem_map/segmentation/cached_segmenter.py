@@ -1,31 +1,30 @@
-"""A network looks at every image once, though the drive is read twice: for what moved, and for the map."""
+"""Cache of a network's probabilities: every image is segmented once, though a drive is read more than once."""
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError, WriteError
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter
+from gnss_sem_map.segmentation.cache import write_probabilities
+from gnss_sem_map.segmentation.cached import read_probabilities
 from gnss_sem_map.sensor_log import Image
 
 ABOUT = "about.json"
 
 
 @dataclass(frozen=True, eq=False)
-class RememberedSegmenter:
-    """A segmenter whose answers stay in a folder, in the map's own classes: the second asking costs a file."""
+class CachedSegmenter:
+    """A segmenter that keeps its probabilities in a folder, in the classes of the map: the second call reads a file."""
 
     segmenter: Segmenter
     label_set: LabelSet
@@ -39,28 +38,22 @@ class RememberedSegmenter:
         return (*self.label_set.names, OTHER)
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:
-        """Probabilities (h, w, c + 1), round(255 p), the same at every asking; raises what the segmenter raises."""
+        """Probabilities (h, w, c + 1), round(255 p), the same at every call; raises what the segmenter raises."""
         file = self.folder / f"{image.number}.npz"
-        remembered = _read(file)
-        if remembered is not None:
-            return remembered
+        try:
+            return np.asarray(read_probabilities(file)[0], np.uint8)
+        except DataError:
+            pass  # not there yet, or damaged
         seen = class_image(
             self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_size,
             f"labels of image {image.number}",
         )  # fmt: skip
-        content = io.BytesIO()
-        np.savez_compressed(content, probabilities=seen.probabilities)
-        try:
-            write_whole(file, content.getvalue())
-        except OSError as error:
-            raise WriteError(
-                f"{self.folder}: cannot keep what the network said ({error.strerror}); free the disk, then --resume"
-            ) from None
+        write_probabilities(file, seen.probabilities, self.class_names)
         return seen.probabilities
 
 
 def answers_folder(work: Path, fingerprint: str, resume: bool) -> Path:
-    """A folder for a network's answers; those of an interrupted run stay when resuming and both have one fingerprint.
+    """Folder for a network's probabilities; with `resume`, those of an interrupted run with this fingerprint are kept.
 
     Raises DataError when it cannot be written.
     """
@@ -80,13 +73,4 @@ def _fingerprint(about: Path) -> str | None:
     try:
         return str(json.loads(about.read_text("utf-8"))["fingerprint"])
     except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _read(file: Path) -> NDArray[np.uint8] | None:
-    """What was answered; None where nothing was, or the file is damaged (its checksum is in it)."""
-    try:
-        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as remembered:
-            return np.asarray(remembered["probabilities"], np.uint8)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return None

@@ -1,4 +1,4 @@
-"""Which shape every pixel shows, and how far away it is."""
+"""ID buffer: the visible shape of every pixel, and its distance."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ def pixel_ray(T: Floats, lens: Triple, u: int, v: int) -> tuple[float, float, fl
 def _on_same(
     scene: Scene, thing: int, shape: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, int]:
-    """Distance to one known shape, or to the ground; FAR where the ray misses it or may pass through it."""
+    """Distance to one given shape, or to the ground; FAR if the ray misses it or may pass (leaves, fences)."""
     if thing in (GROUND, KERB):
         t, kerb = hit_ground(scene.ground, FAR, ox, oy, oz, dx, dy, dz)
         return (t if t < _REACH_M else FAR), (KERB if kerb else GROUND)
@@ -42,8 +42,8 @@ def _on_same(
 def see(scene: Scene, T: Floats, lens: Triple, distance: Floats, things: Integers, shapes: Integers) -> None:
     """Fill distance (FAR in the sky), thing and shape of every pixel. `lens`: focal length and centre in pixels.
 
-    Every other pixel of every other row looks through the whole scene. Where the four of them around a pixel agree,
-    only what they show is intersected: nothing thinner than two pixels can stand before it alone.
+    Every second pixel of every second row is cast into the whole scene. Where the four of them around a pixel agree,
+    only their shape is intersected: objects thinner than two pixels may be lost there.
     """
     height, width = distance.shape
     ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]

@@ -1,4 +1,4 @@
-"""A network is asked once for each image, though a run is interrupted and goes on."""
+"""A network segments every image once, though a run is interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Counting:
 
 
 class Interrupted(Exception):
-    """Somebody pulls the plug."""
+    """The run is interrupted."""
 
 
 def stop_at_mapping(stage: str, done: int, total: int) -> None:
@@ -48,8 +48,8 @@ def test_resuming_asks_a_network_nothing_again(small_drive: street.Street, tmp_p
     damaged = tmp_path / "work/answers/7.npz"
     damaged.write_bytes(damaged.read_bytes()[:-40])
     resumed = pipeline.run(log, second, settings, work=tmp_path / "work", resume=True, labels_from="net")
-    assert second.asked == [7], "only what was damaged is asked again"
+    assert second.asked == [7], "only the damaged image is segmented again"
     whole = pipeline.run(log, other, settings, work=tmp_path / "other", resume=True, labels_from="net")
     for name in ("keys", "evidence", "hits"):
         np.testing.assert_array_equal(getattr(resumed.raw.voxels, name), getattr(whole.raw.voxels, name))
-    assert len(other.asked) == len(log.images), "another place has no answers"
+    assert len(other.asked) == len(log.images), "another work folder has no probabilities"

@@ -1,4 +1,4 @@
-"""What a ray hit: its surface, its kind, and how it lies there."""
+"""Surface at the hit point of a ray: material, kind, normal."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def surface_at(
     dz: float,
     t: float,
 ) -> tuple[int, int, Triple, Triple, float]:
-    """What a ray hit after a distance t: surface, kind, normal in the map, place in the model, clump of leaves."""
+    """Surface hit at distance t: material, kind, normal in the map, position in the model, clump of leaves."""
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     if thing in (GROUND, KERB):
         surface = ground_surface(scene.ground, x, y, thing == KERB)

@@ -86,6 +86,10 @@ class Settings(BaseModel):
                 )
         return content
 
+    def changed(self, *overrides: str) -> Settings:
+        """These settings with some `section.name=value` changed; raises ConfigError."""
+        return parse(Settings, overrides, self.model_dump(mode="json"))
+
     def to_yaml(self) -> str:
         """These settings as a file that `load` reads back, each under its description."""
         return "".join(f"{line}\n" for line in _described(self))

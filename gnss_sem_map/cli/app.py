@@ -9,13 +9,17 @@ import warnings
 
 import typer
 
-from gnss_sem_map.cli import evaluation, mapping, segmentation, settings, simulation
+from gnss_sem_map.cli import evaluation, finished, mapping, segmentation, settings, simulation
 from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
 
 COMMANDS = (
     mapping.run,
     mapping.merge,
     mapping.trajectory,
+    finished.refine,
+    finished.relabel,
+    finished.export,
+    finished.view,
     segmentation.segment,
     segmentation.train,
     evaluation.evaluate,

@@ -71,7 +71,7 @@ def run(
                 labels_from=str(segmenter),
                 force=force,
             )
-            about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter)
+            about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter, frames)
     warn(result.stats.warnings)
     print_run(about, out, as_json)
 
@@ -82,7 +82,9 @@ def merge(
     out: Out,
     match: Annotated[
         bool,
-        typer.Option(help="Lay the surfaces of the second onto those of the first: positions of both err."),
+        typer.Option(
+            help="Align the surfaces of the second map with those of the first: positions of both err."
+        ),
     ] = True,
     as_json: Json = False,
 ) -> None:

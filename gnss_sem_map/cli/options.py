@@ -61,28 +61,15 @@ def inputs_of(
 
 def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
     """The drive, with the scans that `--frames` names; raises DataError, and BadParameter for a wrong option."""
-    from dataclasses import replace
-
     from gnss_sem_map.datasets import DriveFormat, open_drive
+    from gnss_sem_map.errors import ConfigError
 
     if drive_format is not None and drive_format not in get_args(DriveFormat):
         raise typer.BadParameter(
             f"found {drive_format!r}, expected one of {get_args(DriveFormat)}", param_hint="--format"
         )
     log = open_drive(drive, cast("DriveFormat | None", drive_format))
-    if frames is None:
-        return log
-    first, last = _frame_range(frames)
-    return replace(log, scans=tuple(scan for scan in log.scans if first <= scan.number < last))
-
-
-def _frame_range(frames: str) -> tuple[int, float]:
-    first, colon, last = frames.partition(":")
     try:
-        if not colon:
-            raise ValueError
-        return int(first or 0), int(last) if last else float("inf")
-    except ValueError:
-        raise typer.BadParameter(
-            f"found {frames!r}, expected A:B with frame numbers", param_hint="--frames"
-        ) from None
+        return log.between(frames)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint="--frames") from None

@@ -1,0 +1,77 @@
+"""Commands on a finished run, without starting over: `refine`, `relabel`, `export`, `view`."""
+
+from __future__ import annotations
+
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gnss_sem_map.cli.console import print_run, progress_bars
+from gnss_sem_map.cli.options import Device, Json, Set
+
+Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
+Other = Annotated[
+    Path | None, typer.Option("-o", "--out", help="Folder to write; default: the run itself is replaced.")
+]
+
+
+def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = False) -> None:
+    """Refine the map of a run again with other settings of the refinement; no scan is matched, no network asked."""
+    from gnss_sem_map.finished_run import Run
+
+    finished = Run.open(run)
+    again = finished.refine(finished.settings.changed(*(set_ or ())), out)
+    print_run(again.about, again.folder, as_json)
+
+
+def relabel(
+    run: Finished,
+    segmenter: Annotated[
+        str, typer.Option(help="Where class probabilities come from: labels:DIR, refinenet:FILE, ...")
+    ],
+    device: Device = "auto",
+    out: Other = None,
+    as_json: Json = False,
+) -> None:
+    """Map the drive of a run again with other labels, along the same trajectory."""
+    from gnss_sem_map.finished_run import Run
+
+    with progress_bars() as progress:
+        again = Run.open(run).relabel(segmenter, out, device=device, progress=progress)
+    print_run(again.about, again.folder, as_json)
+
+
+def export(
+    run: Finished,
+    formats: Annotated[
+        str,
+        typer.Option(
+            "--format", help="Some of viewer, laz, ply, geotiff, topview, perspective; with commas."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder to write; default: the run.")
+    ] = None,
+) -> None:
+    """Write the refined map of a run in some formats."""
+    from gnss_sem_map.finished_run import Run
+
+    for file in Run.open(run).export([name.strip() for name in formats.split(",")], out):
+        typer.echo(str(file))
+
+
+def view(
+    run: Finished,
+    browser: Annotated[bool, typer.Option(help="Open it in a browser, and not only say where it is.")] = True,
+) -> None:
+    """Open the viewer of a run in a browser."""
+    from gnss_sem_map.finished_run import Run
+
+    finished = Run.open(run)
+    file = finished.folder / "viewer.html"
+    if not file.is_file():
+        [file] = finished.export(["viewer"])
+    if not (browser and webbrowser.open(file.resolve().as_uri())):
+        typer.echo(f"open in a browser: {file.resolve()}")

@@ -20,8 +20,17 @@ NOT_UNIT = ("integration", "slow", "faults")
 INTEGRATION_FILES = tuple(
     TESTS / name
     for name in (
+        "factor_graphs/test_calibration.py",
+        "factor_graphs/test_constraints.py",
+        "factor_graphs/test_kalman.py",
+        "factor_graphs/test_real_logs.py",
+        "factor_graphs/test_relative_poses.py",
+        "factor_graphs/test_smoothing.py",
         "faults",
+        "gnss_sem_map/dynamics/test_moving_objects.py",
         "gnss_sem_map/evaluation/preflight",
+        "gnss_sem_map/export/test_every_writer.py",
+        "gnss_sem_map/export/test_pictures.py",
         "gnss_sem_map/mapping/test_surface_heights.py",
         "gnss_sem_map/scans/test_lidar_odometry.py",
         "gnss_sem_map/segmentation/test_checkpoints.py",
@@ -34,8 +43,14 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/test_run_again.py",
     )
 )
-"""Tests of several stages, whole drives or networks; those of the command line stand in this folder itself."""
+"""Tests of several stages, whole drives, whole pictures or networks; those in `TESTS` itself run commands."""
 INTEGRATION_FIXTURES = {"real_data", "browser", "simulation", "town_drive", "whole_drive"}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """The unit tier does not import what it does not run: networks and their packages take long."""
+    is_unit_tier = "not integration" in config.getoption("-m")
+    return True if is_unit_tier and collection_path in INTEGRATION_FILES else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

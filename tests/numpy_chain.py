@@ -139,7 +139,7 @@ class NumpyMap:
         self.sums = np.insert(self.sums, places[~known], sums[~known], axis=0)
 
     def _looks(self, seen: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Evidence (p, c) of class pixels (p, c + 1): probabilities, and the likelihood of the predicted class."""
+        """Evidence (p, c) of class pixels (p, c + 1): probabilities, and likelihood of the predicted class."""
         looks, answer = log_likelihoods(seen, self._logs, self.floor_percent), seen.argmax(axis=1)
         if self.answers is not None:
             looks += np.rint(512 * self.answers).astype(np.int32)[answer]

@@ -30,12 +30,11 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.dynamics.moving_objects import MovingObjects
 from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
-from gnss_sem_map.mapping.moving_points import find_moving
+from gnss_sem_map.mapping.moving_points import MovingObjects, find_moving
 from gnss_sem_map.pipeline import estimate_trajectory
 from gnss_sem_map.refinement.count_grid import count_grid
 from gnss_sem_map.refinement.state import Evidence

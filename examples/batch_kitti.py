@@ -16,8 +16,8 @@ from factor_graphs.errors import FactorGraphError
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.export.run_folder import write_run
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.runs.run_folder import write_run
 from gnss_sem_map.segmentation import open_segmenter
 
 

@@ -6,17 +6,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gnss_sem_map.config import Settings
-    from gnss_sem_map.datasets import open_drive
-    from gnss_sem_map.finished_run import Run, run
+    from gnss_sem_map.runs.finished_run import Run, Settings, open_drive, run
 
 __all__ = ["Run", "Settings", "open_drive", "run"]
-
-_PLACES = {"Run": "finished_run", "Settings": "config", "open_drive": "datasets", "run": "finished_run"}
 
 
 def __getattr__(name: str) -> Any:
     # imported when first asked for: the command line must answer --help at once
-    if name not in _PLACES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+    return getattr(import_module(f"{__name__}.runs.finished_run"), name)

@@ -11,7 +11,6 @@ from typing import Any, Literal, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.files.structured import not_finite, parse_yaml, read_yaml
@@ -19,6 +18,7 @@ from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings
 from gnss_sem_map.scans.projection import LabellingSettings
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 from gnss_sem_map.voxels.voxel_map import MappingSettings
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -34,7 +34,7 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.mapping.surface_heights import measure_surface_heights
 from gnss_sem_map.mapping.trajectory import estimate_trajectory, locate
-from gnss_sem_map.refinement.kerbs import Kerbs
+from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.road_sidewalk import ways
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, run_steps

@@ -13,10 +13,10 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.export.report import write_report
-from gnss_sem_map.export.run_folder import claimed_run, write_run
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs.run_folder import claimed_run, write_run
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels

@@ -99,8 +99,8 @@ def check(
     """The pre-flight: a log against physics, and its sensors against each other; 1 when something is red."""
     from gnss_sem_map.evaluation import preflight
     from gnss_sem_map.evaluation.preflight.findings import Level
-    from gnss_sem_map.export.check_page import check_writable, write_check_page
     from gnss_sem_map.labels.label_set import open_label_set
+    from gnss_sem_map.runs.check_page import check_writable, write_check_page
     from gnss_sem_map.segmentation import open_segmenter
 
     check_writable(out)

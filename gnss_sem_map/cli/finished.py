@@ -19,7 +19,7 @@ Other = Annotated[
 
 def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = False) -> None:
     """Refine the map of a run again with other settings of the refinement; no scan is matched, no network asked."""
-    from gnss_sem_map.finished_run import Run
+    from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
     again = finished.refine(finished.settings.changed(*(set_ or ())), out)
@@ -36,7 +36,7 @@ def relabel(
     as_json: Json = False,
 ) -> None:
     """Map the drive of a run again with other labels, along the same trajectory."""
-    from gnss_sem_map.finished_run import Run
+    from gnss_sem_map.runs.finished_run import Run
 
     with progress_bars() as progress:
         again = Run.open(run).relabel(segmenter, out, device=device, progress=progress)
@@ -56,7 +56,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the refined map of a run in some formats."""
-    from gnss_sem_map.finished_run import Run
+    from gnss_sem_map.runs.finished_run import Run
 
     for file in Run.open(run).export([name.strip() for name in formats.split(",")], out):
         typer.echo(str(file))
@@ -67,7 +67,7 @@ def view(
     browser: Annotated[bool, typer.Option(help="Open it in a browser, and not only say where it is.")] = True,
 ) -> None:
     """Open the viewer of a run in a browser."""
-    from gnss_sem_map.finished_run import Run
+    from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
     file = finished.folder / "viewer.html"

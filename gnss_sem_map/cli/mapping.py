@@ -43,9 +43,9 @@ def run(
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
     from gnss_sem_map import pipeline
-    from gnss_sem_map.export import run_folder
     from gnss_sem_map.files.output_folder import refuse_inputs
     from gnss_sem_map.labels.label_set import open_label_set
+    from gnss_sem_map.runs import run_folder
     from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
 
     settings = settings_of(config, set_)
@@ -89,7 +89,7 @@ def merge(
     as_json: Json = False,
 ) -> None:
     """One map of two runs of the same place, refined again."""
-    from gnss_sem_map.export.merged_run import merge_run_folders
+    from gnss_sem_map.runs.merged_run import merge_run_folders
 
     about = merge_run_folders(first, second, out, match)
     if as_json:
@@ -109,8 +109,8 @@ def trajectory(
 ) -> None:
     """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
     from gnss_sem_map import pipeline
-    from gnss_sem_map.export import run_folder
     from gnss_sem_map.run_stats import RunStats
+    from gnss_sem_map.runs import run_folder
 
     settings = settings_of(config, set_)
     with run_folder.claimed_run(out, inputs_of(drive, config, settings)):

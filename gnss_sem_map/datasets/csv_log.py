@@ -22,7 +22,6 @@ from pydantic import ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu, far_off
-from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_fixes import usable_fixes
 from gnss_sem_map.datasets.stamps import (
@@ -37,6 +36,7 @@ from gnss_sem_map.errors import DataError, PointTimesError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30

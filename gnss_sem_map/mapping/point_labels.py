@@ -15,7 +15,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.mapping.labelled_scans import map_points
-from gnss_sem_map.refinement.kerbs import Kerbs
+from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of

@@ -6,14 +6,14 @@ they stand on the right level all the same, and on the right side of where the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.special import expit
 
 from gnss_sem_map.labels.label_set import UNLABELLED
+from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.road_sidewalk import (
     ROAD,
     RoadEdgeSettings,
@@ -28,8 +28,6 @@ from gnss_sem_map.voxels.voxel_map import SemanticMap, State
 
 REACH = 3
 """Levels of road and sidewalk are those within so many voxels to each side of a kerb."""
-SUREST = 0.98
-"""No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
 
 
 class KerbSettings(RoadEdgeSettings):
@@ -38,57 +36,6 @@ class KerbSettings(RoadEdgeSettings):
     point_stddev_m: float = Field(
         default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Kerbs:
-    """The e voxels of a map where road and sidewalk meet at a step, in order."""
-
-    settings: KerbSettings
-    voxel_size_m: float
-    classes: tuple[int, int]
-    """Road and sidewalk."""
-    rows: NDArray[np.int32]
-    """(v,) place of every voxel of the map among the e, -1 where no kerb is."""
-    leaning: NDArray[np.float32]
-    """(e, 3, 3) probability of road minus that of sidewalk in the voxel and those beside it in x and y, 0 elsewhere."""
-    known: NDArray[np.bool_]
-    """(e, 3, 3) which of those are either of the two."""
-    levels: NDArray[np.float64]
-    """(2, e) m, height of the road and of the sidewalk here."""
-
-    def decide(
-        self, places: NDArray[np.int64], p_map: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int8], NDArray[np.float32]]:
-        """Which of the points (n, 3) m lie in a kerb (k,), the class of each (k,), and how probable that is (k,).
-
-        `places` (n,) are the points' voxels in the map, -1 for none. Two witnesses, independent of each other: log odds
-        of the place, bilinear between the centres of the voxels of one layer, and of the height, two normal
-        distributions around the levels.
-        """
-        rows = np.where(places >= 0, self.rows[places], -1)
-        inside = np.flatnonzero(rows >= 0)
-        rows, p_map = rows[inside], p_map[inside]
-        log_odds = self._of_place(rows, p_map) + self._of_height(rows, p_map[:, 2])
-        road, sidewalk = self.classes
-        chosen = np.where(log_odds >= 0, road, sidewalk).astype(np.int8)
-        return inside, chosen, np.asarray(expit(np.abs(log_odds)), np.float32)
-
-    def _of_place(self, rows: NDArray[np.int32], p_map: NDArray[np.float64]) -> NDArray[np.float64]:
-        from_centre = np.mod(p_map[:, :2] / self.voxel_size_m, 1) - 0.5
-        (x, y), (a, b) = np.where(from_centre < 0, 0, 2).T, np.abs(from_centre).T
-        corners = (
-            (1, 1, (1 - a) * (1 - b)), (x, 1, a * (1 - b)), (1, y, (1 - a) * b), (x, y, a * b)
-        )  # fmt: skip
-        leaning = sum(weight * self.leaning[rows, i, j] for i, j, weight in corners)
-        known = sum(weight * self.known[rows, i, j] for i, j, weight in corners)
-        return np.asarray(2 * np.arctanh(np.clip(leaning / known, -SUREST, SUREST)))
-
-    def _of_height(self, rows: NDArray[np.int32], z: NDArray[np.float64]) -> NDArray[np.float64]:
-        road, sidewalk = self.levels[:, rows]
-        step = sidewalk - road
-        turning = road + self.settings.face_begins * step
-        return np.asarray(step * (turning - z) / self.settings.point_stddev_m**2)
 
 
 def reach_m(settings: KerbSettings, voxel_size_m: float) -> float:
@@ -132,7 +79,16 @@ def find_kerbs(
     sure = np.maximum(2 * semantic_map.confidence[beside] - 1, 0)  # unsure of one is not sure of the other
     leaning = np.where(known, np.where(labels[beside] == classes[ROAD], sure, -sure), np.float32(0))
     levels = np.stack([road[is_step], sidewalk[is_step]])
-    return Kerbs(settings, semantic_map.voxels.voxel_size_m, classes, rows, leaning, known, levels)
+    return Kerbs(
+        settings.face_begins,
+        settings.point_stddev_m,
+        semantic_map.voxels.voxel_size_m,
+        classes,
+        rows,
+        leaning,
+        known,
+        levels,
+    )
 
 
 def _around(

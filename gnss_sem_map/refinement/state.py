@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from gnss_sem_map.dynamics.motion_state import Motion
 from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
+from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
-
-if TYPE_CHECKING:
-    from gnss_sem_map.refinement.kerbs import Kerbs
-    from gnss_sem_map.refinement.vehicles import VehicleObject
 
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""
@@ -55,6 +52,19 @@ class Evidence:
     """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
     surface_heights: SurfaceHeights | None = None
     """How high the surface in a voxel lies, finer than the voxel."""
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleObject:
+    """One group of vehicle voxels and what was decided about it."""
+
+    number: int
+    motion: Motion
+    reason: str
+    voxels: int
+    centre: NDArray[np.float64]
+    """(3,) m, in the map frame."""
+    length_m: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,10 +37,10 @@ from gnss_sem_map.refinement.kerbs import KerbSettings
 from gnss_sem_map.refinement.levels import LevelSettings
 from gnss_sem_map.refinement.potts_mrf import PottsSettings
 from gnss_sem_map.refinement.removed_layer import RemovedLayerSettings
-from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, StepSettings
+from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, StepSettings, VehicleObject
 from gnss_sem_map.refinement.systematic_error import SystematicErrorSettings
 from gnss_sem_map.refinement.unobserved import UnobservedSettings
-from gnss_sem_map.refinement.vehicles import VehicleObject, VehicleSettings
+from gnss_sem_map.refinement.vehicles import VehicleSettings
 from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
 
 

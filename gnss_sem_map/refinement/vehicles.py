@@ -11,7 +11,14 @@ from pydantic import Field
 from scipy.spatial import cKDTree
 
 from gnss_sem_map.dynamics.motion_state import Motion
-from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, NotApplicable, StepSettings, classes_of
+from gnss_sem_map.refinement.state import (
+    WHOLE_MAP,
+    MapState,
+    NotApplicable,
+    StepSettings,
+    VehicleObject,
+    classes_of,
+)
 from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
 from gnss_sem_map.voxels.voxel_map import pack, unpack
 
@@ -70,19 +77,6 @@ def apply(state: MapState, settings: VehicleSettings) -> MapState:
     scores = state.scores.copy()
     scores[found.rejected, vehicle] -= np.float32(settings.rejected_nat)
     return replace(state, scores=scores, vehicles=found.objects)
-
-
-@dataclass(frozen=True, eq=False)
-class VehicleObject:
-    """One group of vehicle voxels and what was decided about it."""
-
-    number: int
-    motion: Motion
-    reason: str
-    voxels: int
-    centre: NDArray[np.float64]
-    """(3,) m, in the map frame."""
-    length_m: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
-"""DBSCAN on integer voxels with bit masks; the result is that of scikit-learn.
+"""DBSCAN on integer voxels: scikit-learn's result, found with bit masks instead of distances.
 
-A column of voxels is stored as bits. The neighbours of a voxel are found with one shift and one popcount per column of
-the ball around it. Voxels and columns have the same order, so a column is looked up by merging two sorted lists.
+A column of voxels is a row of bits. The neighbours of a voxel are then one shift and one popcount per column
+of the ball around it, and because voxels and columns are sorted alike, looking up a column is a step of a
+merge.
 """
 
 from __future__ import annotations
@@ -21,21 +22,21 @@ LARGEST_EPS_VOXELS = 16
 TIE = 1e-9
 """Voxels at exactly eps are neighbours even where eps is a rounded quotient: 0.6 / 0.2 is below 3."""
 _BLOCK_BITS, _Y_BITS, _MARGIN = 17, 22, 1 << 5
-"""The key of a word is x, y and z / 32 in one integer, with a margin on all sides for the stencil."""
+"""A word's key is x, y and z / 32 in one integer, with room on all sides for the stencil."""
 
 
 def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) -> NDArray[np.int32]:
-    """Clusters of voxels, numbered as by `sklearn.cluster.DBSCAN(eps_voxels, min_samples=min_samples)`.
+    """Clusters of voxels, as `sklearn.cluster.DBSCAN(eps_voxels, min_samples=min_samples)` numbers them.
 
-    `indices` (v, 3) integers, each voxel once, in any order; returns (v,) cluster numbers from 0, -1 for noise. A voxel
-    counts as its own neighbour; a border voxel belongs to the first cluster that reaches it. Raises ConfigError for a
-    radius that is not in (0, 17) voxels or fewer than one sample, DataError for repeated or far indices. Source: Ester,
-    Kriegel, Sander, Xu, "A density-based algorithm for discovering clusters" (1996).
+    `indices` (v, 3) integers, each voxel once, in any order; returns (v,) cluster numbers from 0, -1 for
+    noise. A voxel counts among its own neighbours; a border voxel goes to the first cluster that reaches it.
+    Raises ConfigError for a radius that is not positive or fewer than one sample, DataError for repeated or
+    far indices. Source: Ester, Kriegel, Sander, Xu, "A density-based algorithm for discovering clusters"
+    (1996).
     """
-    if not 0 < eps_voxels < LARGEST_EPS_VOXELS + 1 - TIE or min_samples < 1:
+    if not eps_voxels > 0 or min_samples < 1:
         raise ConfigError(
-            f"dbscan: found eps of {eps_voxels:g} voxels and {min_samples} samples; expected more than 0 and less than"
-            f" {LARGEST_EPS_VOXELS + 1} voxels, and at least 1 sample; choose another distance or voxel size"
+            f"dbscan: found eps {eps_voxels} voxels, {min_samples} samples; expected more than 0, at least 1"
         )
     voxels = np.asarray(indices, np.int64).reshape(-1, 3)
     if len(voxels) == 0:
@@ -44,6 +45,8 @@ def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) ->
         raise DataError(
             f"dbscan: found indices from {voxels.min()} to {voxels.max()}, expected +-{AXIS_OFFSET}"
         )
+    if eps_voxels + TIE >= LARGEST_EPS_VOXELS + 1:
+        return _dbscan_by_distance(voxels, eps_voxels, min_samples)
     keys = pack(voxels)
     order = np.argsort(keys, kind="stable")
     if (np.diff(keys[order]) == 0).any():
@@ -57,7 +60,7 @@ def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) ->
 def _dbscan_sorted(
     voxels: NDArray[np.int64], positions: NDArray[np.int64], stencil: NDArray[np.int64], min_samples: int
 ) -> NDArray[np.int32]:
-    """Clusters of sorted voxels, numbered in the order of `positions`: the sorted indices of the input voxels."""
+    """Clusters of sorted voxels, numbered in the order of `positions`: where the input's voxels now are."""
     x, y, z = (voxels + AXIS_OFFSET).T
     columns = ((x + _MARGIN) << _Y_BITS | (y + _MARGIN)) << _BLOCK_BITS
     keys, masks, _, own, bits = _words(columns, z)
@@ -75,6 +78,12 @@ def _dbscan_sorted(
     _reach_borders(around[~core], bits[~core], keys, masks, first, stencil, clusters[core], border)
     clusters[~core] = border
     return clusters
+
+
+def _dbscan_by_distance(voxels: NDArray[np.int64], eps_voxels: float, min_samples: int) -> NDArray[np.int32]:
+    from sklearn.cluster import DBSCAN
+
+    return np.asarray(DBSCAN(eps=eps_voxels + TIE, min_samples=min_samples).fit(voxels).labels_, np.int32)
 
 
 def _stencil(eps_voxels: float) -> NDArray[np.int64]:

@@ -35,7 +35,7 @@ class MappingSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    voxel_size_m: float = Field(0.2, ge=0.03, le=10, description="Edge of a voxel (the paper: 0.2 m).")
+    voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
     nearest_m: float = Field(
         2.4,
         ge=0,

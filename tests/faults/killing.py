@@ -77,7 +77,7 @@ def write_result(out: Path, files: Mapping[str, str]) -> None:
 
 def look_in(out: Path) -> None:
     """The next command that writes there, which ends before it has anything to write."""
-    from gnss_sem_map.export.run_folder import claimed_run
+    from gnss_sem_map.runs.run_folder import claimed_run
 
     with claimed_run(out):
         pass
@@ -85,7 +85,7 @@ def look_in(out: Path) -> None:
 
 def write_run_like(out: Path, files: Mapping[str, str]) -> None:
     """The same where an older version may have written a run without a list."""
-    from gnss_sem_map.export.run_folder import claimed_run
+    from gnss_sem_map.runs.run_folder import claimed_run
 
     with claimed_run(out):
         write_result(out, files)

@@ -25,10 +25,10 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.export.run_folder import about_run, write_point_labels
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
 from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.run_folder import about_run, write_point_labels
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles

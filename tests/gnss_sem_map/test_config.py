@@ -82,7 +82,7 @@ def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
     [
         ("mapping.voxel_sise_m=0.2", "unknown setting 'mapping.voxel_sise_m'; did you mean 'voxel_size_m'"),
         ("maping.voxel_size_m=0.2", "unknown setting 'maping'; did you mean 'mapping'"),
-        ("mapping.voxel_size_m=0", "mapping.voxel_size_m: .*greater than or equal to 0.03"),
+        ("mapping.voxel_size_m=0", "mapping.voxel_size_m: .*greater than 0.01"),
         ("mapping.voxel_size_m=-1", "mapping.voxel_size_m"),
         ("mapping.voxel_size_m=wide", "mapping.voxel_size_m: .*number"),
         ("mapping.voxel_size_m.x=1", "mapping.voxel_size_m: .*number"),

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from gnss_sem_map import config
-from gnss_sem_map.conventions import NAMED_AXES, SensorConventions, matrix_of
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.sensor_log.conventions import NAMED_AXES, SensorConventions, matrix_of
 
 RNG = np.random.default_rng(0)
 STAMPS = np.arange(20) * 0.1

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.conventions import NAMED_AXES, matrix_of
+from gnss_sem_map.sensor_log.conventions import NAMED_AXES, matrix_of
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.conventions import FORCE_UNITS, RATE_UNITS
 from gnss_sem_map.evaluation.preflight import axes, units
 from gnss_sem_map.evaluation.preflight.axes import AxesMistake, Seen
 from gnss_sem_map.evaluation.preflight.clocks import NO_LAG, Lag, lag_of
@@ -20,6 +19,7 @@ from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral
 from gnss_sem_map.evaluation.preflight.own_attitude import course_errors, rate_response
 from gnss_sem_map.evaluation.preflight.response import ForceResponse, TurnGain, force_response, turn_gain
 from gnss_sem_map.evaluation.preflight.track import Track, track_of
+from gnss_sem_map.sensor_log.conventions import FORCE_UNITS, RATE_UNITS
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.conventions import FORCE_UNITS, RATE_UNITS
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral
+from gnss_sem_map.sensor_log.conventions import FORCE_UNITS, RATE_UNITS
 
 Array = NDArray[np.float64]
 

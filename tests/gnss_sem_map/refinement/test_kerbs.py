@@ -18,7 +18,8 @@ from gnss_sem_map.datasets.label_files import read_labels
 from gnss_sem_map.evaluation.metrics import Tables, confusion
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.point_labels import PointLabels, label_points
-from gnss_sem_map.refinement.kerbs import Kerbs, KerbSettings, find_kerbs
+from gnss_sem_map.refinement.kerb_points import Kerbs
+from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
 from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of

@@ -12,11 +12,11 @@ from sensor_drives import FRAME, SETTINGS, drive, findings, wrong
 
 from factor_graphs.measurements import ImuNoise, ImuSamples
 from factor_graphs.simulation import follow, simulate_gnss, simulate_imu
-from gnss_sem_map.conventions import SensorConventions, matrix_of
 from gnss_sem_map.evaluation.preflight.findings import Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.mapping.trajectory import smooth_log
 from gnss_sem_map.sensor_log import Calibration, SensorLog
+from gnss_sem_map.sensor_log.conventions import SensorConventions, matrix_of
 
 Array = NDArray[np.float64]
 

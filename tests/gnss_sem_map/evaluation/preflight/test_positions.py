@@ -13,8 +13,8 @@ from sensor_drives import FRAME, LEVER, drive, findings, wrong
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
 

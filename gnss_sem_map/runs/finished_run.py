@@ -17,7 +17,6 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import DriveFormat, open_drive
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.export import run_folder
 from gnss_sem_map.export.formats import FORMATS, Exported, Format
 from gnss_sem_map.files.output_folder import refuse_inputs
 from gnss_sem_map.files.ownership import amend
@@ -27,10 +26,13 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import run_folder
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.voxel_map import SemanticMap
+
+__all__ = ["Run", "Settings", "open_drive", "run"]
 
 
 def run(

@@ -9,7 +9,6 @@ from typing import Any
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.run_folder import about_map, claimed_run, write_about, write_maps
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
@@ -17,6 +16,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import Laid, merge_runs
 from gnss_sem_map.pipeline import Result, refine_map
 from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_maps
 from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 

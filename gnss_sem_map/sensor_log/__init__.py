@@ -20,8 +20,8 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.conventions import SensorConventions
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
 @dataclass(frozen=True, eq=False)

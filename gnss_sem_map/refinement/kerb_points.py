@@ -1,0 +1,65 @@
+"""Kerbs: a voxel where road meets sidewalk holds both, and place and height say which of them each point is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+SUREST = 0.98
+"""No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kerbs:
+    """The e voxels of a map where road and sidewalk meet at a step, in order."""
+
+    face_begins: float
+    """Share of the step, from the road up, from which on points are sidewalk."""
+    point_stddev_m: float
+    voxel_size_m: float
+    classes: tuple[int, int]
+    """Road and sidewalk."""
+    rows: NDArray[np.int32]
+    """(v,) place of every voxel of the map among the e, -1 where no kerb is."""
+    leaning: NDArray[np.float32]
+    """(e, 3, 3) probability of road minus that of sidewalk in the voxel and those beside it in x and y, 0 elsewhere."""
+    known: NDArray[np.bool_]
+    """(e, 3, 3) which of those are either of the two."""
+    levels: NDArray[np.float64]
+    """(2, e) m, height of the road and of the sidewalk here."""
+
+    def decide(
+        self, places: NDArray[np.int64], p_map: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int8], NDArray[np.float32]]:
+        """Which of the points (n, 3) m lie in a kerb (k,), the class of each (k,), and how probable that is (k,).
+
+        `places` (n,) are the points' voxels in the map, -1 for none. Two witnesses, independent of each other: log odds
+        of the place, bilinear between the centres of the voxels of one layer, and of the height, two normal
+        distributions around the levels.
+        """
+        rows = np.where(places >= 0, self.rows[places], -1)
+        inside = np.flatnonzero(rows >= 0)
+        rows, p_map = rows[inside], p_map[inside]
+        log_odds = self._of_place(rows, p_map) + self._of_height(rows, p_map[:, 2])
+        road, sidewalk = self.classes
+        chosen = np.where(log_odds >= 0, road, sidewalk).astype(np.int8)
+        return inside, chosen, np.asarray(expit(np.abs(log_odds)), np.float32)
+
+    def _of_place(self, rows: NDArray[np.int32], p_map: NDArray[np.float64]) -> NDArray[np.float64]:
+        from_centre = np.mod(p_map[:, :2] / self.voxel_size_m, 1) - 0.5
+        (x, y), (a, b) = np.where(from_centre < 0, 0, 2).T, np.abs(from_centre).T
+        corners = (
+            (1, 1, (1 - a) * (1 - b)), (x, 1, a * (1 - b)), (1, y, (1 - a) * b), (x, y, a * b)
+        )  # fmt: skip
+        leaning = sum(weight * self.leaning[rows, i, j] for i, j, weight in corners)
+        known = sum(weight * self.known[rows, i, j] for i, j, weight in corners)
+        return np.asarray(2 * np.arctanh(np.clip(leaning / known, -SUREST, SUREST)))
+
+    def _of_height(self, rows: NDArray[np.int32], z: NDArray[np.float64]) -> NDArray[np.float64]:
+        road, sidewalk = self.levels[:, rows]
+        step = sidewalk - road
+        turning = road + self.face_begins * step
+        return np.asarray(step * (turning - z) / self.point_stddev_m**2)

@@ -20,7 +20,7 @@ def test_the_paper_s_settings_do_what_the_paper_does_and_no_more(small_drive: St
         f"labels:{small_drive.labels}", open_label_set(), expected_size=log.calibration.image_size
     )
     result = pipeline.run(log, segmenter, settings)
-    assert "scans matched" not in result.account.counts
+    assert "scans matched" not in result.stats.counts
     assert set(result.sharpness) == {"map"}  # nothing to compare with: GNSS and IMU alone made the map
     assert not result.evidence.moving  # the paper looks for what moved in the map, not beside it
     assert not settings.refinement.potts_mrf.enabled

@@ -56,7 +56,7 @@ class LabelCalibration:
         c = len(self.names)
         if not self.drives or not np.isfinite(self.temperature) or self.temperature <= 0:
             raise ConfigError(
-                f"label calibration: found {len(self.drives)} streets and temperature {self.temperature},"
+                f"label calibration: found {len(self.drives)} drives and temperature {self.temperature},"
                 " expected at least one drive and a temperature above 0"
             )
         for drive in self.drives:

@@ -202,7 +202,7 @@ def calibration(folder: Path) -> Reader:
     """What a network's answers are worth."""
     folder.mkdir(parents=True)
     file, n = folder / "calibration.yaml", len(CLASSES)
-    one = sensor_model.Street(
+    one = sensor_model.CalibrationDrive(
         "a", np.full((n, n + 1), 7, np.int64), np.full((n, *sensor_model.CELLS), 2, np.int64)
     )
     file.write_text(sensor_model.LabelCalibration("urban", CLASSES, (one,), 1.5).to_yaml())

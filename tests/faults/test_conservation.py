@@ -281,12 +281,12 @@ def unaccounted(place: Place, harm: Harm, out: Path, with_labels: bool) -> list[
     tiles.write(result.raw, out / "map", log.frame)
     tiles.write(result.refined, out / "refined", log.frame)
     write_point_labels(out, log, result, SETTINGS)
-    about = about_run(place.drive, log, result.account)
+    about = about_run(place.drive, log, result.stats)
     counts, frames = about["counts"], about["skips"]["frames"]
     labelled = {path.stem: path.stat().st_size // 4 for path in (out / "labels").iterdir()}
     removed = sum(int(np.fromfile(path, "<u4").sum()) for path in (out / "removed").iterdir())
     parts = [counts[f"points {part}"] for part in ("left out", "unlabelled", "labelled")]
-    unlabelled = {s.where for s in result.account.skips if s.what == "labels"}
+    unlabelled = {s.where for s in result.stats.skips if s.what == "labels"}
     used = {scan.number for scan in log.scans if scan.name in labelled}
     laws = {
         "points read": (counts["points"], sum(parts)),

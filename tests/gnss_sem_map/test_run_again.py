@@ -181,7 +181,14 @@ def test_two_halves_of_a_drive_merge_into_the_whole(small_drive: Street, whole: 
 
     What moved, and LiDAR odometry, are found from all scans of a run: half a drive knows less, so they are off.
     """
-    off = ("--set", "refinement.vehicles=off", "--set", "trajectory.lidar_odometry=false")
+    off = (
+        "--set",
+        "dynamics.enabled=false",
+        "--set",
+        "refinement.vehicles.enabled=false",
+        "--set",
+        "trajectory.lidar_odometry=false",
+    )
     for name, frames in (("a", "0:6"), ("b", "6:12"), ("both", "0:12")):
         done = run(*run_of(small_drive, tmp_path / name, "--frames", frames, *off))
         assert done.returncode == 0, done.stderr

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -61,14 +61,14 @@ def inputs_of(
 
 def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
     """The drive, with the scans that `--frames` names; raises DataError, and BadParameter for a wrong option."""
-    from gnss_sem_map.datasets import DriveFormat, open_drive
+    from gnss_sem_map.datasets import open_drive, readers
     from gnss_sem_map.errors import ConfigError
 
-    if drive_format is not None and drive_format not in get_args(DriveFormat):
+    if drive_format is not None and drive_format not in readers():
         raise typer.BadParameter(
-            f"found {drive_format!r}, expected one of {get_args(DriveFormat)}", param_hint="--format"
+            f"found {drive_format!r}, expected one of {sorted(readers())}", param_hint="--format"
         )
-    log = open_drive(drive, cast("DriveFormat | None", drive_format))
+    log = open_drive(drive, drive_format)
     try:
         return log.between(frames)
     except ConfigError as error:

@@ -1,41 +1,47 @@
-"""Dataset readers: each reads one folder layout into a `SensorLog`."""
+"""Drives in: every reader turns one folder layout into a `SensorLog`.
+
+A reader is a module of this folder with a `FORMAT`: its name, `SIGNS` (what a drive of it holds, in words),
+`is_drive(folder)`, and `read(folder)`.
+"""
 
 from __future__ import annotations
 
+from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from pkgutil import iter_modules
+from typing import Any
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
+from gnss_sem_map.files.untrusted import inside, is_folder, shown
 from gnss_sem_map.sensor_log import SensorLog
 
-DriveFormat = Literal["kitti-raw", "kitti-odometry", "table"]
+
+@cache
+def readers() -> dict[str, Any]:
+    """All readers by the name of their format."""
+    modules = [import_module(f"{__name__}.{found.name}") for found in iter_modules(__path__)]
+    return {module.FORMAT: module for module in modules if hasattr(module, "FORMAT")}
 
 
-def detect_format(drive: Path) -> DriveFormat:
-    """Detect the format of a drive from its files; raises DataError for an unknown one."""
+def detect_format(drive: Path) -> str:
+    """Say what kind of drive a folder holds, from what is there; raises DataError when it is none."""
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
-    if is_folder(drive / "oxts"):
-        return "kitti-raw"
-    if is_file(drive / "imu.csv") or is_file(drive / "gnss.csv"):
-        return "table"
-    if is_file(drive / "calib.txt") or is_file(drive / "poses.txt"):
-        return "kitti-odometry"
+    fitting = [name for name, reader in readers().items() if reader.is_drive(drive)]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise DataError(f"{shown(drive)}: looks like {' and '.join(fitting)}; say which with --format")
     found = [shown(path.name) for path in inside(drive)][:8]
-    raise DataError(
-        f"{shown(drive)}: no drive that we know; found {found}, expected oxts/ (KITTI raw), calib.txt and poses.txt"
-        " (KITTI odometry, SemanticKITTI), or imu.csv and gnss.csv (table log)"
-    )
+    signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
+    raise DataError(f"{shown(drive)}: no drive that we know; found {found}, expected {signs}")
 
 
-def open_drive(drive: Path, drive_format: DriveFormat | None = None) -> SensorLog:
-    """Open a drive of any known format: tables are read now, scans and images when they are needed."""
-    from gnss_sem_map.datasets import csv_log, kitti_odometry, kitti_raw
-
-    readers = {
-        "kitti-raw": kitti_raw.read,
-        "kitti-odometry": kitti_odometry.read,
-        "table": csv_log.read,
-    }
-    return readers[drive_format or detect_format(drive)](drive)
+def open_drive(drive: Path | str, drive_format: str | None = None) -> SensorLog:
+    """Open a drive of any known format: small things are read now, scans and images when they are needed."""
+    drive = Path(drive)
+    if drive_format is not None and drive_format not in readers():
+        raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
+    log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive)
+    return log

@@ -82,6 +82,14 @@ class LogFile(SensorConventions):
     )
 
 
+FORMAT, SIGNS = "table", "imu.csv and gnss.csv (table log)"
+
+
+def is_drive(drive: Path) -> bool:
+    """Whether a folder looks like one."""
+    return is_file(drive / "imu.csv") or is_file(drive / "gnss.csv")
+
+
 def read(drive: Path) -> SensorLog:
     """Open a table log; raises DataError when a table is missing, malformed or empty."""
     about = _about(drive / "log.yaml")

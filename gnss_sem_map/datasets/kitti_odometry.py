@@ -28,6 +28,14 @@ SIX_DIGITS = 2e-4
 FARTHEST_M = 1e6
 
 
+FORMAT, SIGNS = "kitti-odometry", "calib.txt and poses.txt (KITTI odometry, SemanticKITTI)"
+
+
+def is_drive(drive: Path) -> bool:
+    """Whether a folder looks like one."""
+    return is_file(drive / "calib.txt") or is_file(drive / "poses.txt")
+
+
 def read(sequence: Path) -> SensorLog:
     """Open an odometry sequence; raises DataError when calibration, poses or times are missing or malformed."""
     file = sequence / "calib.txt"

@@ -55,6 +55,14 @@ LEAST_ACCURACY_M = 1e-4
 """Standard deviations must be positive; too small ones are a matter of the pre-flight check."""
 
 
+FORMAT, SIGNS = "kitti-raw", "oxts/ (KITTI raw)"
+
+
+def is_drive(drive: Path) -> bool:
+    """Whether a folder looks like one."""
+    return is_folder(drive / "oxts")
+
+
 def read(drive: Path) -> SensorLog:
     """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed."""
     calibration = _calibration(drive.parent, has_images=is_folder(drive / "image_02"))

@@ -15,7 +15,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.datasets import DriveFormat, open_drive
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.export.formats import FORMATS, Exported, Format
 from gnss_sem_map.files.output_folder import refuse_inputs
@@ -42,7 +42,7 @@ def run(
     settings: Settings | None = None,
     *,
     frames: str | None = None,
-    drive_format: DriveFormat | None = None,
+    drive_format: str | None = None,
     device: str = "auto",
     workers: int = 1,
     resume: bool = False,

@@ -262,7 +262,7 @@ def test_a_damaged_image_and_one_of_another_size_are_named_when_read(copy: Path)
 
 def test_a_folder_that_is_no_drive_says_what_a_drive_looks_like(tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").write_text("")
-    with pytest.raises(DataError, match=r"found \['holiday.jpg'\], expected oxts/"):
+    with pytest.raises(DataError, match=r"found \['holiday.jpg'\], expected .*oxts/"):
         open_drive(tmp_path)
     with pytest.raises(DataError, match="no such folder"):
         open_drive(tmp_path / "nowhere")

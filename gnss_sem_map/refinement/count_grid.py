@@ -38,7 +38,7 @@ class CountGridSettings(StepSettings):
     reach_m: float = Field(
         default=4.0,
         gt=0,
-        description="Voxels at most about this much higher or lower count, m: a crown is no facade.",
+        description="Voxels at most about this much higher or lower count, m: votes stay within one storey.",
     )
     own_limit_nat: float = Field(
         default=1.0,
@@ -169,7 +169,7 @@ def paper_log_odds(
     """Log odds of the first class against the second for every voxel's column (eq. 8 to 10): (v,).
 
     The paper names neither factor of eq. 9. Here the prior is each class's share of the voxels of both, and
-    the likelihood says that every voxel of a column is an independent witness, wrong at `error_rate`.
+    the likelihood says that every voxel of a column is an independent observation, wrong at `error_rate`.
     """
     first, second = count_grid(keys, labels, classes, cell_voxels=1).T
     total = [np.count_nonzero(labels == c) for c in classes]
@@ -191,7 +191,7 @@ def evidence_log_odds(
 
     Prior: flat. Likelihood of the *other* voxels' labels: beta-binomial. In a column of one class the share
     of right labels is not a constant but itself random, Beta(a, b), since one bad view spoils a column as a
-    whole; so a hundred voxels of one opinion count far less than a hundred witnesses. a + b is a setting, and
+    whole; so a hundred voxels of one opinion count far less than a hundred independent ones. a + b is a setting, and
     a and b follow from how often two voxels of one column of this map disagree, which is 2 a b / ((a + b) (a
     + b + 1)). With a = 2, b = 1 the log odds are ln((n1 + 1) / (n2 + 1)).
     """

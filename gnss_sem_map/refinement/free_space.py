@@ -1,7 +1,7 @@
-"""What is left in the map of things that moved: voxels that scan after scan looks through are empty.
+"""Free-space evidence: voxels that rays of keyframe scans traverse repeatedly are removed.
 
-Moving objects are found as objects, and their points are left out. Of some a trail remains: too far away to be
-followed, never in an image, too close to a wall to be told from it. What stands is hit again, wherever one looks from.
+Moving objects are detected before mapping, and their points are left out. Some leave a trail: they are too far away to
+be tracked, in no image, or too close to a wall. Static voxels are hit again from other poses; those of a trail are not.
 """
 
 from __future__ import annotations
@@ -20,52 +20,49 @@ from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 class FreeSpaceSettings(VisibilitySettings, StepSettings):
-    """How often a voxel is seen through before it is empty; witnesses are scans 1 m or 1 s apart."""
+    """How often a voxel must be traversed before it is removed; keyframe scans are 1 m or 1 s apart."""
 
-    least_through: int = Field(default=6, ge=1, description="So many witnesses saw through it,")
-    through_per_hit: float = Field(default=3.0, gt=0, description="so many times as often as hit it,")
-    points_per_through: float = Field(
-        default=2.0, gt=0, description="and so many points it holds at most for each."
+    least_through: int = Field(
+        default=6, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
+    through_per_hit: float = Field(default=3.0, gt=0, description="least ratio of misses to hits,")
+    points_per_through: float = Field(default=2.0, gt=0, description="and most points in the voxel per miss.")
     farthest_m: float = Field(
         default=80.0,
         gt=0,
-        description="Farther scans do not hits_and_misses, m: a voxel needs no outline, as objects do.",
+        description="Scans farther than this are no evidence, m; farther than for objects, which need an outline.",
     )
     over_m: tuple[float, float] = Field(
-        default=(0.4, 3.0), description="Only what stands over something, so far at least and at most, m."
+        default=(0.4, 3.0),
+        description="Only voxels with another one so far below them (least, most), m: the ground stays.",
     )
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
-    """What a voxel stands over; keyframes are asked from wherever they are."""
+    """The voxels below; keyframe scans are used wherever they are."""
     return settings.over_m[1] + voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
-    """Remove the voxels that keyframe scans repeatedly look through; see `seen_through`."""
+    """Remove the voxels that rays traverse repeatedly; see `traversed`."""
     if state.beside.keyframes is None:
         raise NotApplicable("no keyframe scans with poses from LiDAR odometry")
-    return replace(
-        state, removed=state.removed | seen_through(state.voxels, state.beside.keyframes, settings)
-    )
+    return replace(state, removed=state.removed | traversed(state.voxels, state.beside.keyframes, settings))
 
 
-def seen_through(
-    voxels: VoxelMap, witnesses: KeyframeScans, settings: FreeSpaceSettings
-) -> NDArray[np.bool_]:
-    """Which voxels (v,) are empty, by what the witnesses say of their centres.
+def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
+    """Which voxels (v,) are free space, by the rays through their centres.
 
-    Only with poses that scan matching has made sharp: who stands half a metre off looks through walls. The ground is
-    never empty, though one who looks along it sees through its voxels: what moved stood over it.
+    Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
+    because grazing rays traverse them.
     """
     high = np.flatnonzero(
         _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in settings.over_m])
     )
-    hits, throughs = hits_and_misses(voxels.centres[high], witnesses, settings)
-    empty = throughs >= settings.least_through
-    empty &= throughs > settings.through_per_hit * hits
-    empty &= voxels.hits[high] < settings.points_per_through * throughs
+    hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings)
+    empty = misses >= settings.least_through
+    empty &= misses > settings.through_per_hit * hits
+    empty &= voxels.hits[high] < settings.points_per_through * misses
     cleared = np.zeros(len(voxels), np.bool_)
     cleared[high[empty]] = True
     return cleared

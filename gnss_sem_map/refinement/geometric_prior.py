@@ -65,7 +65,7 @@ def against(
 ) -> NDArray[np.float32]:
     """What heights (v,) m over ground and flatness (v,) add to the log scores: (v, c), zero or negative, nat.
 
-    A flatness that is not known, NaN, breaks no rule. The rules are hand-written and soft: a few looks that agree
+    A flatness that is not known, NaN, breaks no rule. The rules are soft: a few observations that agree
     outweigh them. How low a vehicle reaches is left to the vehicle rules, which know its object.
     """
     steep, level = flatness < settings.way_least_flatness, flatness > settings.level_flatness

@@ -1,4 +1,4 @@
-"""Kerbs: a voxel where road meets sidewalk holds both, and place and height say which of them each point is."""
+"""Points of kerbs: a voxel where road meets sidewalk holds both; position and height classify each point."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 SUREST = 0.98
-"""No place alone is surer of road against sidewalk, as a difference of probabilities: height must have its say."""
+"""Upper limit of the difference of probabilities by position alone, so that height can change it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Kerbs:
     ) -> tuple[NDArray[np.int64], NDArray[np.int8], NDArray[np.float32]]:
         """Which of the points (n, 3) m lie in a kerb (k,), the class of each (k,), and how probable that is (k,).
 
-        `places` (n,) are the points' voxels in the map, -1 for none. Two witnesses, independent of each other: log odds
+        `places` (n,) are the points' voxels in the map, -1 for none. Two independent sources: log odds
         of the place, bilinear between the centres of the voxels of one layer, and of the height, two normal
         distributions around the levels.
         """

@@ -1,7 +1,7 @@
-"""Kerbs: a voxel where road meets sidewalk holds both, and every point in it says by place and height which it is.
+"""Kerbs: voxels where road meets sidewalk at a step; their points are classified one by one.
 
-A voxel is wider than a kerb and higher than its step. Whatever the map calls it, some of its points are the other one;
-they stand on the right level all the same, and on the right side of where the map's two classes meet.
+A voxel is wider than a kerb and higher than its step, so it holds points of both classes. Each point lies on the level
+of its class, and on its side of the edge between the two classes of the map.
 """
 
 from __future__ import annotations

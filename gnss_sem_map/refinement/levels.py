@@ -1,9 +1,9 @@
-"""Levels: road and sidewalk lie on two planes a step apart, and the height of a voxel's surface says on which it lies.
+"""Levels: road and sidewalk lie on two parallel planes, and the height of a voxel's surface says on which it lies.
 
-Where a network takes the gaps between cars on a sidewalk for road, it does so in every image, and neighbours only
-confirm each other. Height is a witness of its own. Around every place the ground is fitted by two parallel planes, with
-every voxel on each as far as its class is probable, and its class in turn by how near it lies to each: expectation
-maximisation (Dempster, Laird, Rubin 1977). Where there are not clearly two planes, height says nothing.
+A network may call the gaps between parked cars on a sidewalk road in every image, so neighbours do not help. Height
+is independent evidence. Around every cell of the ground two parallel planes are fitted by expectation maximisation
+(Dempster, Laird, Rubin 1977): each voxel belongs to each plane with the probability of its class, and that probability
+follows from its distance to the planes. Height is used only where the two planes are clearly separated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ROUNDS = 6
 CLEARLY_TWO = 2.0
 """Least distance of two normal distributions, in standard deviations, that are seen to be two (Ashman et al. 1994)."""
 SUREST = 0.98
-"""No image is surer of road against sidewalk: height must have its say."""
+"""Upper limit of the images' probability of road against sidewalk, so that height can change it."""
 X, Y, ON_SIDEWALK, Z = 1, 2, 3, 4
 """Of the terms of a fit; the first is one."""
 
@@ -68,7 +68,7 @@ def apply(state: MapState, settings: LevelSettings) -> MapState:
 def split_levels(
     semantic_map: SemanticMap, heights: NDArray[np.float64], settings: LevelSettings
 ) -> SemanticMap:
-    """The map with road and sidewalk told apart by height as well, where the two lie on clearly two levels.
+    """The map with road and sidewalk split by height as well, where the two levels are clearly separated.
 
     `heights` (v,) m: of every voxel's surface, NaN where unknown. Nothing else changes.
     """

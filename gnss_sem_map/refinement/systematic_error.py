@@ -1,4 +1,4 @@
-"""How often the images err in all views alike: estimated from the map itself, without any truth."""
+"""Systematic (view-correlated) label errors: their rate, estimated from the map itself, without ground truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gnss_sem_map.refinement.potts_mrf import PottsSettings, mean_field
 from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings
 
 MOST = 0.5
-"""A map that is wrong more often than right cannot tell."""
+"""Upper limit of the estimate."""
 NEIGHBOURS = PottsSettings()
 
 
@@ -47,30 +47,29 @@ def apply(state: MapState, settings: SystematicErrorSettings) -> MapState:
 
 
 def systematic_errors(
-    first: NDArray[np.bool_], second: NDArray[np.bool_], looks: NDArray[np.floating]
+    first: NDArray[np.bool_], second: NDArray[np.bool_], observations: NDArray[np.floating]
 ) -> float:
-    """Share of looks, 0 to 0.5, whose class is wrong however often the place is looked at: capture and recapture.
+    """Share of observations, 0 to 0.5, that are wrong in all views alike, by capture and recapture.
 
-    `first` and `second` (v,) are the voxels in which two witnesses that know nothing of each other (say, geometry and
-    neighbours) overrule the images; a voxel counts with its `looks` (v,). Of the errors that the second one finds, the
-    first finds a share, and so it finds that share of all errors: all = first * second / both. Without a second witness
-    what the one finds is all that is known.
+    `first` and `second` (v,) are the voxels in which two independent sources (geometry and neighbours) overrule the
+    images; a voxel is weighted with its `observations` (v,). The first source finds the same share of all errors as of
+    those that the second one finds: all = first * second / both. With one source only, its errors are the estimate.
     Source: Chapman, "Some properties of the hypergeometric distribution" (1951), which is unbiased for small numbers.
     """
-    if not len(looks):
+    if not len(observations):
         return 0.0
-    weight = looks / looks.mean()
+    weight = observations / observations.mean()
     by_first, by_second, by_both = (float(weight[found].sum()) for found in (first, second, first & second))
     errors = (by_first + 1) * (by_second + 1) / (by_both + 1) - 1
-    return min(errors / len(looks), MOST)
+    return min(errors / len(observations), MOST)
 
 
 def doubted(
     probabilities: NDArray[np.float32], systematic: float | NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Class probabilities (v, c) where all views may err alike, and then any class is as likely as another.
+    """Class probabilities (v, c), mixed with the uniform distribution by the rate of systematic errors.
 
-    `systematic` is the share of such errors, one for all or (v, 1).
+    `systematic` is that rate, one for all or (v, 1).
     """
     uniform = np.float32(1 / probabilities.shape[1])
     return np.asarray(probabilities + systematic * (uniform - probabilities), np.float32)

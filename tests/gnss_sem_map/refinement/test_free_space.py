@@ -10,7 +10,7 @@ from gnss_sem_map.dynamics import range_images, visibility
 from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.dynamics.visibility import POINTS_PER_BLOCK, KeyframeScans, KeyframeSelector
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.free_space import FreeSpaceSettings, seen_through
+from gnss_sem_map.refinement.free_space import FreeSpaceSettings, traversed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.voxels.voxel_map import State, VoxelMap, VoxelTable, keys_of
@@ -61,7 +61,7 @@ def street_map(*more: NDArray[np.float64]) -> VoxelMap:
 
 def cleared(voxels: VoxelMap, settings: FreeSpaceSettings | None = None) -> NDArray[np.bool_]:
     witnesses = KeyframeScans.of([witness(x) for x in STREET])
-    return seen_through(voxels, witnesses, settings or FreeSpaceSettings())
+    return traversed(voxels, witnesses, settings or FreeSpaceSettings())
 
 
 def test_a_trail_is_cleared_and_what_stands_stays() -> None:

@@ -132,7 +132,7 @@ class Run:
             self.trajectory, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
         )
         log = self.drive() if is_folder(self.folder / "labels") else None
-        return self._written(out, result, settings, log, {})
+        return self._written(out, result, settings, log, {}, same_map=True)
 
     def relabel(
         self,
@@ -196,10 +196,11 @@ class Run:
         settings: Settings,
         log: SensorLog | None,
         changed: dict[str, Any],
+        same_map: bool = False,
     ) -> Run:
         place = self.folder if out is None else Path(out)
         tracked = self.about["map"]["refinement"] if not result.refinement.tracked else None
-        run_folder.write_again(place, self.folder, result, settings, log, changed, tracked)
+        run_folder.write_again(place, self.folder, result, settings, log, changed, tracked, same_map)
         return Run(place)
 
 

@@ -12,11 +12,10 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import Laid, merge_runs
 from gnss_sem_map.pipeline import Result, refine_map
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_maps
+from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_raw, write_refined
 from gnss_sem_map.voxels.voxel_map import SemanticMap
 
 
@@ -61,8 +60,8 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
         "match": _about(merged.laid),
     }
     with new_folder(out) as folder:
-        write_maps(folder, result, frame, result.trajectory, str(about["name"]))
-        evidence.write(merged.evidence, folder, frame)
+        write_raw(folder, result, frame)
+        write_refined(folder, result, frame, result.trajectory, str(about["name"]))
         write_about(folder, settings, about, {})
     return about
 

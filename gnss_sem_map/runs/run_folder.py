@@ -73,8 +73,8 @@ def write_run(
         with result.stats.stage("export"):
             _write_trajectory(folder, log, result.trajectory, result.solution)
             driven = _while_mapping(result.trajectory, log)
-            write_maps(folder, result, log.frame, driven, log.name)
-            evidence.write(result.evidence, folder, log.frame)
+            write_raw(folder, result, log.frame)
+            write_refined(folder, result, log.frame, driven, log.name)
             if write_labels:
                 write_point_labels(folder, log, result, settings)
         about = about_run(drive, log, result.stats) | {
@@ -98,12 +98,13 @@ def write_again(
     log: SensorLog | None,
     changed: dict[str, Any],
     tracked: dict[str, Any] | None = None,
+    same_map: bool = False,
 ) -> dict[str, Any]:
     """Write a finished run once more, with another map of the same drive; returns the content of run.json.
 
     What stays is copied from `source`, which may be `out`; scores of the map before do not. Point labels are written
     where there is a `log`. `changed` is what run.json says anew, `tracked` what it said of moving objects, where they
-    were not sought again.
+    were not sought again. `same_map`: only the refinement differs.
     """
     about, metrics = read_run(source), read_json(source / "metrics.json")
     first, last = about["scans_s"]
@@ -113,8 +114,12 @@ def write_again(
         frame = tiles.read_frame(source / "map")
         driven = between(result.trajectory, first, last)
         with result.stats.stage("export"):
-            write_maps(folder, result, frame, driven, str(about["name"]))
-            evidence.write(result.evidence, folder, frame)
+            if same_map:
+                for part in ("map", evidence.FOLDER):
+                    shutil.copytree(source / part, folder / part)
+            else:
+                write_raw(folder, result, frame)
+            write_refined(folder, result, frame, driven, str(about["name"]))
             if log is not None:
                 write_point_labels(folder, log, result, settings)
         about |= changed | {
@@ -129,10 +134,16 @@ def write_again(
     return about
 
 
-def write_maps(
+def write_raw(folder: Path, result: Result, frame: LocalFrame | None) -> None:
+    """The map before refinement, and what is known beside it."""
+    tiles.write(result.raw, folder / "map", frame)
+    evidence.write(result.evidence, folder, frame)
+
+
+def write_refined(
     folder: Path, result: Result, frame: LocalFrame | None, driven: Trajectory, title: str
 ) -> None:
-    tiles.write(result.raw, folder / "map", frame)
+    """The refined map, as tiles and in all formats."""
     tiles.write(result.refined, folder / "refined", frame)
     write_exports(Exported(result.refined, frame, driven, title), folder)
 

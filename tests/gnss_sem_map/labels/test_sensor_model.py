@@ -113,7 +113,7 @@ def test_another_class_sets_file_is_an_error(tmp_path: Path) -> None:
         ("format", 99, "format"),
         ("temperature", -1.0, "temperature -1.0"),
         ("temperature", "warm", "could not convert"),
-        ("streets", [], "0 streets"),
+        ("streets", [], "0 drives"),
         ("streets", [{"name": "x", "answers": [[1, 2]], "cells": [[[1]]]}], r"answers \(1, 2\)"),
         ("streets", [{"name": "x"}], "answers"),
     ],

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.export.report import write_report
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.run_stats import Progress, RunStats, silent
-from gnss_sem_map.runs.run_folder import claimed_run, write_run
+from gnss_sem_map.runs.finished_run import run_log
+from gnss_sem_map.runs.run_folder import claimed_run
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
@@ -79,9 +80,7 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
 
     drive, spec = world / drive.relative_to(folder), f"labels:{world / PROBABILITIES}"
     log = open_drive(drive)
-    segmenter = open_segmenter(spec, label_set, expected_size=log.calibration.image_size)
-    result = pipeline.run(log, segmenter, settings, progress)
-    about = write_run(out, drive, log, result, settings, write_labels=True, segmenter=spec)
+    about = run_log(log, drive, out, spec, settings, write_labels=True, progress=progress).about
     metrics = score_run(out, drive / "truth")
     write_report(out, about, metrics)
     return Demo(

@@ -20,7 +20,6 @@ from gnss_sem_map.cli.options import (
     Out,
     Segmenter,
     Set,
-    inputs_of,
     open_log,
     settings_of,
 )
@@ -42,37 +41,24 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Trajectory, semantic map, refined map and all exports of one drive."""
-    from gnss_sem_map import pipeline
-    from gnss_sem_map.files.output_folder import refuse_inputs
-    from gnss_sem_map.labels.label_set import open_label_set
-    from gnss_sem_map.runs import run_folder
-    from gnss_sem_map.segmentation import no_segmenter_message, open_segmenter
+    from gnss_sem_map.runs.finished_run import run_log
+    from gnss_sem_map.runs.run_folder import claimed_run, places_read
+    from gnss_sem_map.segmentation import no_segmenter_message
 
     settings = settings_of(config, set_)
-    with run_folder.claimed_run(out, inputs_of(drive, config, settings, segmenter)) as claim:
+    with claimed_run(out, places_read(drive, settings, segmenter, config)):
         log = open_log(drive, drive_format, frames)
-        refuse_inputs(claim.out, sorted(log.folders))
-        network = None
         if segmenter is None and log.images:
             typer.echo(no_segmenter_message(str(drive)), err=True)
             raise typer.Exit(1)
-        if segmenter not in (None, "none"):
-            label_set = open_label_set(settings.classes)
-            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
         with progress_bars() as progress:
-            result = pipeline.run(
-                log,
-                network,
-                settings,
-                progress,
-                work=claim.work,
-                resume=resume,
-                workers=workers,
-                labels_from=str(segmenter),
-                force=force,
-            )
-            about = run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter, frames)
-    warn(result.stats.warnings)
+            finished = run_log(
+                log, drive, out, segmenter, settings,
+                frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
+                force=force, progress=progress,
+            )  # fmt: skip
+    about = finished.about
+    warn(about["warnings"])
     print_run(about, out, as_json)
 
 
@@ -113,7 +99,7 @@ def trajectory(
     from gnss_sem_map.runs import run_folder
 
     settings = settings_of(config, set_)
-    with run_folder.claimed_run(out, inputs_of(drive, config, settings)):
+    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, config=config)):
         log = open_log(drive, drive_format, None)
         stats = RunStats(skips=list(log.skips))
         page = pipeline.check_drive(log, None, settings, stats, force)

@@ -50,15 +50,6 @@ def settings_of(file: Path | None, overrides: list[str] | None) -> Settings:
     return config.load(file, overrides or ())
 
 
-def inputs_of(
-    drive: Path, config: Path | None, settings: Settings, segmenter: str | None = None
-) -> list[Path | str | None]:
-    """Every place that a run reads, as far as it is known before the drive is opened."""
-    place = (segmenter or "").partition(":")[2].partition("?")[0]
-    classes = settings.classes if Path(settings.classes).suffix else None
-    return [drive, config, place or None, settings.calibration, classes]
-
-
 def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
     """The drive, with the scans that `--frames` names; raises DataError, and BadParameter for a wrong option."""
     from gnss_sem_map.datasets import open_drive, readers

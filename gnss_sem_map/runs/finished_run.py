@@ -56,18 +56,40 @@ def run(
     PreflightError where the drive looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
-    place = segmenter.partition(":")[2].partition("?")[0] or None
-    classes = settings.classes if Path(settings.classes).suffix else None
-    with run_folder.claimed_run(out, [drive, place, settings.calibration, classes]) as claim:
+    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)):
         log = open_drive(drive, drive_format).between(frames)
+        return run_log(
+            log, drive, out, segmenter, settings,
+            frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
+            force=force, progress=progress,
+        )  # fmt: skip
+
+
+def run_log(
+    log: SensorLog,
+    drive: Path,
+    out: Path,
+    segmenter: str | None,
+    settings: Settings,
+    *,
+    frames: str | None = None,
+    device: str = "auto",
+    workers: int = 1,
+    resume: bool = False,
+    write_labels: bool = False,
+    force: bool = False,
+    progress: Progress = silent,
+) -> Run:
+    """Map a drive that is open already; `drive` and `frames` say what `log` was opened from. See `run`."""
+    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
         refuse_inputs(claim.out, sorted(log.folders))
         network = None
-        if segmenter != "none":
+        if segmenter not in (None, "none"):
             label_set = open_label_set(settings.classes)
-            network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
+            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
         result = pipeline.run(
             log, network, settings, progress,
-            work=claim.work, resume=resume, workers=workers, labels_from=segmenter, force=force,
+            work=claim.work, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
         )  # fmt: skip
         run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter, frames)
     return Run(out)

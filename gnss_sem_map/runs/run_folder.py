@@ -57,6 +57,15 @@ def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> Abstract
     return claimed(out, inputs, is_run_file)
 
 
+def places_read(
+    drive: Path, settings: Settings, segmenter: str | None = None, config: Path | None = None
+) -> list[Path | str | None]:
+    """Every place that a run reads, as far as it is known before the drive is opened."""
+    place = (segmenter or "").partition(":")[2].partition("?")[0]
+    classes = settings.classes if Path(settings.classes).suffix else None
+    return [drive, config, place or None, settings.calibration, classes]
+
+
 def write_run(
     out: Path,
     drive: Path,

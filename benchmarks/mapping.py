@@ -46,7 +46,8 @@ from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.kernels import _prefetch
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelTable
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelTable
 
 SETTINGS = Settings()
 SIZE = SETTINGS.mapping.voxel_size_m

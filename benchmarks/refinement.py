@@ -43,7 +43,8 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import keys_of, pack
 
 URBAN = open_label_set()
 TABLES = Tables.of(URBAN)

@@ -44,7 +44,8 @@ from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, answers_folder
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 __all__ = ["Result", "check_drive", "estimate_trajectory", "map_drive", "refine_map", "run"]
 

@@ -13,7 +13,7 @@ from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 
 @dataclass(frozen=True, eq=False)

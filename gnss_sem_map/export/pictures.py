@@ -16,7 +16,7 @@ from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
 from gnss_sem_map.export.render import FACE_LIGHT, Camera, draw_cubes, hollows
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

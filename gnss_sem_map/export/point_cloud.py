@@ -14,7 +14,8 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.utm import to_utm
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, unpack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import unpack
 
 if TYPE_CHECKING:
     import laspy

@@ -15,7 +15,7 @@ from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, drawable, visible
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import UNLABELLED
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 NOTHING = -2
 """Label of a cell without any voxel."""

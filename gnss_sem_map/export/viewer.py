@@ -20,7 +20,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.raster import NO_VOXELS
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import pack
 
 AXIS_BYTES = 3
 """A zigzag difference of 21-bit voxel indices fits 22 bits."""

@@ -18,7 +18,8 @@ from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 FOLDER = "evidence"
 MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (

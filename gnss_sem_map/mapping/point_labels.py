@@ -18,7 +18,8 @@ from gnss_sem_map.mapping.labelled_scans import map_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import keys_of
 
 
 @dataclass(frozen=True, eq=False)

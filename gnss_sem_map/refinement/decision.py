@@ -11,7 +11,8 @@ from pydantic import Field
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.state import MapState, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, entropy_of, softmax
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State, entropy_of
+from gnss_sem_map.voxels.voxel_map import softmax
 
 
 class DecisionSettings(StepSettings):

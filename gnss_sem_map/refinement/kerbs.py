@@ -24,7 +24,7 @@ from gnss_sem_map.refinement.road_sidewalk import (
     ways,
 )
 from gnss_sem_map.refinement.state import MapState
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 REACH = 3
 """Levels of road and sidewalk are those within so many voxels to each side of a kerb."""

@@ -27,7 +27,8 @@ from gnss_sem_map.refinement.road_sidewalk import (
     ways,
 )
 from gnss_sem_map.refinement.state import MapState
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import keys_of
 
 CELL_M = 2.0
 REACH = (3, 3, 1)

@@ -8,7 +8,8 @@ import numpy as np
 
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, entropy_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State, entropy_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 class RemovedLayerSettings(StepSettings):

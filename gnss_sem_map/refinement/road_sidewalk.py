@@ -13,7 +13,7 @@ from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.kernels import AXIS_BITS
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 ROAD, SIDEWALK = 0, 1
 """Which of the two `ways` is which."""

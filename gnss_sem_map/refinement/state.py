@@ -17,7 +17,8 @@ from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""

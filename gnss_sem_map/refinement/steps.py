@@ -41,7 +41,8 @@ from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, Ste
 from gnss_sem_map.refinement.systematic_error import SystematicErrorSettings
 from gnss_sem_map.refinement.unobserved import UnobservedSettings
 from gnss_sem_map.refinement.vehicles import VehicleSettings
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 class RefinementSettings(BaseModel):

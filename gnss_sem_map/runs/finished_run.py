@@ -30,7 +30,7 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 __all__ = ["Run", "Settings", "open_drive", "run"]
 

@@ -16,7 +16,7 @@ from gnss_sem_map.mapping.merging import Laid, merge_runs
 from gnss_sem_map.pipeline import Result, refine_map
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_raw, write_refined
-from gnss_sem_map.voxels.voxel_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 
 def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:

@@ -27,7 +27,8 @@ from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_OFFSET
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, pack, unpack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack, unpack
 
 TILE_BITS = 9
 Z_BITS = 14

@@ -229,7 +229,8 @@ def run_json(folder: Path) -> Reader:
 def small_map(folder: Path) -> Path:
     """The folder of a map of some voxels."""
     from factor_graphs.geodesy import LocalFrame
-    from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
+    from gnss_sem_map.voxels.semantic_map import SemanticMap
+    from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
     rng = np.random.default_rng(0)
     keys = np.unique(pack(rng.integers(-300, 300, (400, 3))))

@@ -6,7 +6,8 @@ import pytest
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 VOXEL_M = 0.2
 LABELS = open_label_set()

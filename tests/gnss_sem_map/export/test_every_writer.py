@@ -17,7 +17,7 @@ from gnss_sem_map.export.point_cloud import visible, write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.viewer import write_viewer
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
 

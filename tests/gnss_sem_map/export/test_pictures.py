@@ -11,7 +11,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.render import Camera
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 NAMES = open_label_set().names
 

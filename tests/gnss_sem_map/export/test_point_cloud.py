@@ -11,7 +11,8 @@ from pyproj import Geod, Proj
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, tmp_path: Path) -> None:

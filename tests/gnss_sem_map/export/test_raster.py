@@ -17,7 +17,7 @@ from gnss_sem_map.export.raster import (
     write_topview_geotiff,
 )
 from gnss_sem_map.export.utm import from_utm, to_utm
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 AT_THE_EDGE_OF_A_ZONE = LocalFrame(60.0, 6.02, 40.0)  # convergence -2.6 degrees
 

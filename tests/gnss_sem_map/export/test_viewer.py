@@ -24,7 +24,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 
 def part(page: str, name: str) -> str:

@@ -32,7 +32,8 @@ from gnss_sem_map.segmentation import Segmenter, open_segmenter
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 from gnss_sem_map.sensor_log import Image, Skip, file_of
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 URBAN = open_label_set()
 

@@ -18,7 +18,8 @@ from gnss_sem_map.mapping.merging import into_frame, lay_onto, merge, merge_runs
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import refine
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
 URBAN = open_label_set()
 HERE, THERE = LocalFrame(49.011, 8.423, 112.0), LocalFrame(49.0135, 8.4275, 120.0)

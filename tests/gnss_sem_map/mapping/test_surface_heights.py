@@ -14,7 +14,8 @@ from gnss_sem_map.mapping.fusion import build_map
 from gnss_sem_map.mapping.labelled_scans import map_points
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.simulation import simulate
-from gnss_sem_map.voxels.voxel_map import SemanticMap, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import keys_of
 
 
 @pytest.fixture(scope="module")

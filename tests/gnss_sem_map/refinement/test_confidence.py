@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
-from gnss_sem_map.voxels.voxel_map import State, VoxelMap, entropy_of, pack
+from gnss_sem_map.voxels.semantic_map import State, entropy_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 URBAN = open_label_set("urban")
 BUILDING = URBAN.index("building")

@@ -13,7 +13,8 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings, traversed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
-from gnss_sem_map.voxels.voxel_map import State, VoxelMap, VoxelTable, keys_of
+from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
 URBAN, MOTION = open_label_set(), MotionSettings()
 EYE_M = 1.8

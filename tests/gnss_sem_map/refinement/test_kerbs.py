@@ -22,7 +22,8 @@ from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
 URBAN = open_label_set()
 ROAD, SIDEWALK, BUILDING = (URBAN.index(name) for name in ("road", "sidewalk", "building"))

@@ -15,7 +15,8 @@ from gnss_sem_map.refinement import kerbs, levels
 from gnss_sem_map.refinement.levels import LevelSettings, split_levels
 from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, keys_of
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
 URBAN = open_label_set()
 ROAD, SIDEWALK, BUILDING = (URBAN.index(name) for name in ("road", "sidewalk", "building"))

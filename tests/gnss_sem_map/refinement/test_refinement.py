@@ -9,7 +9,8 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.removed_layer import with_removed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
-from gnss_sem_map.voxels.voxel_map import SemanticMap, State, VoxelMap, VoxelTable, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, pack
 
 OFF = {"enabled": False}
 URBAN = open_label_set("urban")

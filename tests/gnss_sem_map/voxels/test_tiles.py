@@ -14,7 +14,8 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.voxel_map import SemanticMap, VoxelMap, pack
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 URBAN, FRAME = open_label_set(), LocalFrame(49.0, 8.4, 110.0)
 

@@ -7,11 +7,10 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import betaincc, ndtr
 
 from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
-from gnss_sem_map.dynamics.visibility import VisibilitySettings
 
 LEAST_TRACKED_POINTS = 5
 """Smaller segments are not tracked; each is classified on its own."""
@@ -37,8 +36,10 @@ class Motion(StrEnum):
 GONE = (Motion.MOVING, Motion.STOPPED_AND_LEFT)
 
 
-class MotionSettings(VisibilitySettings):
+class MotionSettings(BaseModel):
     """Thresholds of the search for moving objects."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = Field(default=True, description="Whether moving objects are sought before mapping.")
     segment_eps_m: float = Field(default=0.7, gt=0, le=3, description="DBSCAN distance of segments, m.")
@@ -60,6 +61,7 @@ class MotionSettings(VisibilitySettings):
     least_through_per_hit: float = Field(
         default=0.25, ge=0, description="and the points of the track have at least so many misses per hit."
     )
+    farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
     window_scans: int = Field(
         default=150,
         ge=10,

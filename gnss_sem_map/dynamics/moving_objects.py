@@ -135,7 +135,7 @@ class MovingObjectDetector:
         sums = np.concatenate([part.sums for part in parts])
         centroids = np.stack([np.bincount(row, sums[:, axis]) / points for axis in range(3)], axis=1)
         here = [(seen.image, seen.T_lidar_map) for seen in observations]
-        counts = hits_and_misses(centroids, KeyframeScans.of(self._past + here), self._settings)
+        counts = hits_and_misses(centroids, KeyframeScans.of(self._past + here), self._settings.farthest_m)
         counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
         return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.scans.prefetch import prefetch
@@ -18,17 +17,10 @@ POINTS_PER_BLOCK = 1 << 14
 """Positions that one thread works on at a time."""
 APART_M, APART_S = 1.0, 1.0
 """Distance and time between keyframe scans, whichever comes first: the scans take no more memory than the map."""
-
-
-class VisibilitySettings(BaseModel):
-    """When a range that a scan measured speaks of a place."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    nearest_m: float = Field(default=3.0, gt=0, description="Scans nearer than this are no evidence, m.")
-    farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
-    margin_m: float = Field(default=0.3, ge=0, description="A range within this of a place is a hit, m,")
-    margin_ratio: float = Field(default=0.01, ge=0, description="plus this share of the range.")
+NEAREST_M = 3.0
+"""A scan nearer to a position than this is no evidence: the vehicle itself is in the way."""
+MARGIN_M, MARGIN_RATIO = 0.3, 0.01
+"""A range within this, plus this share of the range, of a position is a hit: noise of ranges and poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,20 +66,20 @@ class KeyframeSelector:
 
 
 def hits_and_misses(
-    positions: NDArray[np.float64], keyframes: KeyframeScans, settings: VisibilitySettings
+    positions: NDArray[np.float64], keyframes: KeyframeScans, farthest_m: float
 ) -> NDArray[np.int32]:
     """Count the scans that hit each position (v, 3) m, and those that saw through it: (2, v) hits and misses.
 
+    Scans farther than `farthest_m` are no evidence.
     See `range_images.count_hits_and_misses`, which does the visibility test.
     """
     counts = np.zeros((2, len(positions)), np.int32)
 
     def count(part: slice) -> None:
-        close = keyframes.near(positions[part], settings.farthest_m)
+        close = keyframes.near(positions[part], farthest_m)
         range_images.count_hits_and_misses(
             positions[part], close.images, close.T_lidar_map,
-            settings.nearest_m, settings.farthest_m, settings.margin_m, settings.margin_ratio,
-            *counts[:, part],
+            NEAREST_M, farthest_m, MARGIN_M, MARGIN_RATIO, *counts[:, part],
         )  # fmt: skip
 
     starts = range(0, len(positions), POINTS_PER_BLOCK)

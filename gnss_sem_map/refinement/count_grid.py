@@ -25,6 +25,11 @@ LEAST_AT_ONCE = 1 << 18
 LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
 """A map's own word on its errors is believed within these: to agree with itself is not to be right."""
 
+OWN_LIMIT_NAT = 1.0
+"""A voxel's own evidence counts at most this much: a column may then overrule it."""
+PSEUDO_COUNTS = 3.0
+"""Overdispersion: a column's share of right labels is Beta with so many pseudo-counts, since views err as a whole."""
+
 
 class CountGridSettings(StepSettings):
     """How the voxels above and below speak for building or vegetation."""
@@ -39,16 +44,6 @@ class CountGridSettings(StepSettings):
         default=4.0,
         gt=0,
         description="Voxels at most about this much higher or lower count, m: votes stay within one storey.",
-    )
-    own_limit_nat: float = Field(
-        default=1.0,
-        ge=0,
-        description="A voxel's own evidence for one against the other counts at most this much, nat.",
-    )
-    pseudo_counts: float = Field(
-        default=3.0,
-        gt=1,
-        description="Overdispersion: a column's share of right labels is Beta with this many pseudo-counts.",
     )
     error_rate: float = Field(
         default=0.2,
@@ -191,19 +186,19 @@ def evidence_log_odds(
 
     Prior: flat. Likelihood of the *other* voxels' labels: beta-binomial. In a column of one class the share
     of right labels is not a constant but itself random, Beta(a, b), since one bad view spoils a column as a
-    whole; so a hundred voxels of one opinion count far less than a hundred independent ones. a + b is a setting, and
+    whole; so a hundred voxels of one opinion count far less than a hundred independent ones. a + b is fixed, and
     a and b follow from how often two voxels of one column of this map disagree, which is 2 a b / ((a + b) (a
     + b + 1)). With a = 2, b = 1 the log odds are ln((n1 + 1) / (n2 + 1)).
     """
     cell = max(round(settings.cell_m / voxel_size_m), 1)
     reach = max(round(settings.reach_m / settings.cell_m), 0)
     counts = count_grid(keys, labels, classes, cell, cell, reach).astype(np.float64)
-    a, b = _beta_of(counts[np.isin(labels, classes)], settings.pseudo_counts)
+    a, b = _beta_of(counts[np.isin(labels, classes)], PSEUDO_COUNTS)
     others = [np.maximum(counts[:, k] - (labels == classes[k]), 0) for k in (0, 1)]
     columns = (
         gammaln(others[0] + a) + gammaln(others[1] + b) - gammaln(others[0] + b) - gammaln(others[1] + a)
     )
-    return np.asarray(np.clip(own, -settings.own_limit_nat, settings.own_limit_nat) + columns)
+    return np.asarray(np.clip(own, -OWN_LIMIT_NAT, OWN_LIMIT_NAT) + columns)
 
 
 def _beta_of(counts: NDArray[np.float64], pseudo_counts: float) -> tuple[float, float]:

@@ -13,34 +13,34 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.dynamics.visibility import KeyframeScans, VisibilitySettings, hits_and_misses
+from gnss_sem_map.dynamics.visibility import KeyframeScans, hits_and_misses
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
+OVER_M = (0.4, 3.0)
+"""Only voxels with another one so far below them (least, most) are removed: the ground stays."""
+POINTS_PER_MISS = 2.0
+"""A voxel with more points per miss than this stays, whatever the keyframe scans say: other scans saw it often."""
 
-class FreeSpaceSettings(VisibilitySettings, StepSettings):
+
+class FreeSpaceSettings(StepSettings):
     """How often a voxel must be traversed before it is removed; keyframe scans are 1 m or 1 s apart."""
 
     least_through: int = Field(
         default=6, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
-    through_per_hit: float = Field(default=3.0, gt=0, description="least ratio of misses to hits,")
-    points_per_through: float = Field(default=2.0, gt=0, description="and most points in the voxel per miss.")
+    through_per_hit: float = Field(default=3.0, gt=0, description="and least ratio of misses to hits.")
     farthest_m: float = Field(
         default=80.0,
         gt=0,
         description="Scans farther than this are no evidence, m; farther than for objects, which need an outline.",
     )
-    over_m: tuple[float, float] = Field(
-        default=(0.4, 3.0),
-        description="Only voxels with another one so far below them (least, most), m: the ground stays.",
-    )
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
     """The voxels below; keyframe scans are used wherever they are."""
-    return settings.over_m[1] + voxel_size_m
+    return OVER_M[1] + voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
@@ -56,13 +56,11 @@ def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSet
     Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
     because grazing rays traverse them.
     """
-    high = np.flatnonzero(
-        _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in settings.over_m])
-    )
-    hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings)
+    high = np.flatnonzero(_stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M]))
+    hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings.farthest_m)
     empty = misses >= settings.least_through
     empty &= misses > settings.through_per_hit * hits
-    empty &= voxels.hits[high] < settings.points_per_through * misses
+    empty &= voxels.hits[high] < POINTS_PER_MISS * misses
     cleared = np.zeros(len(voxels), np.bool_)
     cleared[high[empty]] = True
     return cleared

@@ -13,6 +13,15 @@ from gnss_sem_map.refinement.height_above_ground import REACH_M
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.state import MapState, StepSettings
 
+LEAST_HEIGHT_M = 0.1
+"""Buildings and vegetation are no lower: half a voxel of the paper, so the ground itself."""
+FOOT_M = 0.3
+"""Up to here a building may begin, but not with level ground."""
+LEVEL = 0.95
+"""Flatter than this is level ground (1 is level, 0 upright)."""
+LEAST_FLATNESS = 0.8
+"""Of road and sidewalk: a slope of 37 degrees, which no street has and every kerb's face and car's side exceeds."""
+
 
 class GeometricPriorSettings(StepSettings):
     """At which heights over the ground, and on which surfaces, a class is unlikely."""
@@ -22,22 +31,8 @@ class GeometricPriorSettings(StepSettings):
     )
     road_highest_m: float = Field(default=0.35, description="Road is no higher than this, m.")
     sidewalk_highest_m: float = Field(default=0.45, description="A sidewalk is no higher than this, m.")
-    way_least_flatness: float = Field(
-        default=0.8,
-        ge=0,
-        le=1,
-        description="Road and sidewalk lie at least this flat (1 is level, 0 upright).",
-    )
     vehicle_highest_m: float = Field(
         default=3.5, description="A vehicle is no higher than this (counts twice), m."
-    )
-    building_lowest_m: float = Field(default=0.1, description="A building is no lower than this, m.")
-    building_foot_m: float = Field(
-        default=0.3, description="A building begins no higher than this, and not with level ground, m."
-    )
-    level_flatness: float = Field(default=0.95, ge=0, le=1, description="Flatter than this is level ground.")
-    vegetation_lowest_m: float = Field(
-        default=0.1, description="Vegetation is no lower than this (counts half), m."
     )
 
 
@@ -68,14 +63,14 @@ def against(
     A flatness that is not known, NaN, breaks no rule. The rules are soft: a few observations that agree
     outweigh them. How low a vehicle reaches is left to the vehicle rules, which know its object.
     """
-    steep, level = flatness < settings.way_least_flatness, flatness > settings.level_flatness
+    steep, level = flatness < LEAST_FLATNESS, flatness > LEVEL
     rules = (
         ("road", (heights > settings.road_highest_m) | steep, 1.0),
         ("sidewalk", (heights > settings.sidewalk_highest_m) | steep, 1.0),
         ("vehicle", heights > settings.vehicle_highest_m, 2.0),
-        ("building", heights < settings.building_lowest_m, 1.0),
-        ("building", (heights < settings.building_foot_m) & level, 1.0),
-        ("vegetation", heights < settings.vegetation_lowest_m, 0.5),
+        ("building", heights < LEAST_HEIGHT_M, 1.0),
+        ("building", (heights < FOOT_M) & level, 1.0),
+        ("vegetation", heights < LEAST_HEIGHT_M, 0.5),
     )
     result = np.zeros((len(heights), len(label_set.names)), np.float32)
     for name, broken, weight in rules:

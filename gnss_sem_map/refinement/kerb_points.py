@@ -10,15 +10,16 @@ from scipy.special import expit
 
 SUREST = 0.98
 """Upper limit of the difference of probabilities by position alone, so that height can change it."""
+POINT_STDDEV_M = 0.05
+"""Points lie so far over or under the level that they belong to."""
+FACE_BEGINS = 0.3
+"""Share of the step, from the road up, where what lies there is as likely the kerb's face, so sidewalk."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kerbs:
     """The e voxels of a map where road and sidewalk meet at a step, in order."""
 
-    face_begins: float
-    """Share of the step, from the road up, from which on points are sidewalk."""
-    point_stddev_m: float
     voxel_size_m: float
     classes: tuple[int, int]
     """Road and sidewalk."""
@@ -61,5 +62,5 @@ class Kerbs:
     def _of_height(self, rows: NDArray[np.int32], z: NDArray[np.float64]) -> NDArray[np.float64]:
         road, sidewalk = self.levels[:, rows]
         step = sidewalk - road
-        turning = road + self.face_begins * step
-        return np.asarray(step * (turning - z) / self.point_stddev_m**2)
+        turning = road + FACE_BEGINS * step
+        return np.asarray(step * (turning - z) / POINT_STDDEV_M**2)

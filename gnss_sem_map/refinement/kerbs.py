@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.kerb_points import Kerbs
@@ -31,11 +30,7 @@ REACH = 3
 
 
 class KerbSettings(RoadEdgeSettings):
-    """How sharply the heights of points tell road from sidewalk."""
-
-    point_stddev_m: float = Field(
-        default=0.05, gt=0, description="Points lie so far over or under the level that they belong to, m."
-    )
+    """Which steps are kerbs."""
 
 
 def reach_m(settings: KerbSettings, voxel_size_m: float) -> float:
@@ -80,8 +75,6 @@ def find_kerbs(
     leaning = np.where(known, np.where(labels[beside] == classes[ROAD], sure, -sure), np.float32(0))
     levels = np.stack([road[is_step], sidewalk[is_step]])
     return Kerbs(
-        settings.face_begins,
-        settings.point_stddev_m,
         semantic_map.voxels.voxel_size_m,
         classes,
         rows,

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.special import entr, expit, logit
 
 from gnss_sem_map.labels.label_set import UNLABELLED
+from gnss_sem_map.refinement.kerb_points import FACE_BEGINS
 from gnss_sem_map.refinement.road_sidewalk import (
     ROAD,
     SIDEWALK,
@@ -40,18 +40,14 @@ CLEARLY_TWO = 2.0
 """Least distance of two normal distributions, in standard deviations, that are seen to be two (Ashman et al. 1994)."""
 SUREST = 0.98
 """Upper limit of the images' probability of road against sidewalk, so that height can change it."""
+VOXEL_STDDEV_M = 0.03
+"""Surfaces of voxels lie at least so far over or under the plane that they belong to."""
 X, Y, ON_SIDEWALK, Z = 1, 2, 3, 4
 """Of the terms of a fit; the first is one."""
 
 
 class LevelSettings(RoadEdgeSettings):
-    """How sharply the heights of voxels tell road from sidewalk."""
-
-    voxel_stddev_m: float = Field(
-        default=0.03,
-        gt=0,
-        description="Surfaces of voxels lie at least so far over or under the plane that they belong to, m.",
-    )
+    """Which steps the heights of voxels tell."""
 
 
 def reach_m(settings: LevelSettings, voxel_size_m: float) -> float:
@@ -164,7 +160,7 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
 
 def _are_two(planes: _Planes, settings: LevelSettings) -> NDArray[np.bool_]:
     """Around which cells (k,) the planes are clearly two."""
-    step, stddev = planes.slopes[:, 2], np.sqrt(_variance(planes, settings))
+    step, stddev = planes.slopes[:, 2], np.sqrt(_variance(planes))
     return (step >= settings.least_m) & (step >= CLEARLY_TWO * stddev)
 
 
@@ -173,12 +169,12 @@ def _log_odds(planes: _Planes, ground: _Ground, settings: LevelSettings) -> NDAr
     of_road = planes.z0[ground.cell] + (planes.slopes[ground.cell, :2] * ground.p[:, :2]).sum(axis=1)
     step = np.maximum(planes.slopes[ground.cell, 2], settings.least_m)  # no lower one is believed in
     up = (ground.p[:, 2] - of_road) / step  # 0 on the road, 1 on the sidewalk
-    odds = step**2 * (up - settings.face_begins) / _variance(planes, settings)[ground.cell]
+    odds = step**2 * (up - FACE_BEGINS) / _variance(planes)[ground.cell]
     return np.where((up > -1) & (up < 2), odds, 0.0)  # what lies a whole step off both is neither
 
 
-def _variance(planes: _Planes, settings: LevelSettings) -> NDArray[np.float64]:
-    return np.maximum(planes.variance, settings.voxel_stddev_m**2)
+def _variance(planes: _Planes) -> NDArray[np.float64]:
+    return np.maximum(planes.variance, VOXEL_STDDEV_M**2)
 
 
 def _decided(

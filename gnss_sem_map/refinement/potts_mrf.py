@@ -14,6 +14,10 @@ from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import softmax
 
 LEAST_PROBABILITY = 1e-12
+TEMPER = 0.5
+"""A voxel's own evidence is multiplied by this, or neighbours have no say."""
+ITERATIONS = 5
+"""Mean-field updates, all voxels at once; each reaches one voxel farther."""
 HALF_STENCIL = np.array(
     [
         (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z
@@ -30,31 +34,31 @@ HALF_STENCIL = np.array(
 class PottsSettings(StepSettings):
     """How much the neighbours of a voxel have to say."""
 
-    temper: float = Field(
-        default=0.5,
-        gt=0,
-        le=1,
-        description="A voxel's own evidence is multiplied by this, or neighbours have no say.",
-    )
     coupling_nat: float = Field(
         default=0.3, ge=0, description="What a neighbour that is sure of a class adds to it, nat."
     )
-    iterations: int = Field(default=5, ge=1, le=100, description="Mean-field updates, all voxels at once.")
 
 
 def reach_m(settings: PottsSettings, voxel_size_m: float) -> float:
     """One voxel per iteration."""
-    return settings.iterations * voxel_size_m
+    return ITERATIONS * voxel_size_m
 
 
 def apply(state: MapState, settings: PottsSettings) -> MapState:
     """Neighbours as evidence for each other; see `mean_field`."""
     voxels = state.voxels
-    return replace(state, scores=mean_field(voxels.keys, state.scores, voxels.observed, settings))
+    return replace(
+        state, scores=mean_field(voxels.keys, state.scores, voxels.observed, settings.coupling_nat)
+    )
 
 
 def mean_field(
-    keys: NDArray[np.int64], scores: Scores, observed: NDArray[np.bool_], settings: PottsSettings
+    keys: NDArray[np.int64],
+    scores: Scores,
+    observed: NDArray[np.bool_],
+    coupling_nat: float,
+    temper: float = TEMPER,
+    iterations: int = ITERATIONS,
 ) -> Scores:
     """Log probabilities (v, c) in which every voxel has heard its 26 neighbours.
 
@@ -65,12 +69,12 @@ def mean_field(
     seen = np.flatnonzero(observed)
     if len(seen) == 0:
         return scores
-    own = np.float32(settings.temper) * scores[seen]
+    own = np.float32(temper) * scores[seen]
     q = softmax(own)
-    for _ in range(settings.iterations):
+    for _ in range(iterations):
         heard = np.zeros_like(q)
         sum_of_neighbours(keys[seen], q, HALF_STENCIL, heard)
-        q = softmax(own + np.float32(settings.coupling_nat) * heard)
+        q = softmax(own + np.float32(coupling_nat) * heard)
     result = scores.copy()
     result[seen] = np.log(np.maximum(q, LEAST_PROBABILITY))
     return result

@@ -27,13 +27,6 @@ class RoadEdgeSettings(StepSettings):
         gt=0,
         description="What is lower is no step: the images are all that is known there.",
     )
-    face_begins: float = Field(
-        default=0.3,
-        ge=0,
-        le=1,
-        description="Share of the step, from the road up, where what lies there is as likely the kerb's face, so"
-        " sidewalk.",
-    )
 
 
 def ways(label_set: LabelSet) -> tuple[int, int] | None:

@@ -13,7 +13,7 @@ from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings
 
 MOST = 0.5
 """Upper limit of the estimate."""
-NEIGHBOURS = PottsSettings()
+COUPLING_NAT: float = PottsSettings().coupling_nat
 
 
 class SystematicErrorSettings(StepSettings):
@@ -38,7 +38,7 @@ def apply(state: MapState, settings: SystematicErrorSettings) -> MapState:
     if settings.rate is not None:
         return replace(state, systematic_error=settings.rate)
     voxels, seen = state.voxels, state.voxels.observed
-    with_neighbours = mean_field(voxels.keys, state.images, seen, NEIGHBOURS)
+    with_neighbours = mean_field(voxels.keys, state.images, seen, COUPLING_NAT)
     called, by_geometry, by_neighbours = (
         scores[seen].argmax(axis=1) for scores in (state.images, state.scores, with_neighbours)
     )

@@ -12,14 +12,14 @@ from gnss_sem_map.refinement.potts_mrf import HALF_STENCIL, sum_of_neighbours
 from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
 from gnss_sem_map.voxels.voxel_map import softmax
 
+COUPLING_NAT = 0.3
+"""What a neighbour that is sure of a class says for it: little, so that what is inferred stays unsure."""
+
 
 class UnobservedSettings(StepSettings):
     """How far labels spread to what no camera saw."""
 
     enabled: bool = Field(default=False, description="Whether this step is done.")
-    coupling_nat: float = Field(
-        default=0.3, ge=0, description="What a neighbour that is sure of a class says for it, nat."
-    )
     iterations: int = Field(default=5, ge=1, le=100, description="Each reaches one voxel farther.")
 
 
@@ -49,6 +49,6 @@ def infer(
         reached = ~known & heard.any(axis=1)
         if not reached.any():
             break
-        scores[reached] = np.float32(settings.coupling_nat) * heard[reached]
+        scores[reached] = np.float32(COUPLING_NAT) * heard[reached]
         known |= reached
     return scores, known & ~observed

@@ -25,6 +25,11 @@ from gnss_sem_map.voxels.voxel_map import pack, unpack
 COLUMN = np.array([1, 1, 0], np.int32)
 """Times a voxel, its column."""
 
+LOWEST_M, HIGHEST_M = 0.1, 3.5
+"""Heights over the ground between which a voxel may be a vehicle: lower is the ground, higher no truck reaches."""
+REJECTED_NAT = 6.0
+"""What the rules count against a voxel that they reject: odds of 400 to 1."""
+
 
 class VehicleSettings(StepSettings):
     """What a vehicle looks like in the map."""
@@ -46,11 +51,6 @@ class VehicleSettings(StepSettings):
     road_share: float = Field(
         default=0.3, ge=0, le=1, description="A vehicle stands with more than this share over road."
     )
-    rejected_nat: float = Field(
-        default=6.0, ge=0, description="What the rules count against a voxel that they reject, nat."
-    )
-    lowest_m: float = Field(default=0.1, description="Lower than this over the ground is no vehicle, m.")
-    highest_m: float = Field(default=3.5, description="Higher than this over the ground is no vehicle, m.")
     largest_parked_voxels: int = Field(
         default=1500, ge=1, description="Mode `paper`: a group of this many voxels moved (eta_D of eq. 13)."
     )
@@ -75,7 +75,7 @@ def apply(state: MapState, settings: VehicleSettings) -> MapState:
         raise NotApplicable("the map has no road to stand on")
     found = supported(voxels.indices, labels, state.heights, vehicle, road, settings, voxels.voxel_size_m)
     scores = state.scores.copy()
-    scores[found.rejected, vehicle] -= np.float32(settings.rejected_nat)
+    scores[found.rejected, vehicle] -= np.float32(REJECTED_NAT)
     return replace(state, scores=scores, vehicles=found.objects)
 
 
@@ -127,7 +127,7 @@ def supported(
     road.
     """
     is_vehicle = labels == vehicle
-    at_height = (heights >= settings.lowest_m) & (heights <= settings.highest_m)
+    at_height = (heights >= LOWEST_M) & (heights <= HIGHEST_M)
     members = np.flatnonzero(is_vehicle & at_height)
     over_road = _over(indices[members], indices[labels == road], settings.road_reach_m / voxel_size_m)
     clusters = dbscan(indices[members], settings.eps_m / voxel_size_m, settings.min_voxels)

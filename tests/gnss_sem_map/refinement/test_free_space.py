@@ -7,16 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images, visibility
-from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.dynamics.visibility import POINTS_PER_BLOCK, KeyframeScans, KeyframeSelector
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.refinement import free_space
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings, traversed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings, refine
 from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
-URBAN, MOTION = open_label_set(), MotionSettings()
+URBAN = open_label_set()
 EYE_M = 1.8
 FACADE_M = 8.0
 
@@ -79,10 +79,11 @@ def test_what_was_hit_often_stays_whoever_looks_through() -> None:
     assert not cleared(voxels).any()
 
 
-def test_too_few_witnesses_clear_nothing() -> None:
+def test_too_few_witnesses_clear_nothing_and_nothing_low_is_cleared(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = street_map(GHOST)
     assert not cleared(voxels, FreeSpaceSettings(least_through=len(STREET) + 1)).any()
-    assert not cleared(voxels, FreeSpaceSettings(over_m=(1.6, 3.0))).any()
+    monkeypatch.setattr(free_space, "OVER_M", (1.6, 3.0))
+    assert not cleared(voxels).any()
 
 
 @pytest.mark.parametrize("reach_m", [10.0, 40.0])
@@ -93,13 +94,12 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     witnesses = KeyframeScans(np.stack([witness(0.0)[0]] * len(far)), np.linalg.inv([pose(x) for x in far]))
     places = rng.uniform([0, -8, 0], [2000, 8, 3], (POINTS_PER_BLOCK + 5000, 3))
     places = places[np.argsort(places[:, 0])]
-    settings = MOTION.model_copy(update={"farthest_m": reach_m})
     assert len(witnesses.near(places[:1000], reach_m).images) < len(far) / 5
-    looks = visibility.hits_and_misses(places, witnesses, settings)
+    looks = visibility.hits_and_misses(places, witnesses, reach_m)
     hits, misses = np.zeros((2, len(places)), np.int32)
     range_images.count_hits_and_misses(
-        places, witnesses.images, witnesses.T_lidar_map, settings.nearest_m, reach_m,
-        settings.margin_m, settings.margin_ratio, hits, misses,
+        places, witnesses.images, witnesses.T_lidar_map, visibility.NEAREST_M, reach_m,
+        visibility.MARGIN_M, visibility.MARGIN_RATIO, hits, misses,
     )  # fmt: skip
     np.testing.assert_array_equal(looks, [hits, misses])
     assert looks.any(axis=1).all()

@@ -18,6 +18,7 @@ from gnss_sem_map.datasets.label_files import read_labels
 from gnss_sem_map.evaluation.metrics import Tables, confusion
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.point_labels import PointLabels, label_points
+from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
 from gnss_sem_map.segmentation import open_segmenter
@@ -105,12 +106,13 @@ def test_where_no_two_meet_there_is_no_kerb() -> None:
         assert find_kerbs(replace(street.semantic_map, **other), street.heights, KerbSettings()) is None
 
 
-def test_the_odds_are_those_of_scipy() -> None:
+def test_the_odds_are_those_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Place: a bilinear interpolation of probabilities between voxel centres; height: two normal distributions."""
     low, confidence, stddev = 0.04, 0.9, 0.08
     street = scene(low_m=low, confidence=confidence, heading=0.0)
-    settings = KerbSettings(point_stddev_m=stddev, face_begins=0.5)
-    inside, chosen, probability = street.kerbs(settings).decide(street.places, street.p_map)
+    monkeypatch.setattr(kerb_points, "POINT_STDDEV_M", stddev)
+    monkeypatch.setattr(kerb_points, "FACE_BEGINS", 0.5)
+    inside, chosen, probability = street.kerbs().decide(street.places, street.p_map)
     x, y = (np.arange(n) * SIZE_M for n in (50, 20))
     grid = np.where(street.semantic_map.labels.reshape(50, 20) == ROAD, confidence, 1 - confidence)
     of_road = RegularGridInterpolator((x + SIZE_M / 2, y - 2 + SIZE_M / 2), grid)

@@ -129,7 +129,9 @@ def test_only_shown_road_and_sidewalk_of_known_height_are_told() -> None:
     assert (after.confidence[after.confidence != before.confidence] >= 0.5).all()
 
 
-def test_the_planes_are_those_of_scikit_learn_and_the_odds_those_of_scipy() -> None:
+def test_the_planes_are_those_of_scikit_learn_and_the_odds_those_of_scipy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """On a place small enough that every cell sees all of it, and classes that are certain."""
     rng = np.random.default_rng(1)
     p = np.column_stack([rng.uniform(100, 104, (900, 2)), np.zeros(900)])
@@ -143,7 +145,9 @@ def test_the_planes_are_those_of_scikit_learn_and_the_odds_those_of_scipy() -> N
     left_over = p[:, 2] - oracle.predict(terms)
     np.testing.assert_allclose(planes.variance, (left_over**2).sum() / (900 - 4), rtol=1e-5)
 
-    settings = LevelSettings(voxel_stddev_m=0.04, face_begins=0.5)
+    settings = LevelSettings()
+    monkeypatch.setattr(levels, "VOXEL_STDDEV_M", 0.04)
+    monkeypatch.setattr(levels, "FACE_BEGINS", 0.5)
     log_odds = levels._log_odds(planes, ground, settings)
     road = oracle.predict(np.column_stack([p[:, :2], np.zeros(900)]))
     expected = norm.logpdf(p[:, 2], road + oracle.coef_[2], 0.04) - norm.logpdf(p[:, 2], road, 0.04)
@@ -152,14 +156,15 @@ def test_the_planes_are_those_of_scikit_learn_and_the_odds_those_of_scipy() -> N
 
 
 @pytest.mark.parametrize("step_m", [0.12, 0.15])
-def test_confidence_keeps_its_word(step_m: float) -> None:
+def test_confidence_keeps_its_word(step_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Images that are wrong as often as they admit, surfaces that stray as far as is set: the odds are Bayes' own."""
     p, truth = street(step_m, roughness_m=0.03)
     column, row = (p[:, :2] // 1.0).astype(int).T  # images err in patches
     wrong = np.random.default_rng(2).random((30, 18))[column, row] < 0.1
     called = np.where(wrong, ROAD + SIDEWALK - truth, truth).astype(np.int8)
     before, heights, place = mapped(p, called, confidence=0.9)
-    after = split_levels(before, heights, LevelSettings(face_begins=0.5))
+    monkeypatch.setattr(levels, "FACE_BEGINS", 0.5)
+    after = split_levels(before, heights, LevelSettings())
     is_right = np.empty(len(after), np.bool_)
     is_right[place] = after.labels[place] == truth
     told = after.confidence != before.confidence

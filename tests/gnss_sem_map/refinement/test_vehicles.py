@@ -68,11 +68,11 @@ def test_what_bled_onto_a_facade_far_from_the_road_is_no_vehicle():
 
 def test_vehicle_voxels_in_the_road_surface_or_above_a_lorry_are_rejected():
     indices, labels = scene(
-        (ROAD, box((0, 60), (0, 20), (-1, 0))), (VEHICLE, box((10, 30), (5, 14), (0, 30)))
+        (ROAD, box((0, 60), (0, 20), (-2, -1))), (VEHICLE, box((10, 30), (5, 14), (-1, 30)))
     )
-    rejected = judge(supported, indices, labels, lowest_m=0.15, highest_m=3.0).rejected
+    rejected = judge(supported, indices, labels).rejected
     heights = (indices[:, 2] + 0.5) * 0.2
-    np.testing.assert_array_equal(rejected, (labels == VEHICLE) & ((heights < 0.15) | (heights > 3.0)))
+    np.testing.assert_array_equal(rejected, (labels == VEHICLE) & ((heights < 0.1) | (heights > 3.5)))
 
 
 def test_maps_without_vehicles_or_without_road_are_judged_without_error():

@@ -130,6 +130,7 @@ class Target:
 
     def __init__(self, p_lidar: Array, normals: Array) -> None:
         self._p, self._normals, self._tree = p_lidar, normals, small_gicp.KdTree(p_lidar)
+        self._has_plane = (normals != 0).any(axis=1)
 
     def match(self, p: Array, guess: Array, steps_m: tuple[float, ...]) -> Match | None:
         """Register the points (m, 3) of another sweep to this one; None if too few have a correspondence."""
@@ -137,11 +138,10 @@ class Target:
         for within_m in steps_m:
             moved = p @ T[:3, :3].T + T[:3, 3]
             places, squares = (np.asarray(a) for a in self._tree.batch_nearest_neighbor_search(moved))
-            normals = self._normals[places]
-            use = np.flatnonzero((squares < within_m**2) & (normals != 0).any(axis=1))
+            use = np.flatnonzero((squares < within_m**2) & self._has_plane[places])
             if len(use) < LEAST_POINTS / 2:
                 return None
-            share, n, at = len(use) / len(p), normals[use], moved[use]
+            share, n, at = len(use) / len(p), self._normals[places[use]], moved[use]
             residuals = np.einsum("ij,ij->i", n, at - self._p[places[use]])
             off = (1 - share) * LOST_M**2 + share * float(np.minimum(residuals**2, LOST_M**2).mean())
             J = np.hstack([np.cross(at, n), n])

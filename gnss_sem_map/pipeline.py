@@ -7,7 +7,7 @@
     for every scan      deskew into the map, label from its image, fuse into the voxels
     refine              height, columns, vehicles, neighbours; levels of road and sidewalk
 
-Files are the business of `io` and `export`.
+Result folders are written by `runs`, their files by `export`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.fusion import answers_fingerprint, build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.motion_checkpoint import MotionCheckpoint, open_checkpoint
 from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.mapping.surface_heights import measure_surface_heights
 from gnss_sem_map.mapping.trajectory import estimate_trajectory, locate
@@ -123,7 +124,8 @@ def map_drive(
 ) -> Result:
     """Raw map and refined map of a drive whose trajectory is known; see `run`."""
     with _answers(drive, work, resume, labels_from) as folder:
-        drive, found = _without_moving(drive, folder, stats, progress)
+        checkpoint = None if work is None else open_checkpoint(work, drive, labels_from, resume)
+        drive, found = _without_moving(drive, folder, checkpoint, stats, progress)
         with stats.stage("mapping"):
             maps = build_maps(
                 drive, stats, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -198,18 +200,29 @@ def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) ->
 
 
 def _without_moving(
-    drive: Drive, folder: Path, stats: RunStats, progress: Progress
+    drive: Drive, folder: Path, checkpoint: MotionCheckpoint | None, stats: RunStats, progress: Progress
 ) -> tuple[Drive, MovingObjects]:
-    """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
+    """The drive with its moving points, and the moving objects; probabilities of a network are kept in `folder`."""
     log, settings = drive.log, drive.settings
     if not settings.dynamics.enabled:
         return drive, MovingObjects({}, ())
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
         label_set = open_label_set(settings.classes)
-        remembered = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
-        drive = replace(drive, segmenter=remembered)
+        cached = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
+        drive = replace(drive, segmenter=cached)
     with stats.stage("motion"):
-        moving = find_moving(drive, progress)
+        moving = _searched(drive, checkpoint, progress)
     stats.counts["points of moving objects"] += sum(map(len, moving.points.values()))
     return replace(drive, moving=moving.points), moving
+
+
+def _searched(drive: Drive, checkpoint: MotionCheckpoint | None, progress: Progress) -> MovingObjects:
+    """The moving objects of a drive, from the checkpoint where it has them."""
+    if checkpoint is None:
+        return find_moving(drive, progress)
+    moving = checkpoint.read()
+    if moving is None:
+        moving = find_moving(drive, progress)
+        checkpoint.write(moving)
+    return moving

@@ -35,7 +35,7 @@ def run(
     frames: Frames = None,
     drive_format: Format = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
-    resume: Annotated[bool, typer.Option(help="Go on with what an interrupted run of this mapped.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted run of this.")] = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
     force: Force = False,
     as_json: Json = False,

@@ -153,7 +153,7 @@ def open_store(
         )
     try:
         if known is None:
-            work_folder.forget_chunks(folder)
+            work_folder.remove_chunks(folder)
             write_whole(about, json.dumps({"fingerprint": fingerprint, "chunks": count}).encode())
         for path in folder.glob(".*.part"):
             _remove(path)

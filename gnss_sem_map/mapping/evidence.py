@@ -49,20 +49,29 @@ def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
     folder = run / FOLDER
     folder.mkdir()
     tiles.write(SemanticMap.of(evidence.moved), folder / MOVED, frame)
-    frames = sorted(evidence.moving)
-    places = [evidence.moving[number] for number in frames]
+    write_moving_points(evidence.moving, folder / MOVING_POINTS)
+    if evidence.keyframes is not None:
+        write_keyframes(evidence.keyframes, folder / KEYFRAMES)
+    if evidence.surface_heights is not None:
+        heights = evidence.surface_heights
+        np.savez_compressed(folder / HEIGHTS, keys=heights.keys, sums=heights.sums, counts=heights.counts)
+
+
+def write_moving_points(moving: Mapping[int, NDArray[np.int64]], path: Path) -> None:
+    """Write the indices of the moving points of every frame; raises OSError."""
+    frames = sorted(moving)
+    places = [moving[number] for number in frames]
     np.savez_compressed(
-        folder / MOVING_POINTS,
+        path,
         frames=np.array(frames, np.int64),
         counts=np.array([len(some) for some in places], np.int64),
         places=np.concatenate([*places, np.empty(0, np.int64)]).astype(np.int32),
     )
-    if evidence.keyframes is not None:
-        scans = evidence.keyframes
-        np.savez_compressed(folder / KEYFRAMES, images=scans.images, T_lidar_map=scans.T_lidar_map)
-    if evidence.surface_heights is not None:
-        heights = evidence.surface_heights
-        np.savez_compressed(folder / HEIGHTS, keys=heights.keys, sums=heights.sums, counts=heights.counts)
+
+
+def write_keyframes(scans: KeyframeScans, path: Path) -> None:
+    """Write range images and poses of keyframe scans; raises OSError."""
+    np.savez_compressed(path, images=scans.images, T_lidar_map=scans.T_lidar_map)
 
 
 def read(run: Path, label_set: LabelSet) -> RunEvidence:
@@ -74,13 +83,14 @@ def read(run: Path, label_set: LabelSet) -> RunEvidence:
         )
     return RunEvidence(
         tiles.read(folder / MOVED, label_set).voxels,
-        _moving_points(folder / MOVING_POINTS),
-        _keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
+        read_moving_points(folder / MOVING_POINTS),
+        read_keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
         _heights(folder / HEIGHTS) if is_file(folder / HEIGHTS) else None,
     )
 
 
-def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
+def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
+    """The indices of the moving points of every frame; raises DataError."""
     with open_archive(path) as archive:
         frames, counts, places = (
             _array(archive, path, name, "iu", 1) for name in ("frames", "counts", "places")
@@ -93,7 +103,8 @@ def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
     return dict(zip(frames.tolist(), parts, strict=True))
 
 
-def _keyframes(path: Path) -> KeyframeScans:
+def read_keyframes(path: Path) -> KeyframeScans:
+    """Range images and poses of keyframe scans; raises DataError."""
     with open_archive(path) as archive:
         images, T = _array(archive, path, "images", "u", 3), _array(archive, path, "T_lidar_map", "f", 3)
     if (

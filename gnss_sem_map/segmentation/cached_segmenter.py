@@ -61,7 +61,7 @@ def answers_folder(work: Path, fingerprint: str, resume: bool) -> Path:
     folder = work / work_folder.ANSWERS
     try:
         if not (resume and _fingerprint(folder / ABOUT) == fingerprint):
-            work_folder.forget_answers(work)
+            work_folder.remove_answers(work)
         folder.mkdir(exist_ok=True)
         write_whole(folder / ABOUT, json.dumps({"fingerprint": fingerprint}).encode())
     except OSError as error:

@@ -56,6 +56,7 @@ LEAST_ACCURACY_M = 1e-4
 
 
 FORMAT, SIGNS = "kitti-raw", "oxts/ (KITTI raw)"
+IMU_TO_LIDAR = "calib_imu_to_velo.txt"
 
 
 def is_drive(drive: Path) -> bool:
@@ -65,7 +66,7 @@ def is_drive(drive: Path) -> bool:
 
 def read(drive: Path) -> SensorLog:
     """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed."""
-    calibration = _calibration(drive.parent, has_images=is_folder(drive / "image_02"))
+    calibration = _calibration(_date_folder(drive), has_images=is_folder(drive / "image_02"))
     oxts_ns, oxts, skips = _oxts(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, fix_skips = usable_fixes(
@@ -88,7 +89,7 @@ def read(drive: Path) -> SensorLog:
     scans, scan_skips = _scans(drive, epoch_ns)
     images, image_skips = _images(drive, epoch_ns, calibration.image_size)
     return SensorLog(
-        name=shown(drive.name),
+        name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
         calibration=calibration,
         scans=scans,
@@ -103,8 +104,14 @@ def read(drive: Path) -> SensorLog:
     )
 
 
+def _date_folder(drive: Path) -> Path:
+    """The folder with the calibration: beside the drive, or, if `drive` is a link or `.`, beside its target."""
+    has_calibration = is_file(drive.parent / IMU_TO_LIDAR)
+    return drive.parent if has_calibration else drive.resolve().parent
+
+
 def _calibration(date: Path, has_images: bool) -> Calibration:
-    file = date / "calib_imu_to_velo.txt"
+    file = date / IMU_TO_LIDAR
     imu_to_velo = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
     T_lidar_imu = kitti_calibration.transform(imu_to_velo["R"], imu_to_velo["T"], f"{shown(file)}: R")
     T_imu_lidar = np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
@@ -212,12 +219,16 @@ def _oxts_row(path: Path) -> tuple[str, Array]:
 
 
 def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[Array, Array, list[Skip]]:
-    """The 100 Hz rows of the `_extract` twin when it lies beside the drive, else the 10 Hz rows of the drive."""
-    twin = drive.with_name(drive.name.replace("_sync", "_extract"))
-    if twin == drive or not is_folder(twin / "oxts" / "data"):
-        return stamps, oxts, []
-    twin_ns, rows, skips = _oxts(twin)
-    return _seconds(twin_ns, epoch_ns), rows, skips
+    """The 100 Hz rows of the `_extract` twin of the drive, else the 10 Hz rows of the drive.
+
+    The twin is beside the drive, or beside its target if `drive` is a link.
+    """
+    for place in (drive, drive.resolve()):
+        twin = place.parent / place.name.replace("_sync", "_extract")
+        if "_sync" in place.name and is_folder(twin / "oxts" / "data"):
+            twin_ns, rows, skips = _oxts(twin)
+            return _seconds(twin_ns, epoch_ns), rows, skips
+    return stamps, oxts, []
 
 
 def _reference_poses(positions: Array, oxts: Array) -> Array:

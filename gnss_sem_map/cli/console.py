@@ -56,18 +56,18 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
 
 
 def print_merged(about: dict[str, Any], out: Path) -> None:
-    """What came of two runs, and how the second came to lie on the first; what does not fit on stderr."""
+    """Size of the merged map and alignment of the second run to the first; a failed registration on stderr."""
     match, (first, second) = about["match"], about["merged"]
-    before, now = (_percent(match["coinciding"][moment]) for moment in ("by_georeference", "now"))
+    before, after = (_percent(match["overlap"][moment]) for moment in ("by_georeference", "aligned"))
     typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
     if match["shift_m"] is not None:
         typer.echo(
-            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {now} % of its voxels fall"
-            f" on {first}, {before} % did by georeference"
+            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {after} % of its voxels"
+            f" overlap {first}, by georeference {before} %"
         )
     else:
-        typer.echo(f"{second} lies by georeference: {now} % of its voxels fall on {first}")
-        warn([f"{second} could not be laid onto {first}: {match['reason']}"] if match["reason"] else [])
+        typer.echo(f"{second} is aligned by its georeference alone: {after} % of its voxels overlap {first}")
+        warn([f"{second} could not be registered to {first}: {match['reason']}"] if match["reason"] else [])
     typer.echo(f"results in {out}")
 
 
@@ -79,7 +79,7 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
     table = Table(
         title="Semantics, % of labelled points",
-        caption="accuracy: of the points that carry the class, how many are of it (eq. 14; elsewhere: precision)",
+        caption="accuracy: share of the points labelled with the class that belong to it (eq. 14; precision)",
     )
     table.add_column("class")
     for column in ("accuracy raw", "refined", "IoU raw", "refined"):

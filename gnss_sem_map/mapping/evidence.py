@@ -1,4 +1,4 @@
-"""What a run knows beside its map, kept with it: so a finished run is refined again without its scans."""
+"""Evidence of a run besides its map: with it, a finished run is refined again without its scans."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """The part of a run that its tiles do not hold."""
+    """The evidence of a run that is not in its tiles."""
 
     moved: VoxelMap
-    """The points of moving objects, which are not in the map that is refined."""
+    """The map of the moving points, which are not refined."""
     moving: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)
-    """Frame number -> places of those points among the scan's usable ones."""
+    """Frame number -> indices of the moving points among the usable points of the scan."""
     keyframes: KeyframeScans | None = None
-    """Scans that say which space is free; None where poses do not come from LiDAR odometry."""
+    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
     surface_heights: SurfaceHeights | None = None
-    """None where no step asked for them."""
+    """None if no step needs them."""
 
 
 def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
@@ -60,12 +60,12 @@ def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
 def write_moving_points(moving: Mapping[int, NDArray[np.int64]], path: Path) -> None:
     """Write the indices of the moving points of every frame; raises OSError."""
     frames = sorted(moving)
-    places = [moving[number] for number in frames]
+    indices = [moving[number] for number in frames]
     np.savez_compressed(
         path,
         frames=np.array(frames, np.int64),
-        counts=np.array([len(some) for some in places], np.int64),
-        places=np.concatenate([*places, np.empty(0, np.int64)]).astype(np.int32),
+        counts=np.array([len(some) for some in indices], np.int64),
+        places=np.concatenate([*indices, np.empty(0, np.int64)]).astype(np.int32),
     )
 
 
@@ -75,11 +75,11 @@ def write_keyframes(scans: KeyframeScans, path: Path) -> None:
 
 
 def read(run: Path, label_set: LabelSet) -> RunEvidence:
-    """Read it again; raises DataError where something is missing or damaged."""
+    """Read the folder `evidence/` of a run folder; raises DataError if something is missing or damaged."""
     folder = run / FOLDER
     if not is_file(folder / MOVING_POINTS):
         raise DataError(
-            f"{shown(run)}: found no {FOLDER}/ in it, which a run keeps to be refined again; make the run again"
+            f"{shown(run)}: found no {FOLDER}/ in it, which is needed to refine the map; make the run again"
         )
     return RunEvidence(
         tiles.read(folder / MOVED, label_set).voxels,

@@ -435,7 +435,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path)
     )  # fmt: skip
     first, second = done.stdout.splitlines()
     assert "cannot write the map" in first
-    assert "cannot put voxels away" in second
+    assert "cannot save voxels" in second
     assert [path.name for path in tmp_path.iterdir()] == ["work"]
     assert {path.name for path in (tmp_path / "work").iterdir()} == {"chunks.json", MARKER}
 

@@ -1,4 +1,4 @@
-"""Commands on a finished run, without starting over: `refine`, `relabel`, `export`, `view`."""
+"""Commands on a finished run: `refine`, `relabel`, `export`, `view`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Other = Annotated[
 
 
 def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = False) -> None:
-    """Refine the map of a run again with other settings of the refinement; no scan is matched, no network asked."""
+    """Refine the map of a run again with other refinement settings; scans are not matched or segmented again."""
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
@@ -29,7 +29,7 @@ def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = F
 def relabel(
     run: Finished,
     segmenter: Annotated[
-        str, typer.Option(help="Where class probabilities come from: labels:DIR, refinenet:FILE, ...")
+        str, typer.Option(help="Source of class probabilities: labels:DIR, refinenet:FILE, ...")
     ],
     device: Device = "auto",
     out: Other = None,
@@ -64,7 +64,7 @@ def export(
 
 def view(
     run: Finished,
-    browser: Annotated[bool, typer.Option(help="Open it in a browser, and not only say where it is.")] = True,
+    browser: Annotated[bool, typer.Option(help="Open it in a browser; else only print its path.")] = True,
 ) -> None:
     """Open the viewer of a run in a browser."""
     from gnss_sem_map.runs.finished_run import Run

@@ -1,6 +1,6 @@
 """KITTI raw drives: `<date>/<date>_drive_<nnnn>_sync`, calibration in the date folder.
 
-Facts that this reader stands on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
+Facts that this reader relies on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
 turns clockwise; raw scans are not motion-compensated; the stamp of a scan is its middle; the image is exposed 8.5 ms
 before its stamp; oxts jitters against the scans, so nothing may be paired by index. Line k of a stamp file belongs
 to frame k, and is blank when the frame is missing.
@@ -44,11 +44,11 @@ OXTS_NOISE = ImuNoise(
     gyroscope_bias_stddev=1e-4,
 )
 """Of the RT3003, whose rates and forces are already corrected for bias by its own filter. Gyroscopes by its data sheet,
-0.2 °/√h and stable to 2 °/h; accelerometers worse than by that, 0.005 m/s/√h, for it stands in a car that shakes."""
+0.2 °/√h and stable to 2 °/h; accelerometers worse, 0.005 m/s/√h, because the car vibrates."""
 OXTS_COLUMNS = 30
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
-"""ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would leak into the result."""
+"""ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would influence the result."""
 ANGULAR_RATE = slice(17, 20)
 POSITION_ACCURACY = 23
 LEAST_ACCURACY_M = 1e-4
@@ -60,7 +60,7 @@ IMU_TO_LIDAR = "calib_imu_to_velo.txt"
 
 
 def is_drive(drive: Path) -> bool:
-    """Whether a folder looks like one."""
+    """Whether a folder looks like a KITTI raw drive."""
     return is_folder(drive / "oxts")
 
 
@@ -137,7 +137,7 @@ def _calibration(date: Path, has_images: bool) -> Calibration:
 
 
 def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
-    """Unix nanoseconds by frame number; blank lines are frames that do not exist, absurd years are left out."""
+    """Unix nanoseconds by frame number; blank lines are missing frames, stamps of impossible years are skipped."""
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
     stamps, skips = {}, []
@@ -170,7 +170,7 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 
 
 def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
-    """Stamps and rows of the navigation unit, sorted, without repeats; and what was left out."""
+    """Stamps and rows of the navigation unit, sorted, without repeated stamps; and the skipped rows."""
     found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
     stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
     skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
@@ -214,7 +214,7 @@ def _oxts_row(path: Path) -> tuple[str, Array]:
     if row.shape != (OXTS_COLUMNS,) or not np.isfinite(np.delete(row, POSITION_ACCURACY)).all():
         return f"found {row.size} numbers, expected {OXTS_COLUMNS} finite ones", row
     if not (np.abs(row[[*range(11, 14), *range(17, 20)]]) <= LARGEST_OF_IMU).all():
-        return "found a force or a rate that no sensor gives", row
+        return "found a force or a rate beyond the range of any sensor", row
     return "", row
 
 
@@ -232,7 +232,7 @@ def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[A
 
 
 def _reference_poses(positions: Array, oxts: Array) -> Array:
-    """Poses by the navigation unit itself: T_map_imu (k, 4, 4)."""
+    """Poses of the navigation unit: T_map_imu (k, 4, 4)."""
     T_map_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
     T_map_imu[:, :3, :3] = _attitudes(oxts)
     T_map_imu[:, :3, 3] = positions
@@ -240,7 +240,7 @@ def _reference_poses(positions: Array, oxts: Array) -> Array:
 
 
 def _attitudes(oxts: Array) -> Array:
-    """R_map_imu (k, 3, 3) by the unit itself. Yaw is 0 towards east, counter-clockwise."""
+    """R_map_imu (k, 3, 3) by the navigation unit. Yaw is 0 towards east, counter-clockwise."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_euler("ZYX", oxts[:, [YAW, PITCH, ROLL]]).as_matrix())

@@ -1,4 +1,4 @@
-"""A finished run is an object: look at its map, refine it again, label it anew, export it, without starting over."""
+"""A finished run as an object: its map can be read, refined, relabelled and exported again."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def run_log(
     force: bool = False,
     progress: Progress = silent,
 ) -> Run:
-    """Map a drive that is open already; `drive` and `frames` say what `log` was opened from. See `run`."""
+    """Map a drive that is open already; `log` was opened from `drive` and `frames`. See `run`."""
     with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
         refuse_inputs(claim.out, sorted(log.folders))
         network = None
@@ -97,7 +97,7 @@ def run_log(
 
 @dataclass(frozen=True)
 class Run:
-    """The folder of a finished run; `Run.open(OUT)` checks that it is one."""
+    """A finished run in its folder; `Run.open(OUT)` checks it."""
 
     folder: Path
 
@@ -118,7 +118,7 @@ class Run:
 
     @cached_property
     def settings(self) -> Settings:
-        """What the run was made with."""
+        """The settings of the run."""
         return config.load(self.folder / "config.yaml")
 
     @cached_property
@@ -128,7 +128,7 @@ class Run:
 
     @cached_property
     def frame(self) -> LocalFrame | None:
-        """Where the map's origin is; None for a map in its drive's own poses."""
+        """The local frame of the map; None for a map without a georeference."""
         return tiles.read_frame(self.folder / "map")
 
     @cached_property
@@ -137,13 +137,13 @@ class Run:
         return open_label_set(self.settings.classes)
 
     def map(self, box: tuple[ArrayLike, ArrayLike] | None = None, *, refined: bool = True) -> SemanticMap:
-        """The map, or what of it lies in a box (low, high), each (3,) m: only its tiles are read."""
+        """The map, or its part in a box (low, high), each (3,) m; only the tiles of the box are read."""
         return tiles.read(self.folder / ("refined" if refined else "map"), self.label_set, box)
 
     def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
-        """Refine the map again with other settings, in place or into `out`; no scan is matched, no network is asked.
+        """Refine the map again with other settings, in place or into `out`; nothing is matched or segmented again.
 
-        Scans are read only where the run has point labels. Raises ConfigError where more than the refinement changes.
+        Scans are read only if the run has point labels. Raises ConfigError if other settings differ too.
         """
         _check_same_map(self.settings, settings)
         found, raw, stats = evidence.read(self.folder, self.label_set), self.map(refined=False), RunStats()
@@ -199,7 +199,7 @@ class Run:
         return self.folder / format_.file
 
     def drive(self) -> SensorLog:
-        """The log that the run was made of; raises DataError where it is no longer there."""
+        """The log of the run's drive; raises DataError if it was moved or removed."""
         inputs = inputs_of(self.folder)
         if "drive" not in inputs:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
@@ -227,11 +227,11 @@ class Run:
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:
-    """Raise ConfigError where more than the refinement differs."""
+    """Raise ConfigError if settings other than those of the refinement differ."""
     same = after.model_copy(update={"refinement": before.refinement})
     if same == before:
         return
     differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
     raise ConfigError(
-        f"refine: {', '.join(differ)} differ from those of the run, and only refinement may; run the drive again"
+        f"refine: {', '.join(differ)} differ from those of the run, and only refinement can; run the drive again"
     )

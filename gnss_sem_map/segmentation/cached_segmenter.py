@@ -24,7 +24,7 @@ ABOUT = "about.json"
 
 @dataclass(frozen=True, eq=False)
 class CachedSegmenter:
-    """A segmenter that keeps its probabilities in a folder, in the classes of the map: the second call reads a file."""
+    """A segmenter that saves its probabilities, in the classes of the map, to a folder; the second call reads them."""
 
     segmenter: Segmenter
     label_set: LabelSet
@@ -43,7 +43,7 @@ class CachedSegmenter:
         try:
             return np.asarray(read_probabilities(file)[0], np.uint8)
         except DataError:
-            pass  # not there yet, or damaged
+            pass  # not saved yet, or damaged
         seen = class_image(
             self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_size,
             f"labels of image {image.number}",

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_run, progress_bars
+from gnss_sem_map.cli.console import print_merged, print_run, progress_bars
 from gnss_sem_map.cli.options import Device, Json, Set
 
 Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
@@ -23,7 +23,10 @@ def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = F
 
     finished = Run.open(run)
     again = finished.refine(finished.settings.changed(*(set_ or ())), out)
-    print_run(again.about, again.folder, as_json)
+    if again.is_merged and not as_json:
+        print_merged(again.about, again.folder)
+    else:
+        print_run(again.about, again.folder, as_json)
 
 
 def relabel(

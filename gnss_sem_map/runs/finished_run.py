@@ -27,6 +27,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.merged_run import TRACK, write_merged
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -97,7 +98,7 @@ def run_log(
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run in its folder; `Run.open(OUT)` checks it."""
+    """A finished run in its folder, also a merged one; `Run.open(OUT)` checks it."""
 
     folder: Path
 
@@ -105,16 +106,20 @@ class Run:
     def open(cls, folder: Path | str) -> Run:
         """Raises DataError for a folder that holds no finished map."""
         folder = Path(folder)
-        if "merged" in read_run(folder) or not is_folder(folder / "refined"):
-            raise DataError(
-                f"{shown(folder)}: found no map of one drive in it; expected the -o of `gnss-sem-map run`"
-            )
+        read_run(folder)
+        if not is_folder(folder / "refined"):
+            raise DataError(f"{shown(folder)}: found no map in it; expected the -o of `gnss-sem-map run`")
         return cls(folder)
 
     @property
     def about(self) -> dict[str, Any]:
         """The content of run.json."""
         return read_run(self.folder)
+
+    @property
+    def is_merged(self) -> bool:
+        """Whether it was merged from two runs: then it has no drive, no trajectory and no point labels."""
+        return "merged" in self.about
 
     @cached_property
     def settings(self) -> Settings:
@@ -123,7 +128,8 @@ class Run:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the IMU in the map, with covariances."""
+        """Poses of the IMU in the map, with covariances; raises DataError for a merged run."""
+        self._refuse_merged("trajectory")
         return Trajectory.load(self.folder / "trajectory.parquet")
 
     @cached_property
@@ -151,8 +157,10 @@ class Run:
             state, report = pipeline.refine_map(raw.voxels - found.moved, found, settings)
         assert state.decided is not None
         result = pipeline.Result(
-            self.trajectory, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
+            self._track, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
         )
+        if self.is_merged:
+            return self._written_merged(out, result, settings)
         log = self.drive() if is_folder(self.folder / "labels") else None
         return self._written(out, result, settings, log, {}, same_map=True)
 
@@ -164,7 +172,11 @@ class Run:
         device: str = "auto",
         progress: Progress = silent,
     ) -> Run:
-        """Map the drive again along the same trajectory with the labels of another segmenter."""
+        """Map the drive again along the same trajectory with the labels of another segmenter.
+
+        Raises DataError for a merged run, and if the drive was moved or removed.
+        """
+        self._refuse_merged("relabelling")
         log, settings = self.drive(), self.settings
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_sharp = bool(self.about.get("from_lidar_odometry"))
@@ -208,8 +220,30 @@ class Run:
 
     @property
     def _driven(self) -> Trajectory:
+        if self.is_merged:
+            return self._track
         first, last = self.about["scans_s"]
         return run_folder.between(self.trajectory, first, last)
+
+    @property
+    def _track(self) -> Trajectory:
+        """The trajectory for pictures."""
+        return Trajectory.load(self.folder / TRACK) if self.is_merged else self.trajectory
+
+    def _refuse_merged(self, what: str) -> None:
+        if self.is_merged:
+            names = " and ".join(map(str, self.about["merged"]))
+            raise DataError(
+                f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; use one of those"
+            )
+
+    def _written_merged(self, out: Path | str | None, result: pipeline.Result, settings: Settings) -> Run:
+        place = self.folder if out is None else Path(out)
+        inputs = [self.folder] if place.resolve() != self.folder.resolve() else []
+        with run_folder.claimed_run(place, inputs):
+            about = self.about | {"map": run_folder.about_map(result)}
+            write_merged(place, self.folder / TRACK, result, settings, self.frame, about)
+        return Run(place)
 
     def _written(
         self,

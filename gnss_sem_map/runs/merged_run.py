@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
+from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
@@ -17,6 +20,9 @@ from gnss_sem_map.pipeline import Result, refine_map
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_raw, write_refined
 from gnss_sem_map.voxels.semantic_map import SemanticMap
+
+TRACK = "track.parquet"
+"""Trajectory of the first run, for pictures: a merged run has no trajectory of its own."""
 
 
 def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:
@@ -41,7 +47,7 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     merged = merge_runs(first, second, label_set, match)
     state, report = refine_map(merged.static, merged.evidence, settings)
     assert state.decided is not None
-    raw, frame = SemanticMap.of(merged.static + merged.evidence.moved), merged.frame
+    raw = SemanticMap.of(merged.static + merged.evidence.moved)
     result = Result(
         Trajectory.load(first / "trajectory.parquet"),
         None,
@@ -55,15 +61,28 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
-        "local_frame": asdict(frame),
+        "local_frame": asdict(merged.frame),
         "map": about_map(result),
         "match": _about(merged.alignment),
     }
+    write_merged(out, first / "trajectory.parquet", result, settings, merged.frame, about)
+    return about
+
+
+def write_merged(
+    out: Path,
+    track: Path,
+    result: Result,
+    settings: Settings,
+    frame: LocalFrame | None,
+    about: dict[str, Any],
+) -> None:
+    """Write the folder of a merged run; `track` is the file of its trajectory. Raises DataError."""
     with new_folder(out) as folder:
         write_raw(folder, result, frame)
         write_refined(folder, result, frame, result.trajectory, str(about["name"]))
+        shutil.copyfile(track, folder / TRACK)
         write_about(folder, settings, about, {})
-    return about
 
 
 def _about(alignment: Alignment) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping.evidence import RunEvidence
-from gnss_sem_map.mapping.fusion import answers_fingerprint, build_maps
+from gnss_sem_map.mapping.fusion import build_maps, probabilities_fingerprint
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.motion_checkpoint import MotionCheckpoint, open_checkpoint
 from gnss_sem_map.mapping.moving_points import find_moving
@@ -42,7 +42,7 @@ from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, answers_folder
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -122,7 +122,7 @@ def map_drive(
     labels_from: str = "",
 ) -> Result:
     """Raw map and refined map of a drive whose trajectory is known; see `run`."""
-    with _answers(drive, work, resume, labels_from) as folder:
+    with _probabilities(drive, work, resume, labels_from) as folder:
         checkpoint = None if work is None else open_checkpoint(work, drive, labels_from, resume)
         drive, found = _without_moving(drive, folder, checkpoint, stats, progress)
         with stats.stage("mapping"):
@@ -189,10 +189,10 @@ def check_drive(
 
 
 @contextmanager
-def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
+def _probabilities(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
     """Folder for the probabilities of a network, in `work` if there is one: --resume segments no image twice."""
     if work is not None:
-        yield answers_folder(work, answers_fingerprint(drive, labels_from), resume)
+        yield probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume)
         return
     with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
         yield Path(folder)

@@ -21,13 +21,13 @@ APART_M, APART_S = 1.0, 1.0
 
 
 class VisibilitySettings(BaseModel):
-    """When a range that a scan measured speaks of a place."""
+    """Which ranges count as hits and misses of a position."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     nearest_m: float = Field(default=3.0, gt=0, description="Scans nearer than this are no evidence, m.")
     farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
-    margin_m: float = Field(default=0.3, ge=0, description="A range within this of a place is a hit, m,")
+    margin_m: float = Field(default=0.3, ge=0, description="A range within this of the position is a hit, m,")
     margin_ratio: float = Field(default=0.01, ge=0, description="plus this share of the range.")
 
 

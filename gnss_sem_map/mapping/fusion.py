@@ -241,7 +241,7 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
     return digest.hexdigest()
 
 
-def answers_fingerprint(drive: Drive, labels_from: str) -> str:
+def probabilities_fingerprint(drive: Drive, labels_from: str) -> str:
     """Digest of the network, the images and the classes: a run may use the probabilities of one with the same."""
     log = drive.log
     names = () if drive.segmenter is None else drive.segmenter.class_names

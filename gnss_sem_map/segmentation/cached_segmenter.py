@@ -52,7 +52,7 @@ class CachedSegmenter:
         return seen.probabilities
 
 
-def answers_folder(work: Path, fingerprint: str, resume: bool) -> Path:
+def probabilities_folder(work: Path, fingerprint: str, resume: bool) -> Path:
     """Folder for a network's probabilities; with `resume`, those of an interrupted run with this fingerprint are kept.
 
     Raises DataError when it cannot be written.

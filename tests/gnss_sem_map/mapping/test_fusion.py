@@ -166,7 +166,7 @@ def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_
 @pytest.mark.parametrize(
     ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
 )
-def test_chunks_and_processes_give_the_same_map_and_account(
+def test_chunks_and_processes_give_the_same_map_and_stats(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, chunk: int, workers: int
 ) -> None:
     stats = RunStats()

@@ -82,6 +82,7 @@ def whole(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> dict
     return results
 
 
+@pytest.mark.integration
 def test_a_resumed_run_does_not_search_again_and_gives_the_same_folder(
     small_drive: Street, whole: dict[str, object], tmp_path: Path
 ) -> None:
@@ -94,6 +95,7 @@ def test_a_resumed_run_does_not_search_again_and_gives_the_same_folder(
     assert [path.name for path in tmp_path.iterdir()] == ["out"], "nothing stays beside the results"
 
 
+@pytest.mark.integration
 def test_without_resume_it_searches_again(small_drive: Street, tmp_path: Path) -> None:
     interrupted(small_drive, tmp_path / "out")
     stages = Stages()
@@ -111,6 +113,7 @@ def halved(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("damage", "name"),
     [

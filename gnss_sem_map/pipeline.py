@@ -1,13 +1,12 @@
-"""The whole flow on one page: a drive in, a trajectory and a semantic map out (Fig. 1 of the paper).
+"""The pipeline on one page: from a drive to its trajectory and its semantic map (Fig. 1 of the paper).
 
-    preflight           the log against physics, and its sensors against each other: a probable mistake stops the run
-    trajectory          GNSS and IMU, smoothed in batch (or the poses that came with the drive); sweeps matched by it
-                        bind it in turn
-    motion              which points belong to something that moved
-    for every scan      deskew into the map, label from its image, fuse into the voxels
-    refine              height, columns, vehicles, neighbours; levels of road and sidewalk
+    preflight           check the log against physics, and its sensors against each other; a probable mistake stops
+    trajectory          smooth GNSS and IMU in batch (or take the poses of the drive), then add LiDAR odometry
+    motion              find the points of moving objects
+    mapping             every scan: deskew into the map, label from its image, fuse into the voxels
+    refinement          the steps of `refinement.steps`
 
-Files are the business of `io` and `export`.
+Result folders are written by `runs`, their files by `export`.
 """
 
 from __future__ import annotations
@@ -29,8 +28,9 @@ from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping.evidence import RunEvidence
-from gnss_sem_map.mapping.fusion import answers_fingerprint, build_maps
+from gnss_sem_map.mapping.fusion import build_maps, probabilities_fingerprint
 from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.motion_checkpoint import MotionCheckpoint, open_checkpoint
 from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.mapping.surface_heights import measure_surface_heights
 from gnss_sem_map.mapping.trajectory import estimate_trajectory, locate
@@ -42,7 +42,7 @@ from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, answers_folder
+from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -52,25 +52,25 @@ __all__ = ["Result", "check_drive", "estimate_trajectory", "map_drive", "refine_
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Everything that a run made."""
+    """The results of a run."""
 
     trajectory: Trajectory
     solution: Solution | None
-    """How the smoother came to the trajectory; None when the poses came with the drive."""
+    """Solution of the smoother; None if the drive has poses."""
     raw: SemanticMap
     refined: SemanticMap
     refinement: RefinementReport
     stats: RunStats
     evidence: RunEvidence
-    """What is known beside the map, kept so that it can be refined again."""
+    """Evidence besides the map, with which it can be refined again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
-    """Of the "map", and of the one that "gnss and imu" alone would make, where LiDAR odometry helped."""
+    """Of the "map"; with LiDAR odometry, also of a map with the poses of "gnss and imu" alone."""
     from_lidar_odometry: bool = False
-    """Whether the poses come from LiDAR odometry, so that what stands, stands still in the map."""
+    """Whether the poses come from LiDAR odometry, so that static objects are not blurred in the map."""
     kerbs: Kerbs | None = None
     """Voxels of the refined map whose points are classified one by one."""
     preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
-    """What was found before any work."""
+    """Findings of the pre-flight check."""
 
 
 def run(
@@ -87,14 +87,14 @@ def run(
 ) -> Result:
     """Trajectory, raw map and refined map of one drive.
 
-    Without a segmenter, or without images, the map has no labels. What is mapped is kept in the folder `work` until
-    the caller removes it, so that an interrupted run can `resume`; see `mapping.build_maps`. `force` goes on where the
-    pre-flight is red. Raises PreflightError, DataError when not one scan can be used, MeasurementError and
+    Without a segmenter, or without images, the map has no labels. Intermediate results are kept in the folder `work`
+    until the caller removes it, and used with `resume`; see `mapping.fusion.build_maps`. With `force`, a red pre-flight
+    does not stop the run. Raises PreflightError, DataError when not one scan can be used, MeasurementError and
     EstimationError from the smoother.
     """
     log = log.in_our_conventions(settings.sensors)
     stats = RunStats(skips=list(log.skips))
-    _sensor_model(settings)  # of other classes: refused now
+    _sensor_model(settings)  # one of other classes is refused now
     page = check_drive(log, segmenter, settings, stats, force)
     with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
@@ -122,8 +122,9 @@ def map_drive(
     labels_from: str = "",
 ) -> Result:
     """Raw map and refined map of a drive whose trajectory is known; see `run`."""
-    with _answers(drive, work, resume, labels_from) as folder:
-        drive, found = _without_moving(drive, folder, stats, progress)
+    with _probabilities(drive, work, resume, labels_from) as folder:
+        checkpoint = None if work is None else open_checkpoint(work, drive, labels_from, resume)
+        drive, found = _without_moving(drive, folder, checkpoint, stats, progress)
         with stats.stage("mapping"):
             maps = build_maps(
                 drive, stats, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
@@ -138,7 +139,7 @@ def map_drive(
         progress("refinement", 1, 1)
     refined = _decided(state)
     if (refined.states == State.REMOVED).all():
-        stats.warnings.append("everything was taken for moving: what is drawn is what was removed")
+        stats.warnings.append("all points were removed as moving: the pictures show the removed points")
     report = replace(report, tracked=found.objects)
     return Result(
         drive.trajectory, None, raw, refined, report, stats, evidence,
@@ -149,7 +150,7 @@ def map_drive(
 def refine_map(
     static: VoxelMap, evidence: RunEvidence, settings: Settings
 ) -> tuple[MapState, RefinementReport]:
-    """The map without what moved, refined with everything that is known beside it; see `refinement.steps`."""
+    """Refine the static map with all evidence besides it; see `refinement.steps`."""
     beside = Evidence(evidence.moved, _sensor_model(settings), evidence.keyframes, evidence.surface_heights)
     return run_steps(static, settings.refinement, beside)
 
@@ -164,7 +165,7 @@ def _sensor_model(settings: Settings) -> LabelCalibration | None:
 
 
 def _heights(drive: Drive, voxels: VoxelMap) -> SurfaceHeights | None:
-    """Heights of surfaces, where a step needs them and there are labels to tell apart."""
+    """Heights of surfaces, if a step needs them and the map has labels."""
     steps, label_set = drive.settings.refinement, drive.label_set
     if (
         ways(label_set) is None
@@ -178,7 +179,7 @@ def _heights(drive: Drive, voxels: VoxelMap) -> SurfaceHeights | None:
 def check_drive(
     log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats, force: bool = False
 ) -> Preflight:
-    """The pre-flight; what is amber, and red where it is forced, becomes a warning. Raises PreflightError."""
+    """The pre-flight check; amber findings, and red ones with `force`, become warnings. Raises PreflightError."""
     with stats.stage("preflight"):
         page = preflight.check(log, settings, segmenter, with_camera=segmenter is not None)
     if page.level is Level.RED and not force:
@@ -188,28 +189,39 @@ def check_drive(
 
 
 @contextmanager
-def _answers(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
-    """Where a network's answers are kept: with what is mapped, so that --resume asks for none twice."""
+def _probabilities(drive: Drive, work: Path | None, resume: bool, labels_from: str) -> Iterator[Path]:
+    """Folder for the probabilities of a network, in `work` if there is one: --resume segments no image twice."""
     if work is not None:
-        yield answers_folder(work, answers_fingerprint(drive, labels_from), resume)
+        yield probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume)
         return
     with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
         yield Path(folder)
 
 
 def _without_moving(
-    drive: Drive, folder: Path, stats: RunStats, progress: Progress
+    drive: Drive, folder: Path, checkpoint: MotionCheckpoint | None, stats: RunStats, progress: Progress
 ) -> tuple[Drive, MovingObjects]:
-    """The drive with what moved in it, and why; a network's answers are kept in `folder` for the map."""
+    """The drive with its moving points, and the moving objects; probabilities of a network are kept in `folder`."""
     log, settings = drive.log, drive.settings
     if not settings.dynamics.enabled:
         return drive, MovingObjects({}, ())
     is_network = drive.segmenter is not None and not isinstance(drive.segmenter, CachedLabels)
     if drive.segmenter is not None and is_network and log.calibration.image_size is not None:
         label_set = open_label_set(settings.classes)
-        remembered = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
-        drive = replace(drive, segmenter=remembered)
+        cached = CachedSegmenter(drive.segmenter, label_set, log.calibration.image_size, folder)
+        drive = replace(drive, segmenter=cached)
     with stats.stage("motion"):
-        moving = find_moving(drive, progress)
+        moving = _searched(drive, checkpoint, progress)
     stats.counts["points of moving objects"] += sum(map(len, moving.points.values()))
     return replace(drive, moving=moving.points), moving
+
+
+def _searched(drive: Drive, checkpoint: MotionCheckpoint | None, progress: Progress) -> MovingObjects:
+    """The moving objects of a drive, from the checkpoint where it has them."""
+    if checkpoint is None:
+        return find_moving(drive, progress)
+    moving = checkpoint.read()
+    if moving is None:
+        moving = find_moving(drive, progress)
+        checkpoint.write(moving)
+    return moving

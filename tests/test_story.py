@@ -228,7 +228,7 @@ def test_segmenting_again_says_that_nothing_was_to_do(small_drive: Street, tmp_p
     first, second = gnss_sem_map(*arguments), gnss_sem_map(*arguments)
     assert f"{images} images segmented" in first.stdout
     assert "images/s" in first.stdout
-    assert f"nothing was to do: all {images} images are segmented" in second.stdout
+    assert f"nothing to do: all {images} images are segmented" in second.stdout
     assert "images/s" not in second.stdout
     for done in (first, second):
         assert f"now use --segmenter labels:{tmp_path}" in done.stdout

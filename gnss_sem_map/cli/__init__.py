@@ -1,4 +1,4 @@
-"""The command line. Everything heavy is imported inside the commands, so that --help answers at once.
+"""The command line. Large packages are imported inside the commands, so that --help is fast.
 
 A new command is a function in one of the files here and a line in `app.COMMANDS`.
 """

@@ -1,4 +1,4 @@
-"""The list of all commands, and how each of them ends: exit codes and one line for every error."""
+"""The list of all commands, their exit codes, and one line for every error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ COMMANDS = (
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="A drive log (GNSS, IMU, LiDAR, camera) in, a clean, georeferenced, semantic 3D map out.",
+    help="From a drive log (GNSS, IMU, LiDAR, camera) to a clean, georeferenced, semantic 3D map.",
     epilog="Example: gnss-sem-map run 2011_09_26/2011_09_26_drive_0005_sync --segmenter labels:probabilities -o out",
 )
 for _command in COMMANDS:
@@ -42,15 +42,15 @@ for _command in COMMANDS:
 
 
 def main() -> None:
-    """Entry point: one line on stderr for every mistake; exit code 2 for wrong usage, 1 for an error that is ours.
+    """Entry point: one line on stderr for every error; exit code 2 for wrong usage, 1 for any other error.
 
-    A signal ends it as orderly, with 128 and its number.
+    A signal ends it with one line too, and with 128 plus its number.
     """
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
 
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # those of other packages; ours are printed as such
+        warnings.simplefilter("ignore")  # of other packages; ours are printed by the commands
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
@@ -68,7 +68,7 @@ def main() -> None:
         code = _say(
             f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive", 1
         )
-    except OSError as error:  # what the system refused, and nobody explained better
+    except OSError as error:  # an error of the system that was not explained earlier
         code = _say(f"{error.filename or 'output'}: {error.strerror or error}", 1)
         _close_stdout()
     except (UnicodeError, RecursionError) as error:
@@ -78,21 +78,21 @@ def main() -> None:
 
 def _say(message: str, code: int) -> int:
     """One line on stderr; returns the exit code."""
-    ignore_signals()  # we are ending already
+    ignore_signals()  # the program is ending already
     typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
     return code
 
 
 def _close_stdout() -> None:
-    """What could not be printed will not be tried again at the end."""
+    """Close stdout, so that output that could not be printed is not tried again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _wrong_usage(error: typer.TyperException) -> int:
-    """Say in one line what was typed wrongly and where to read how; returns the exit code."""
+    """Print the wrong usage, and the command for help, in one line; returns the exit code."""
     message = " ".join(error.format_message().split())
     context: typer.Context | None = getattr(error, "ctx", None)
     command = "gnss-sem-map" if context is None else context.command_path
-    if message:  # no command at all: its help has been shown
+    if message:  # without a command, the help has been shown
         typer.echo(f"gnss-sem-map: {message.rstrip('.')}; see {command} --help", err=True)
     return error.exit_code

@@ -1,4 +1,4 @@
-"""What the terminal shows: progress, warnings, tables and summaries."""
+"""Output on the terminal: progress, warnings, tables and summaries."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def warn(warnings: Iterable[str]) -> None:
 
 
 def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
-    """What a run was and cost, in three lines or as JSON."""
+    """Summary of a run, with its times, in three lines or as JSON."""
     if as_json:
         typer.echo(json.dumps(about))
         return
@@ -56,18 +56,18 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
 
 
 def print_merged(about: dict[str, Any], out: Path) -> None:
-    """What came of two runs, and how the second came to lie on the first; what does not fit on stderr."""
+    """Size of the merged map and alignment of the second run to the first; a failed registration on stderr."""
     match, (first, second) = about["match"], about["merged"]
-    before, now = (_percent(match["coinciding"][moment]) for moment in ("by_georeference", "now"))
+    before, after = (_percent(match["overlap"][moment]) for moment in ("by_georeference", "aligned"))
     typer.echo(f"{about['name']}: {about['map']['voxels']} voxels")
     if match["shift_m"] is not None:
         typer.echo(
-            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {now} % of its voxels fall"
-            f" on {first}, {before} % did by georeference"
+            f"{second} moved by {match['shift_m']:.2f} m and {match['turn_deg']:.2f} deg: {after} % of its voxels"
+            f" overlap {first}, by georeference {before} %"
         )
     else:
-        typer.echo(f"{second} lies by georeference: {now} % of its voxels fall on {first}")
-        warn([f"{second} could not be laid onto {first}: {match['reason']}"] if match["reason"] else [])
+        typer.echo(f"{second} is aligned by its georeference alone: {after} % of its voxels overlap {first}")
+        warn([f"{second} could not be registered to {first}: {match['reason']}"] if match["reason"] else [])
     typer.echo(f"results in {out}")
 
 
@@ -79,7 +79,7 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
     table = Table(
         title="Semantics, % of labelled points",
-        caption="accuracy: of the points that carry the class, how many are of it (eq. 14; elsewhere: precision)",
+        caption="accuracy: share of the points labelled with the class that belong to it (eq. 14; precision)",
     )
     table.add_column("class")
     for column in ("accuracy raw", "refined", "IoU raw", "refined"):
@@ -110,19 +110,19 @@ def print_metrics(metrics: dict[str, Any]) -> None:
         )
         if "position_nees_per_dof" in t:
             lines.append(
-                f"  squared error by its claimed variance (NEES per degree of freedom): position"
+                f"  squared error over its stated variance (NEES per degree of freedom): position"
                 f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
-                " honest is 1 on average over many drives"
+                " consistent covariances give 1 on average over many drives"
             )
     for line in lines:
         console.print(line, highlight=False)
 
 
 def print_cache(report: CacheReport, out: Path) -> None:
-    """How many images were segmented, what that cost, and how to use them."""
+    """Number and size of the segmented images, and the option that uses them."""
     if not report.written and not report.skips:
         there = f"all {report.kept} images are segmented" if report.kept else "the drive has no images"
-        typer.echo(f"nothing was to do: {there}")
+        typer.echo(f"nothing to do: {there}")
     else:
         cost = f" ({report.bytes_per_frame / 1000:.0f} kB each, {report.images_per_second:.1f} images/s)"
         typer.echo(
@@ -134,7 +134,7 @@ def print_cache(report: CacheReport, out: Path) -> None:
 
 
 def print_preflight(name: str, page: Preflight, out: Path) -> None:
-    """One page: every check with its level and what was found; under it the probable mistake and what to do."""
+    """One page: every check with its level and its evidence; below it the probable mistake and the remedy."""
     from rich.console import Console
     from rich.text import Text
 

@@ -1,6 +1,6 @@
 """The demo: a simulated drive, its images segmented, mapped, and scored against the exact truth.
 
-What `simulate`, `segment`, `run` and `evaluate` do one after another, and how to do it from Python.
+It does the same as `simulate`, `segment`, `run` and `evaluate`, and is an example of the Python API.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from gnss_sem_map.simulation import simulate, write_corrupted_labels
 PROBABILITIES = "probabilities"
 """Folder of the class probabilities, beside the drive."""
 LABELS = {
-    "network": "of the small network trained on simulated streets (not of seeds 0, 101 to 105); no use on real images",
+    "network": "of the small network trained on simulated streets (not of seeds 0, 101 to 105); not for real images",
     "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
 }
-"""Where the demo's class probabilities come from."""
+"""Sources of the demo's class probabilities."""
 PICTURES = ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html")
 
 
 @dataclass(frozen=True, eq=False)
 class Demo:
-    """What a demo came to."""
+    """Result of a demo."""
 
     about: dict[str, Any]
     """As run.json, with the seconds of simulation and segmentation before those of the run."""
@@ -51,7 +51,7 @@ def demonstrate(
 ) -> Demo:
     """Simulate a drive into `<out>_drive`, segment it, map it into `out` and score it, with `source` one of `LABELS`.
 
-    Earlier demos in both folders are replaced. Raises DataError when either holds what no demo wrote, and ConfigError
+    Earlier demos in both folders are replaced. Raises DataError when either holds other files, and ConfigError
     when the network needs a package that is not installed.
     """
     world = real_path(out).with_name(f"{real_path(out).name}_drive")
@@ -61,7 +61,7 @@ def demonstrate(
 
 def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str, progress: Progress) -> Demo:
     label_set = open_label_set()
-    # what is missing is said now, not after the simulation
+    # a missing package is reported now, not after the simulation
     network = open_segmenter("demo", label_set) if source == "network" else None
     settings = config.load(overrides=[f"calibration={DEMO_CALIBRATION}"] if network else [])
 

@@ -32,7 +32,7 @@ def evaluate(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Score a run against the truth: accuracy and IoU per class, what moved, calibration, trajectory."""
+    """Score a run against the truth: accuracy and IoU per class, moving objects, calibration, trajectory."""
     from gnss_sem_map.errors import DataError
     from gnss_sem_map.evaluation.score_run import score_run
     from gnss_sem_map.export.report import write_report
@@ -64,10 +64,10 @@ def calibrate(
     out: Annotated[Path, typer.Option("-o", "--out", help="Calibration file to write.")] = Path(
         "calibration.yaml"
     ),
-    drive: Annotated[Path | None, typer.Option(help="The drive, where it is no longer where it was.")] = None,
+    drive: Annotated[Path | None, typer.Option(help="The drive, if it was moved since.")] = None,
     segmenter: Segmenter = None,
 ) -> None:
-    """Measure what the network's answers are worth; use it with --set calibration=FILE."""
+    """Measure the confusion model of the network; use it with --set calibration=FILE."""
     from gnss_sem_map.evaluation.fit_sensor_model import calibrate as measure
     from gnss_sem_map.files.atomic import replacing
     from gnss_sem_map.labels.sensor_model import check_replaceable
@@ -96,7 +96,7 @@ def check(
     drive_format: Format = None,
     as_json: Json = False,
 ) -> None:
-    """The pre-flight: a log against physics, and its sensors against each other; 1 when something is red."""
+    """Pre-flight: check a log against physics, and its sensors against each other; exit code 1 if a check is red."""
     from gnss_sem_map.evaluation import preflight
     from gnss_sem_map.evaluation.preflight.findings import Level
     from gnss_sem_map.labels.label_set import open_label_set

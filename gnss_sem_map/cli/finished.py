@@ -1,4 +1,4 @@
-"""Commands on a finished run, without starting over: `refine`, `relabel`, `export`, `view`."""
+"""Commands on a finished run: `refine`, `relabel`, `export`, `view`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_run, progress_bars
+from gnss_sem_map.cli.console import print_merged, print_run, progress_bars
 from gnss_sem_map.cli.options import Device, Json, Set
 
 Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
@@ -18,18 +18,21 @@ Other = Annotated[
 
 
 def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = False) -> None:
-    """Refine the map of a run again with other settings of the refinement; no scan is matched, no network asked."""
+    """Refine the map of a run again with other refinement settings; scans are not matched or segmented again."""
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
     again = finished.refine(finished.settings.changed(*(set_ or ())), out)
-    print_run(again.about, again.folder, as_json)
+    if again.is_merged and not as_json:
+        print_merged(again.about, again.folder)
+    else:
+        print_run(again.about, again.folder, as_json)
 
 
 def relabel(
     run: Finished,
     segmenter: Annotated[
-        str, typer.Option(help="Where class probabilities come from: labels:DIR, refinenet:FILE, ...")
+        str, typer.Option(help="Source of class probabilities: labels:DIR, refinenet:FILE, ...")
     ],
     device: Device = "auto",
     out: Other = None,
@@ -64,7 +67,7 @@ def export(
 
 def view(
     run: Finished,
-    browser: Annotated[bool, typer.Option(help="Open it in a browser, and not only say where it is.")] = True,
+    browser: Annotated[bool, typer.Option(help="Open it in a browser; else only print its path.")] = True,
 ) -> None:
     """Open the viewer of a run in a browser."""
     from gnss_sem_map.runs.finished_run import Run

@@ -35,12 +35,14 @@ def run(
     frames: Frames = None,
     drive_format: Format = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
-    resume: Annotated[bool, typer.Option(help="Go on with what an interrupted run of this mapped.")] = False,
+    resume: Annotated[
+        bool, typer.Option(help="Continue an interrupted run of the same drive and settings.")
+    ] = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Trajectory, semantic map, refined map and all exports of one drive."""
+    """Make trajectory, semantic map, refined map and all exports of one drive."""
     from gnss_sem_map.runs.finished_run import run_log
     from gnss_sem_map.runs.run_folder import claimed_run, places_read
     from gnss_sem_map.segmentation import no_segmenter_message
@@ -68,13 +70,11 @@ def merge(
     out: Out,
     match: Annotated[
         bool,
-        typer.Option(
-            help="Align the surfaces of the second map with those of the first: positions of both err."
-        ),
+        typer.Option(help="Register the second map to the first, because both positions have errors."),
     ] = True,
     as_json: Json = False,
 ) -> None:
-    """One map of two runs of the same place, refined again."""
+    """Merge two runs of the same place into one map, refined again."""
     from gnss_sem_map.runs.merged_run import merge_run_folders
 
     about = merge_run_folders(first, second, out, match)
@@ -93,7 +93,7 @@ def trajectory(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
+    """Make only the trajectory: GNSS and IMU smoothed, with covariance, in every format, and a plot of its quality."""
     from gnss_sem_map import pipeline
     from gnss_sem_map.run_stats import RunStats
     from gnss_sem_map.runs import run_folder

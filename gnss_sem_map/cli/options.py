@@ -1,4 +1,4 @@
-"""The options that several commands share, and what they name: the settings, the drive, its inputs."""
+"""Options that several commands share, and the settings and drives that they name."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ Set = Annotated[
     list[str] | None, typer.Option("--set", help="One setting, as section.name=value; repeatable.")
 ]
 Format = Annotated[
-    str | None, typer.Option("--format", help="kitti-raw, kitti-odometry or table; default: what is there.")
+    str | None, typer.Option("--format", help="kitti-raw, kitti-odometry or table; default: detected.")
 ]
 Frames = Annotated[
     str | None,
     typer.Option(
         "--frames",
-        help="Only frames A to B - 1, as A:B, by frame number; LiDAR odometry sees only these too, GNSS and IMU all"
-        " of the drive.",
+        help="Only frames A to B - 1, as A:B, by frame number; LiDAR odometry uses only these too; GNSS and IMU"
+        " are used completely.",
     ),
 ]
 Segmenter = Annotated[
     str | None,
     typer.Option(
-        help="Where class probabilities come from: labels:DIR, refinenet:FILE, hf:MODEL, onnx:FILE,"
+        help="Source of class probabilities: labels:DIR, refinenet:FILE, hf:MODEL, onnx:FILE,"
         " python:MODULE:CALLABLE; none: geometry only."
     ),
 ]
-Device = Annotated[str, typer.Option(help="Where a network runs: auto, cpu, cuda.")]
-Force = Annotated[bool, typer.Option("--force", help="Go on where the pre-flight (see `check`) is red.")]
+Device = Annotated[str, typer.Option(help="Device of a network: auto, cpu, cuda.")]
+Force = Annotated[bool, typer.Option("--force", help="Continue even if the pre-flight (see `check`) is red.")]
 Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 
 

@@ -1,4 +1,4 @@
-"""Commands that ask or train a network: `segment`, `train`."""
+"""Commands that run or train a network: `segment`, `train`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gnss_sem_map.cli.signals import Stopped
 def segment(
     drive: Drive,
     out: Annotated[
-        Path, typer.Option("-o", "--out", help="Folder for the class probabilities; resumed if there.")
+        Path, typer.Option("-o", "--out", help="Folder for the class probabilities; existing ones are kept.")
     ],
     segmenter: Annotated[str, typer.Option(help="The network: refinenet:FILE, hf:MODEL, onnx:FILE, ...")],
     device: Device = "auto",
     batch_size: Annotated[
-        int, typer.Option(min=1, help="Images per step: one is fastest on a processor, more are on a GPU.")
+        int, typer.Option(min=1, help="Images per batch: one is fastest on a CPU, several on a GPU.")
     ] = 1,
     classes: Annotated[str, typer.Option(help="Class set: a shipped one, or a YAML file.")] = "urban",
     drive_format: Format = None,
@@ -37,7 +37,7 @@ def segment(
         try:
             report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)
         except Stopped as stopped:
-            stopped.add_note("what is segmented is kept: the same command goes on")
+            stopped.add_note("segmented images are kept: the same command continues")
             raise
     warn([f"{skip.where}: {skip.reason}" for skip in report.skips])
     print_cache(report, out)
@@ -52,19 +52,19 @@ def train(
     ],
     validation: Annotated[list[str], typer.Option(help="Validation data, likewise.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder for the network, its state and the log.")],
-    initial: Annotated[Path | None, typer.Option(help="Checkpoint to begin with.")] = None,
+    initial: Annotated[Path | None, typer.Option(help="Checkpoint to start from.")] = None,
     taxonomy: Annotated[
-        str, typer.Option(help="What the ids in the labels mean: cityscapes, camvid, FILE.")
+        str, typer.Option(help="Taxonomy of the ids in the labels: cityscapes, camvid, FILE.")
     ] = "cityscapes",
     ids: Annotated[
-        str | None, typer.Option(help="Kind of id, where the taxonomy has several: train_id, label_id.")
+        str | None, typer.Option(help="Kind of id, if the taxonomy has several: train_id, label_id.")
     ] = None,
     classes: Annotated[
         str, typer.Option(help="Class set to learn: a shipped one, or a YAML file.")
     ] = "urban",
     set_: Set = None,
     device: Device = "auto",
-    resume: Annotated[bool, typer.Option(help="Go on where an interrupted training stopped.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
 ) -> None:
     """Train or fine-tune a RefineNet on images with label PNGs (the paper: Cityscapes, then CamVid)."""
     from gnss_sem_map import config
@@ -91,7 +91,7 @@ def train(
                 progress,
             )
         except Stopped as stopped:
-            stopped.add_note("the same command with --resume goes on from the last validation")
+            stopped.add_note("the same command with --resume continues from the last validation")
             raise
     typer.echo(
         f"{report.network}: validation mean IoU {report.best_mean_iou:.3f} at step {report.best_step} of {report.steps}"

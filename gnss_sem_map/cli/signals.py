@@ -1,4 +1,4 @@
-"""Signals that ask the program to end, as an exception."""
+"""Signals that end the program, as an exception."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stopped(BaseException):
-    """Somebody asked us to stop: Ctrl-C, `kill`, or a terminal that was closed."""
+    """The program was stopped: by Ctrl-C, `kill`, or because its terminal was closed."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}")
@@ -23,7 +23,7 @@ def stop_on_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Let no signal interrupt the end of the program."""
+    """Ignore signals while the program ends."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 

@@ -40,7 +40,7 @@ def demo(
         ),
     ] = "network",
 ) -> None:
-    """Simulate a drive, map it, score it against the exact truth, and say where the pictures are."""
+    """Simulate a drive, map it, score it against the exact truth, and list the pictures."""
     from gnss_sem_map.cli.demo import LABELS, demonstrate
 
     with progress_bars() as progress:

@@ -1,7 +1,7 @@
-"""Drives in: every reader turns one folder layout into a `SensorLog`.
+"""Readers of drives: each reads one folder layout into a `SensorLog`.
 
-A reader is a module of this folder with a `FORMAT`: its name, `SIGNS` (what a drive of it holds, in words),
-`is_drive(folder)`, and `read(folder)`.
+A reader is a module of this folder with `FORMAT` (its name), `SIGNS` (the content of such a drive, in words),
+`is_drive(folder)` and `read(folder)`.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ def readers() -> dict[str, Any]:
 
 
 def detect_format(drive: Path) -> str:
-    """Say what kind of drive a folder holds, from what is there; raises DataError when it is none."""
+    """Name of the format of a drive, by its files; raises DataError for a folder that is no drive."""
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
     fitting = [name for name, reader in readers().items() if reader.is_drive(drive)]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
-        raise DataError(f"{shown(drive)}: looks like {' and '.join(fitting)}; say which with --format")
+        raise DataError(f"{shown(drive)}: looks like {' and '.join(fitting)}; choose one with --format")
     found = [shown(path.name) for path in inside(drive)][:8]
     signs = ", or ".join(f"{reader.SIGNS}" for reader in readers().values())
-    raise DataError(f"{shown(drive)}: no drive that we know; found {found}, expected {signs}")
+    raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}")
 
 
 def open_drive(drive: Path | str, drive_format: str | None = None) -> SensorLog:
-    """Open a drive of any known format: small things are read now, scans and images when they are needed."""
+    """Open a drive of any known format; scans and images are read later, when they are needed."""
     drive = Path(drive)
     if drive_format is not None and drive_format not in readers():
         raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")

@@ -1,7 +1,7 @@
 """CSV logs: a user's own drive as tables, with optional scans and images beside them.
 
     imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
-                                                       or as `imu_axes`, `force_unit`, `rate_unit` of log.yaml say
+                                                       or by `imu_axes`, `force_unit`, `rate_unit` in log.yaml
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
@@ -74,9 +74,7 @@ class LogFile(SensorConventions):
     )
     image_size: tuple[int, int] | None = Field(None, description="Width and height of the images, px.")
     camera_time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
-    imu_noise: ImuNoise | None = Field(
-        None, description="Noise of the IMU; a good consumer unit when absent."
-    )
+    imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
     lidar_is_compensated: bool = Field(
         False, description="Scans of four columns are already motion-compensated to their stamp."
     )
@@ -86,7 +84,7 @@ FORMAT, SIGNS = "table", "imu.csv and gnss.csv (table log)"
 
 
 def is_drive(drive: Path) -> bool:
-    """Whether a folder looks like one."""
+    """Whether a folder looks like a table log."""
     return is_file(drive / "imu.csv") or is_file(drive / "gnss.csv")
 
 
@@ -191,7 +189,7 @@ def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any
         )
         table = csv.read_csv(pa.BufferReader(content), convert_options=options)
         if len(set(table.column_names)) < len(columns):
-            raise ValueError("a column is there twice")
+            raise ValueError("a column is repeated")
     except (pa.ArrowException, ValueError, KeyError) as error:
         raise DataError(
             f"{shown(path)}: {' '.join(str(error).split())[:200]}; expected numbers in columns {','.join(columns)}"
@@ -262,7 +260,7 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.Sta
         rows = frames.read_points(path, 4, state)
         return Points(rows[:, :3], rows[:, 3], None)
     rows = frames.read_points(path, 5, state)
-    with np.errstate(invalid="ignore"):  # of NaN that signal
+    with np.errstate(invalid="ignore"):  # of signalling NaN
         after = rows[:, 4].astype(np.float64)
     _leave_out_of_sweep(rows, after, shown(path))
     return Points(rows[:, :3], rows[:, 3], stamp + after)

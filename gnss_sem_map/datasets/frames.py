@@ -21,8 +21,8 @@ MOST_POINTS = 10_000_000
 FARTHEST_M, NEAREST_M = 1000.0, 1e-6
 """Range limit of LiDARs on roads; and coordinates nearer to zero, but not zero, are no measurements."""
 NO_POINTS, EVERY = 0.1, 8
-"""With so many of its points out of these bounds a file is no scan: of random bytes nine in ten coordinates are. Every
-eighth point tells it at no cost."""
+"""A file with a larger share of points out of these bounds is no scan: of random bytes, nine in ten coordinates are
+out of bounds. Every eighth point is tested."""
 LARGEST_NUMBER = 2**63 - 1
 
 State = tuple[int, int]
@@ -31,7 +31,7 @@ State = tuple[int, int]
 
 @dataclass(frozen=True)
 class Frames:
-    """The files of a folder by frame number, in order, and those that were left out."""
+    """The files of a folder by frame number, in order, and the skipped ones."""
 
     files: dict[int, Path]
     skips: list[Skip]
@@ -40,7 +40,7 @@ class Frames:
 def numbered(what: str, folder: Path, *suffixes: str) -> Frames:
     """The files whose name is a number, of any of these endings; none when there is no such folder.
 
-    Of several files of one frame the one of the first ending stays, then the first by name. Raises DataError for a
+    Of several files of one frame, the first by ending, then by name, is used. Raises DataError for a
     folder that cannot be listed.
     """
     if not is_folder(folder):
@@ -64,14 +64,14 @@ def state_of(path: Path) -> State | None:
     try:
         found = status(path)
     except DataError:
-        return None  # said when it is read
+        return None  # reported when it is read
     return None if found is None else (found.st_size, found.st_mtime_ns)
 
 
 def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDArray[np.float32]:
     """Rows of little-endian float32 (n, columns).
 
-    Raises DataError for a file that is cut short, empty, too large, or no longer in the `state` that it was in.
+    Raises DataError for a file that is cut short, empty, too large, or changed since its `state` was taken.
     """
     with os.fdopen(open_file(path), "rb", buffering=0) as file:
         found = os.fstat(file.fileno())

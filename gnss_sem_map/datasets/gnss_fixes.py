@@ -35,12 +35,12 @@ def usable_fixes(
     has_accuracy = ((stddevs >= LEAST_STDDEV_M) & (stddevs <= LARGEST_STDDEV_M)).all(axis=1)
     usable = is_place & has_accuracy
     near = np.zeros(len(stamps), np.bool_)
-    with np.errstate(over="ignore", invalid="ignore"):  # of stamps that are left out later
+    with np.errstate(over="ignore", invalid="ignore"):  # of stamps that are skipped later
         near[usable] = _near(stamps[usable], geodetic[usable])
     kinds = [
         (is_high, "no height on Earth; is the altitude in mm?"),
         (~is_place & ~is_high, "no place on Earth, or 0, 0"),
-        (is_place & ~has_accuracy, "a standard deviation that is not above 0, or beyond all sense"),
+        (is_place & ~has_accuracy, "a standard deviation that is not above 0, or far too large"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]
     counted = [(int(rows.sum()), why) for rows, why in kinds if rows.any()]

@@ -32,7 +32,7 @@ FORMAT, SIGNS = "kitti-odometry", "calib.txt and poses.txt (KITTI odometry, Sema
 
 
 def is_drive(drive: Path) -> bool:
-    """Whether a folder looks like one."""
+    """Whether a folder looks like an odometry sequence."""
     return is_file(drive / "calib.txt") or is_file(drive / "poses.txt")
 
 
@@ -108,8 +108,8 @@ def _times(path: Path) -> Array:
     off = np.flatnonzero(far_off(times))
     if len(off):
         raise DataError(
-            f"{shown(path)}: line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others; expected the time of"
-            " one frame after the other"
+            f"{shown(path)}: line {off[0] + 1}: found {times[off[0]]:.9g} s, far off all others; expected the times of"
+            " consecutive frames"
         )
     return times
 
@@ -125,7 +125,7 @@ def _poses(path: Path) -> Array:
         line = int(np.flatnonzero(wrong)[0])
         raise DataError(
             f"{shown(path)}: line {line + 1}: {kitti_calibration.rotation_fault(R[line])}, expected a rotation in a"
-            f" rigid pose; {wrong.sum()} of {len(poses)} poses are like that"
+            f" rigid pose; {wrong.sum()} of {len(poses)} poses have this fault"
         )
     far = ~(np.abs(poses[:, :, 3]) <= FARTHEST_M).all(axis=1)
     if far.any():
@@ -141,7 +141,7 @@ def _lidar_poses(poses: Array, Tr: Array) -> Array:
     T_camera0_camera = np.tile(np.eye(4), (len(poses), 1, 1))
     T_camera0_camera[:, :3] = poses
     T_map_lidar: Array = np.linalg.inv(Tr) @ T_camera0_camera @ Tr
-    # poses.txt has six digits: make the rotations orthonormal again
+    # poses.txt has six digits; make the rotations orthonormal again
     u, _, vt = np.linalg.svd(T_map_lidar[:, :3, :3])
     T_map_lidar[:, :3, :3] = u @ vt
     return T_map_lidar
@@ -175,7 +175,7 @@ def _table(path: Path, columns: int) -> Array:
 
 
 def _image_size(files: dict[int, Path]) -> tuple[int, int] | None:
-    """(width, height) of the first image that can be read: the odometry calibration does not say it."""
+    """(width, height) of the first image that can be read: the odometry calibration does not hold it."""
     for path in files.values():
         try:
             height, width = frames.read_image(path, None).shape[:2]

@@ -1,6 +1,6 @@
 """KITTI raw drives: `<date>/<date>_drive_<nnnn>_sync`, calibration in the date folder.
 
-Facts that this reader stands on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
+Facts that this reader relies on (measured on drives 0005 and 0009 of 2011_09_26): the sweep starts at the rear and
 turns clockwise; raw scans are not motion-compensated; the stamp of a scan is its middle; the image is exposed 8.5 ms
 before its stamp; oxts jitters against the scans, so nothing may be paired by index. Line k of a stamp file belongs
 to frame k, and is blank when the frame is missing.
@@ -44,11 +44,11 @@ OXTS_NOISE = ImuNoise(
     gyroscope_bias_stddev=1e-4,
 )
 """Of the RT3003, whose rates and forces are already corrected for bias by its own filter. Gyroscopes by its data sheet,
-0.2 °/√h and stable to 2 °/h; accelerometers worse than by that, 0.005 m/s/√h, for it stands in a car that shakes."""
+0.2 °/√h and stable to 2 °/h; accelerometers worse, 0.005 m/s/√h, because the car vibrates."""
 OXTS_COLUMNS = 30
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
-"""ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would leak into the result."""
+"""ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would influence the result."""
 ANGULAR_RATE = slice(17, 20)
 POSITION_ACCURACY = 23
 LEAST_ACCURACY_M = 1e-4
@@ -56,16 +56,17 @@ LEAST_ACCURACY_M = 1e-4
 
 
 FORMAT, SIGNS = "kitti-raw", "oxts/ (KITTI raw)"
+IMU_TO_LIDAR = "calib_imu_to_velo.txt"
 
 
 def is_drive(drive: Path) -> bool:
-    """Whether a folder looks like one."""
+    """Whether a folder looks like a KITTI raw drive."""
     return is_folder(drive / "oxts")
 
 
 def read(drive: Path) -> SensorLog:
     """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed."""
-    calibration = _calibration(drive.parent, has_images=is_folder(drive / "image_02"))
+    calibration = _calibration(_date_folder(drive), has_images=is_folder(drive / "image_02"))
     oxts_ns, oxts, skips = _oxts(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, fix_skips = usable_fixes(
@@ -88,7 +89,7 @@ def read(drive: Path) -> SensorLog:
     scans, scan_skips = _scans(drive, epoch_ns)
     images, image_skips = _images(drive, epoch_ns, calibration.image_size)
     return SensorLog(
-        name=shown(drive.name),
+        name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
         calibration=calibration,
         scans=scans,
@@ -103,8 +104,14 @@ def read(drive: Path) -> SensorLog:
     )
 
 
+def _date_folder(drive: Path) -> Path:
+    """The folder with the calibration: beside the drive, or, if `drive` is a link or `.`, beside its target."""
+    has_calibration = is_file(drive.parent / IMU_TO_LIDAR)
+    return drive.parent if has_calibration else drive.resolve().parent
+
+
 def _calibration(date: Path, has_images: bool) -> Calibration:
-    file = date / "calib_imu_to_velo.txt"
+    file = date / IMU_TO_LIDAR
     imu_to_velo = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
     T_lidar_imu = kitti_calibration.transform(imu_to_velo["R"], imu_to_velo["T"], f"{shown(file)}: R")
     T_imu_lidar = np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
@@ -130,7 +137,7 @@ def _calibration(date: Path, has_images: bool) -> Calibration:
 
 
 def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
-    """Unix nanoseconds by frame number; blank lines are frames that do not exist, absurd years are left out."""
+    """Unix nanoseconds by frame number; blank lines are missing frames, stamps of impossible years are skipped."""
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
     stamps, skips = {}, []
@@ -163,7 +170,7 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 
 
 def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
-    """Stamps and rows of the navigation unit, sorted, without repeats; and what was left out."""
+    """Stamps and rows of the navigation unit, sorted, without repeated stamps; and the skipped rows."""
     found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
     stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
     skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
@@ -207,21 +214,25 @@ def _oxts_row(path: Path) -> tuple[str, Array]:
     if row.shape != (OXTS_COLUMNS,) or not np.isfinite(np.delete(row, POSITION_ACCURACY)).all():
         return f"found {row.size} numbers, expected {OXTS_COLUMNS} finite ones", row
     if not (np.abs(row[[*range(11, 14), *range(17, 20)]]) <= LARGEST_OF_IMU).all():
-        return "found a force or a rate that no sensor gives", row
+        return "found a force or a rate beyond the range of any sensor", row
     return "", row
 
 
 def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[Array, Array, list[Skip]]:
-    """The 100 Hz rows of the `_extract` twin when it lies beside the drive, else the 10 Hz rows of the drive."""
-    twin = drive.with_name(drive.name.replace("_sync", "_extract"))
-    if twin == drive or not is_folder(twin / "oxts" / "data"):
-        return stamps, oxts, []
-    twin_ns, rows, skips = _oxts(twin)
-    return _seconds(twin_ns, epoch_ns), rows, skips
+    """The 100 Hz rows of the `_extract` twin of the drive, else the 10 Hz rows of the drive.
+
+    The twin is beside the drive, or beside its target if `drive` is a link.
+    """
+    for place in (drive, drive.resolve()):
+        twin = place.parent / place.name.replace("_sync", "_extract")
+        if "_sync" in place.name and is_folder(twin / "oxts" / "data"):
+            twin_ns, rows, skips = _oxts(twin)
+            return _seconds(twin_ns, epoch_ns), rows, skips
+    return stamps, oxts, []
 
 
 def _reference_poses(positions: Array, oxts: Array) -> Array:
-    """Poses by the navigation unit itself: T_map_imu (k, 4, 4)."""
+    """Poses of the navigation unit: T_map_imu (k, 4, 4)."""
     T_map_imu = np.tile(np.eye(4), (len(oxts), 1, 1))
     T_map_imu[:, :3, :3] = _attitudes(oxts)
     T_map_imu[:, :3, 3] = positions
@@ -229,7 +240,7 @@ def _reference_poses(positions: Array, oxts: Array) -> Array:
 
 
 def _attitudes(oxts: Array) -> Array:
-    """R_map_imu (k, 3, 3) by the unit itself. Yaw is 0 towards east, counter-clockwise."""
+    """R_map_imu (k, 3, 3) by the navigation unit. Yaw is 0 towards east, counter-clockwise."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_euler("ZYX", oxts[:, [YAW, PITCH, ROLL]]).as_matrix())

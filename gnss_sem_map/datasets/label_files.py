@@ -20,7 +20,7 @@ def read_labels(path: Path) -> NDArray[np.uint32]:
 
 
 def read_confidence(path: Path) -> NDArray[np.float16]:
-    """The probabilities of one file; raises DataError when it is cut short, or they are none."""
+    """The probabilities of one file; raises DataError when it is cut short, or holds other values."""
     found = _values(path, "<f2")
     if not ((found >= 0) & (found <= 1)).all():
         raise DataError(f"{shown(path)}: found values outside 0..1, expected probabilities")
@@ -46,5 +46,5 @@ def label_files(folder: Path) -> dict[str, Path]:
 
 
 def truth_folder(truth: Path) -> Path:
-    """Where the truth's labels are: the folder itself, or `labels` in it."""
+    """Folder with the labels of the truth: the folder itself, or `labels` in it."""
     return truth / "labels" if is_folder(truth / "labels") else truth

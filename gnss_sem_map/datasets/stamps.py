@@ -1,4 +1,4 @@
-"""Plausibility of stamps: checked before memory is allocated by them."""
+"""Plausibility of stamps, checked before memory is allocated for their span."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -
         return
     fitting = [unit for unit, scale in UNITS.items() if step * scale <= longest_step_s]
     raise DataError(
-        f"{where}: stamps go on by {step:.6g} at a time, expected seconds, at most {longest_step_s:g}"
+        f"{where}: the usual step between stamps is {step:.6g}, expected seconds, at most {longest_step_s:g}"
         + (f"; are these {fitting[0]}?" if fitting else "")
     )
 

@@ -25,7 +25,7 @@ from gnss_sem_map.files import ownership, work_folder
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems without locks: there we continue without a lock."""
 FIRST_WORDS = "gnss-sem-map writes"
-RESUMABLE = "what is mapped so far is kept: `gnss-sem-map run ... --resume` goes on"
+RESUMABLE = "the intermediate results are kept: `gnss-sem-map run ... --resume` continues"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +55,8 @@ def claimed(
 ) -> Iterator[Claim]:
     """Claim an output folder, and check before any work that results can be written there.
 
-    What a killed command left in the work folder is put right: an old result moved back, a new one that was not
-    finished removed; what is mapped stays until a result is there. Raises DataError when another command writes there,
+    What a killed command left in the work folder is put right: the old result is moved back, an unfinished new one is
+    removed. Intermediate results stay until the run is complete. Raises DataError when another command writes there,
     when what is there is not ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
     """
     real = real_path(out)

@@ -1,8 +1,9 @@
 """Work folder: hidden beside the result; holds intermediate results, and the new result until it is complete.
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
-          chunks.json, 0/, 1/    what is mapped (`chunks`)
+          chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
+          motion/                the moving objects that were found (`mapping.motion_checkpoint`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
 """
@@ -17,13 +18,15 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, ANSWERS, PART, OLD = "chunks.json", "answers", "part", "old"
+CHUNKS, ANSWERS, MOTION, PART, OLD = "chunks.json", "answers", "motion", "part", "old"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json"
     r"|(\d+|\.\d+\.\d+\.part)/(record\.json|\w+/|\w+/-?\d+_-?\d+\.npy|(\w+/)?\.[^/]+\.\d+\.part)?"
 )
 OURS = re.compile(
-    rf"\.gnss-sem-map\.json|part/.*|old/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?|{OF_CHUNKS.pattern}"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"|motion/((about|objects)\.json|(moving_points|keyframes)\.npz|\.[^/]+\.\d+\.part)?"
+    rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
 
@@ -58,7 +61,7 @@ def refuse_foreign(folder: Path) -> None:
 def holds_work(folder: Path) -> bool:
     """Whether there are intermediate results for --resume."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
-    return done or any((folder / ANSWERS).glob("*.npz"))
+    return done or any((folder / ANSWERS).glob("*.npz")) or (folder / MOTION / "about.json").is_file()
 
 
 def clear(folder: Path) -> None:
@@ -68,25 +71,31 @@ def clear(folder: Path) -> None:
     """
     if not folder.is_dir() or folder.is_symlink():
         return
-    forget(folder)
+    remove_intermediate(folder)
     drop_results(folder)
     if {path.name for path in folder.iterdir()} <= {ownership.MARKER}:
         (folder / ownership.MARKER).unlink(missing_ok=True)
         folder.rmdir()
 
 
-def forget(folder: Path) -> None:
-    """Remove mapped chunks and cached probabilities; raises OSError."""
-    forget_chunks(folder)
-    forget_answers(folder)
+def remove_intermediate(folder: Path) -> None:
+    """Remove all intermediate results; raises OSError."""
+    remove_chunks(folder)
+    remove_answers(folder)
+    remove_motion(folder)
 
 
-def forget_answers(folder: Path) -> None:
+def remove_answers(folder: Path) -> None:
     """Remove cached probabilities; raises OSError."""
     _remove_known(folder, folder / ANSWERS)
 
 
-def forget_chunks(folder: Path) -> None:
+def remove_motion(folder: Path) -> None:
+    """Remove the moving objects that were found; raises OSError."""
+    _remove_known(folder, folder / MOTION)
+
+
+def remove_chunks(folder: Path) -> None:
     """Remove mapped chunks, their index first; raises OSError."""
     (folder / CHUNKS).unlink(missing_ok=True)
     for path in sorted(folder.iterdir()):

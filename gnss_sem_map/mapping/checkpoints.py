@@ -1,9 +1,9 @@
-"""What a run has mapped so far, on disk: one folder for every chunk of scans, and in it the voxels tile by tile.
+"""Checkpoints of the mapping: one folder for every chunk of scans, with its voxels tile by tile.
 
-A chunk is the unit of memory, of work and of resuming: its scans are fused in a table of their own, which is then put
-away. A chunk is there, whole, or not there: its record lists the checksum of every file, and what is not as listed is
-mapped again. Evidence is integer sums, so adding up the chunks of a tile gives the same bytes however the scans were
-divided, whoever fused them, and however often the run was interrupted.
+A chunk is the unit of memory, of work and of resuming: its scans are fused in their own table, which is then saved. The
+record of a chunk lists the checksum of every file; an incomplete or damaged chunk is mapped again. Evidence is integer
+sums, so the sum of the chunks has the same bytes for any division of the scans, any number of processes, and any
+interruptions.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ RECORD = "record.json"
 
 @dataclass(frozen=True, eq=False)
 class ChunkStore:
-    """The chunks of one run; `open_store` makes or finds it."""
+    """The chunks of one run; `open_store` makes it."""
 
     folder: Path
     fingerprint: str
-    """Of the run; a chunk of another one is no chunk of this."""
+    """Of the run; chunks with another fingerprint are not used."""
     count: int
-    """How many chunks the whole drive has."""
+    """Number of chunks of the whole drive."""
     voxel_size_m: float
     label_set: LabelSet
 
     def done(self) -> set[int]:
-        """Numbers of the chunks that are there."""
+        """Numbers of the saved chunks."""
         return {int(path.name) for path in self.folder.iterdir() if path.name.isdecimal()}
 
     def write(self, number: int, layers: Mapping[str, VoxelMap], record: Mapping[str, Any]) -> None:
-        """Put a chunk away: the voxels of each layer, and a record of how they came about.
+        """Save a chunk: the voxels of each layer, and a record with counts and skips.
 
-        Raises DataError when the disk is full or the folder may not be written to; nothing half-written stays.
+        Raises DataError when the disk is full or the folder may not be written to; unfinished files are removed.
         """
         beside = self.folder / f".{number}.{os.getpid()}.part"
         checksums: dict[str, str] = {}
@@ -67,13 +67,13 @@ class ChunkStore:
             beside.rename(self.folder / str(number))
         except OSError as error:
             raise DataError(
-                f"{self.folder}: cannot put voxels away ({error.strerror}); free the disk, then --resume"
+                f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then --resume"
             ) from None
         finally:
             shutil.rmtree(beside, ignore_errors=True)
 
     def is_whole(self, number: int) -> bool:
-        """Whether every byte of a chunk is as it was written, for this run."""
+        """Whether a chunk is of this run, complete and undamaged."""
         folder = self.folder / str(number)
         try:
             files: dict[str, str] = self._record(number)["files"]
@@ -90,7 +90,7 @@ class ChunkStore:
         return list(self._records)
 
     def tiles(self, layer: str) -> Iterator[tuple[Tile, VoxelMap]]:
-        """Every tile of a layer in order, each the sum over the chunks; one tile at a time is in memory."""
+        """The tiles of a layer in order, each summed over the chunks; one tile at a time is in memory."""
         parts: dict[Tile, list[tuple[Path, str]]] = {}
         for number, record in enumerate(self._records):
             for name, checksum in record["files"].items():
@@ -102,7 +102,7 @@ class ChunkStore:
             yield tile, reduce(add, (self._read(path, checksum) for path, checksum in files))
 
     def whole(self, layer: str) -> VoxelMap:
-        """A layer in memory, sorted by key."""
+        """A whole layer in memory, sorted by key."""
         rows = [part.to_rows() for _, part in self.tiles(layer)]
         empty = np.empty((0, VoxelMap.words(self.label_set)), np.int64)
         return VoxelMap.of_rows(np.concatenate([empty, *rows]), self.voxel_size_m, self.label_set)
@@ -117,10 +117,10 @@ class ChunkStore:
             content = json.loads(path.read_text("utf-8"))
             record = dict(content["record"])
             if content["sha256"] != _checksum(record) or record["fingerprint"] != self.fingerprint:
-                raise ValueError("not as it was written")
+                raise ValueError("its checksum differs")
             return record
         except (OSError, ValueError, KeyError, TypeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not as it was written"
+            reason = error.strerror if isinstance(error, OSError) else "its checksum differs"
             raise DataError(f"{path}: damaged chunk ({reason}); --resume maps it again") from None
 
     def _read(self, path: Path, checksum: str) -> VoxelMap:
@@ -129,7 +129,7 @@ class ChunkStore:
         except OSError as error:
             raise DataError(f"{path}: damaged voxels ({error.strerror}); --resume maps them again") from None
         if hashlib.sha256(content).hexdigest() != checksum:
-            raise DataError(f"{path}: damaged voxels (not as they were written); --resume maps them again")
+            raise DataError(f"{path}: damaged voxels (their checksum differs); --resume maps them again")
         rows = np.load(io.BytesIO(content), allow_pickle=False)
         return VoxelMap.of_rows(rows, self.voxel_size_m, self.label_set)
 
@@ -139,8 +139,8 @@ def open_store(
 ) -> ChunkStore:
     """A store for a run of `count` chunks that `fingerprint` identifies.
 
-    When resuming it holds the chunks that an interrupted run left whole, else none. Raises DataError when what is there
-    came from other files or other settings, or is no store at all.
+    With `resume` it holds the undamaged chunks of an interrupted run, else none. Raises DataError when the interrupted
+    run had other files or other settings, or the folder holds something else.
     """
     work_folder.make(folder)
     about = folder / work_folder.CHUNKS
@@ -153,7 +153,7 @@ def open_store(
         )
     try:
         if known is None:
-            work_folder.forget_chunks(folder)
+            work_folder.remove_chunks(folder)
             write_whole(about, json.dumps({"fingerprint": fingerprint, "chunks": count}).encode())
         for path in folder.glob(".*.part"):
             _remove(path)
@@ -166,7 +166,7 @@ def open_store(
 
 
 def _fingerprint(about: Path) -> str | None:
-    """What an interrupted run was; None when nothing can be said, and so nothing be used."""
+    """The fingerprint of an interrupted run; None if it cannot be read."""
     try:
         return str(json.loads(about.read_text("utf-8"))["fingerprint"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""What a run knows beside its map, kept with it: so a finished run is refined again without its scans."""
+"""Evidence of a run besides its map: with it, a finished run is refined again without its scans."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """The part of a run that its tiles do not hold."""
+    """The evidence of a run that is not in its tiles."""
 
     moved: VoxelMap
-    """The points of moving objects, which are not in the map that is refined."""
+    """The map of the moving points, which are not refined."""
     moving: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)
-    """Frame number -> places of those points among the scan's usable ones."""
+    """Frame number -> indices of the moving points among the usable points of the scan."""
     keyframes: KeyframeScans | None = None
-    """Scans that say which space is free; None where poses do not come from LiDAR odometry."""
+    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
     surface_heights: SurfaceHeights | None = None
-    """None where no step asked for them."""
+    """None if no step needs them."""
 
 
 def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
@@ -49,38 +49,48 @@ def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
     folder = run / FOLDER
     folder.mkdir()
     tiles.write(SemanticMap.of(evidence.moved), folder / MOVED, frame)
-    frames = sorted(evidence.moving)
-    places = [evidence.moving[number] for number in frames]
-    np.savez_compressed(
-        folder / MOVING_POINTS,
-        frames=np.array(frames, np.int64),
-        counts=np.array([len(some) for some in places], np.int64),
-        places=np.concatenate([*places, np.empty(0, np.int64)]).astype(np.int32),
-    )
+    write_moving_points(evidence.moving, folder / MOVING_POINTS)
     if evidence.keyframes is not None:
-        scans = evidence.keyframes
-        np.savez_compressed(folder / KEYFRAMES, images=scans.images, T_lidar_map=scans.T_lidar_map)
+        write_keyframes(evidence.keyframes, folder / KEYFRAMES)
     if evidence.surface_heights is not None:
         heights = evidence.surface_heights
         np.savez_compressed(folder / HEIGHTS, keys=heights.keys, sums=heights.sums, counts=heights.counts)
 
 
+def write_moving_points(moving: Mapping[int, NDArray[np.int64]], path: Path) -> None:
+    """Write the indices of the moving points of every frame; raises OSError."""
+    frames = sorted(moving)
+    indices = [moving[number] for number in frames]
+    np.savez_compressed(
+        path,
+        frames=np.array(frames, np.int64),
+        counts=np.array([len(some) for some in indices], np.int64),
+        places=np.concatenate([*indices, np.empty(0, np.int64)]).astype(np.int32),
+    )
+
+
+def write_keyframes(scans: KeyframeScans, path: Path) -> None:
+    """Write range images and poses of keyframe scans; raises OSError."""
+    np.savez_compressed(path, images=scans.images, T_lidar_map=scans.T_lidar_map)
+
+
 def read(run: Path, label_set: LabelSet) -> RunEvidence:
-    """Read it again; raises DataError where something is missing or damaged."""
+    """Read the folder `evidence/` of a run folder; raises DataError if something is missing or damaged."""
     folder = run / FOLDER
     if not is_file(folder / MOVING_POINTS):
         raise DataError(
-            f"{shown(run)}: found no {FOLDER}/ in it, which a run keeps to be refined again; make the run again"
+            f"{shown(run)}: found no {FOLDER}/ in it, which is needed to refine the map; make the run again"
         )
     return RunEvidence(
         tiles.read(folder / MOVED, label_set).voxels,
-        _moving_points(folder / MOVING_POINTS),
-        _keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
+        read_moving_points(folder / MOVING_POINTS),
+        read_keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
         _heights(folder / HEIGHTS) if is_file(folder / HEIGHTS) else None,
     )
 
 
-def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
+def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
+    """The indices of the moving points of every frame; raises DataError."""
     with open_archive(path) as archive:
         frames, counts, places = (
             _array(archive, path, name, "iu", 1) for name in ("frames", "counts", "places")
@@ -93,7 +103,8 @@ def _moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
     return dict(zip(frames.tolist(), parts, strict=True))
 
 
-def _keyframes(path: Path) -> KeyframeScans:
+def read_keyframes(path: Path) -> KeyframeScans:
+    """Range images and poses of keyframe scans; raises DataError."""
     with open_archive(path) as archive:
         images, T = _array(archive, path, "images", "u", 3), _array(archive, path, "T_lidar_map", "f", 3)
     if (

@@ -1,8 +1,8 @@
 """From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
 
-A drive is mapped in chunks of scans that know nothing of each other: in memory for a short one, else one after another
-or in several processes, each chunk put away on disk (`chunks`), so that memory does not grow with the drive and an
-interrupted run goes on where it was. Sums are integers: all of these give the same bytes.
+A short drive is mapped in memory. A long one is mapped in independent chunks of scans, one after another or in several
+processes. Each chunk is saved (`checkpoints`): memory does not grow with the drive, and an interrupted run can be
+resumed. Sums are integers, so the result has the same bytes in all cases.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ STATIC, REMOVED = "static", "removed"
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """What stands, and what was seen moving: no point is in both."""
+    """The map of static points and the map of moving points; no point is in both."""
 
     static: VoxelMap
     removed: VoxelMap
@@ -48,16 +48,16 @@ def build_map(
     trajectory: Trajectory,
     segmenter: Segmenter | None,
     settings: Settings,
-    account: RunStats,
+    stats: RunStats,
     progress: Progress = silent,
 ) -> VoxelMap:
-    """Every point of every scan in one map, in memory; see `build_maps`."""
-    return build_maps(Drive(log, trajectory, segmenter, settings), account, progress).static
+    """All points of all scans in one map, in memory; see `build_maps`."""
+    return build_maps(Drive(log, trajectory, segmenter, settings), stats, progress).static
 
 
 def build_maps(
     drive: Drive,
-    account: RunStats,
+    stats: RunStats,
     progress: Progress = silent,
     *,
     work: Path | None = None,
@@ -65,39 +65,39 @@ def build_maps(
     workers: int = 1,
     labels_from: str = "",
 ) -> Maps:
-    """Every point of every scan, at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
+    """Map all points of all scans (eq. 1 to 7): each at its own stamp, labelled by the nearest image in time.
 
-    `work` is a folder for what is mapped so far; with `resume` what an interrupted run left there is used (of the same
-    drive, settings and `labels_from`, which says where the labels come from). The caller removes it. `workers`
-    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or belongs to
+    `work` is a folder for chunks of the map; with `resume`, the chunks of an interrupted run are used if drive,
+    settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. `workers`
+    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or holds
     something else.
     """
     scans = drive.log.scans
-    _warn(drive, account)
+    _warn(drive, stats)
     if work is None and workers == 1:
-        static, removed = fuse_scans(drive, scans, account, progress)
+        static, removed = fuse_scans(drive, scans, stats, progress)
         maps = Maps(static.to_map(), removed.to_map())
     else:
         with _folder(work) as folder:
             store = map_chunks(
-                drive, folder, account, progress, resume=resume, workers=workers, labels_from=labels_from
+                drive, folder, stats, progress, resume=resume, workers=workers, labels_from=labels_from
             )
             maps = Maps(store.whole(STATIC), store.whole(REMOVED))
-    _check(drive, account, maps)
+    _check(drive, stats, maps)
     return maps
 
 
 def map_chunks(
     drive: Drive,
     work: Path,
-    account: RunStats,
+    stats: RunStats,
     progress: Progress = silent,
     *,
     resume: bool = False,
     workers: int = 1,
     labels_from: str = "",
 ) -> ChunkStore:
-    """Map a drive into a folder of chunks, whose tiles can be read one by one; memory does not grow with the drive."""
+    """Map a drive into a folder of chunks, whose tiles are read one by one: memory does not grow with the drive."""
     scans, mapping = drive.log.scans, drive.settings.mapping
     chunks = _chunks(drive)
     store = open_store(
@@ -110,18 +110,18 @@ def map_chunks(
         done += len(chunks[number])
         progress("mapping", done, len(scans))
     for record in store.records():
-        account.counts.update(record["counts"])
-        account.skips.extend(Skip(**skip) for skip in record["skips"])
+        stats.counts.update(record["counts"])
+        stats.skips.extend(Skip(**skip) for skip in record["skips"])
     return store
 
 
 def fuse_scans(
-    drive: Drive, scans: Sequence[Scan], account: RunStats, progress: Progress = silent
+    drive: Drive, scans: Sequence[Scan], stats: RunStats, progress: Progress = silent
 ) -> tuple[VoxelTable, VoxelTable]:
-    """Fuse some scans of a drive: what stands, and what belongs to something that moved."""
+    """Fuse some scans of a drive: the static points, and the points of moving objects."""
     settings = drive.settings
     static, removed = _table(settings), _table(settings)
-    for done, seen in enumerate(look_at(drive, scans, account)):
+    for done, seen in enumerate(look_at(drive, scans, stats)):
         if seen is not None:
             keys = seen.keys
             moved = np.zeros(len(keys), np.bool_)
@@ -148,30 +148,30 @@ def _table(settings: Settings) -> VoxelTable:
     )
 
 
-def _warn(drive: Drive, account: RunStats) -> None:
+def _warn(drive: Drive, stats: RunStats) -> None:
     if drive.segmenter is None:
-        account.warnings.append("no segmenter: the map shows geometry only")
+        stats.warnings.append("no segmenter: the map shows geometry only")
     elif not _has_camera(drive):
-        account.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
+        stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _check(drive: Drive, account: RunStats, maps: Maps) -> None:
-    if not account.counts["scans"]:
-        why = _first_reason(account, "scan")
+def _check(drive: Drive, stats: RunStats, maps: Maps) -> None:
+    if not stats.counts["scans"]:
+        why = _first_reason(stats, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
     is_labelled = maps.static.observed.any() or maps.removed.observed.any()
     if drive.segmenter is not None and _has_camera(drive) and not is_labelled:
-        why = _first_reason(account, "labels")
-        account.warnings.append(f"no point got a label, and the map shows geometry only{why}")
+        why = _first_reason(stats, "labels")
+        stats.warnings.append(f"no point got a label, and the map shows geometry only{why}")
 
 
 def _has_camera(drive: Drive) -> bool:
     return bool(drive.log.images) and drive.log.calibration.has_camera
 
 
-def _first_reason(account: RunStats, what: str) -> str:
-    """Why the first one was left out, as the end of a sentence; nothing where none was."""
-    return next((f"; first reason: {s.where}: {s.reason}" for s in account.skips if s.what == what), "")
+def _first_reason(stats: RunStats, what: str) -> str:
+    """The reason of the first skip of this kind, as the end of a sentence; empty without skips."""
+    return next((f"; first reason: {s.where}: {s.reason}" for s in stats.skips if s.what == what), "")
 
 
 @contextmanager
@@ -195,7 +195,7 @@ def _chunks(drive: Drive) -> list[Sequence[Scan]]:
 def _map_all(
     drive: Drive, store: ChunkStore, numbers: Sequence[int], workers: int, progress: Progress
 ) -> Iterator[int]:
-    """Map these chunks and put them away; yields the number of each that is done."""
+    """Map these chunks and save them; yields the number of each finished chunk."""
     if workers > 1 and len(numbers) > 1:
         _check_sendable(drive)
         yield from in_processes(_map_chunk, (drive, store), numbers, workers)
@@ -208,9 +208,9 @@ def _map_all(
 
 
 def _map_chunk(drive: Drive, store: ChunkStore, number: int, progress: Progress = silent) -> None:
-    account = RunStats()
-    static, removed = fuse_scans(drive, _chunks(drive)[number], account, progress)
-    record = {"counts": dict(account.counts), "skips": [asdict(skip) for skip in account.skips]}
+    stats = RunStats()
+    static, removed = fuse_scans(drive, _chunks(drive)[number], stats, progress)
+    record = {"counts": dict(stats.counts), "skips": [asdict(skip) for skip in stats.skips]}
     store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)
 
 
@@ -225,7 +225,7 @@ def _check_sendable(drive: Drive) -> None:
 
 
 def fingerprint(drive: Drive, labels_from: str) -> str:
-    """What two runs share when one may go on with what the other left: everything that decides the map."""
+    """Digest of everything that decides the map: a run may resume another one with the same fingerprint."""
     log, settings = drive.log, drive.settings
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
@@ -241,8 +241,8 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
     return digest.hexdigest()
 
 
-def answers_fingerprint(drive: Drive, labels_from: str) -> str:
-    """What two runs share when one may use what a network told the other: the network, the images, the classes."""
+def probabilities_fingerprint(drive: Drive, labels_from: str) -> str:
+    """Digest of the network, the images and the classes: a run may use the probabilities of one with the same."""
     log = drive.log
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
@@ -253,7 +253,7 @@ def answers_fingerprint(drive: Drive, labels_from: str) -> str:
 
 
 def _state(item: Scan | Image) -> tuple[int, int] | None:
-    """Size and time of the file that a scan or an image is read from."""
+    """Size and time of the file of a scan or an image."""
     path = file_of(item)
     return None if path is None else _size_and_time(path)
 
@@ -270,7 +270,7 @@ def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
 def _size_and_time(path: Path) -> tuple[int, int] | None:
     try:
         about = path.stat()
-    except OSError:  # reading it will say so
+    except OSError:  # the reader reports it
         return None
     return about.st_size, about.st_mtime_ns
 

@@ -1,6 +1,6 @@
-"""Scans with what their images show of them: every point in the map at its own stamp, and the pixel that saw it.
+"""Scans with labels: every point in the map at its own stamp, and the pixel that shows it.
 
-Files are read and decoded a few scans ahead, in a thread.
+A thread reads and decodes files a few scans ahead.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ READ_AHEAD = 4
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Everything that mapping needs to know; any process can work on a part of it."""
+    """Input of the mapping; any process can work on a part of it."""
 
     log: SensorLog
     trajectory: Trajectory
     segmenter: Segmenter | None
     settings: Settings
     moving: Mapping[int, NDArray[np.int64]] | None = None
-    """Frame number -> places, among the points that `map_points` gives, that belong to something that moved."""
+    """Frame number -> indices of the moving points in what `map_points` returns."""
     matched: bool = False
-    """Whether the trajectory was bound by matching these scans: what stands, then stands still in the map."""
+    """Whether the poses come from LiDAR odometry, so that static objects are not blurred."""
 
     @cached_property
     def label_set(self) -> LabelSet:
@@ -60,26 +60,26 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class LabelledScan:
-    """The usable points of one scan (m of n), in the map, with what its image shows of them."""
+    """The usable points of one scan (m of n) in the map, with the labels of its image."""
 
     drive: Drive
     scan: Scan
     points: Points
     """All n."""
     valid: NDArray[np.bool_]
-    """(n,) which of them are used."""
+    """(n,) mask of the usable ones."""
     keys: NDArray[np.int64]
     """(m,) the voxel of each."""
     pixels: NDArray[np.int32]
-    """(m,) row of `classes` that each point saw, -1 for none."""
+    """(m,) row of `classes` for each point, -1 if the image does not show it."""
     classes: NDArray[np.uint8]
     """(p, c + 1) class probabilities, `other` last."""
     kept: NDArray[np.float64] | None = None
-    """(m, 3) m, `p_map` if it was asked for beforehand."""
+    """(m, 3) m, `p_map` if it was computed beforehand (`keep_points`)."""
 
     @cached_property
     def p_map(self) -> NDArray[np.float64]:
-        """(m, 3) m, where each is: found when it is asked for, for the map needs no more than the voxel."""
+        """Positions (m, 3) m, computed on first use: the map needs only the voxel."""
         drive = self.drive
         if self.kept is not None:
             return self.kept
@@ -87,29 +87,29 @@ class LabelledScan:
 
     @property
     def labels(self) -> NDArray[np.int8]:
-        """(m,) class of the pixel that each point saw, c for `other`, -1 where it saw none."""
+        """(m,) class of the pixel of each point, c for `other`, -1 if the image does not show it."""
         of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED)  # -1 is the last
         return np.asarray(of_pixel[self.pixels], np.int8)
 
 
 def labelled_scans(
-    drive: Drive, account: RunStats | None = None, keep_points: bool = False
+    drive: Drive, stats: RunStats | None = None, keep_points: bool = False
 ) -> Iterator[LabelledScan]:
-    """Every usable scan in time order, with its points in the map and what its image shows of them.
+    """Every usable scan in time order, with its points in the map and their labels.
 
-    `keep_points` finds every `p_map` on the way, which takes less time than asking for it later.
+    `keep_points` computes every `p_map` in the same pass, which takes less time than computing it later.
     """
-    account = account or RunStats()
-    return (seen for seen in look_at(drive, drive.log.scans, account, keep_points) if seen is not None)
+    stats = stats or RunStats()
+    return (seen for seen in look_at(drive, drive.log.scans, stats, keep_points) if seen is not None)
 
 
 def look_at(
-    drive: Drive, scans: Sequence[Scan], account: RunStats, keep_points: bool = False
+    drive: Drive, scans: Sequence[Scan], stats: RunStats, keep_points: bool = False
 ) -> Iterator[LabelledScan | None]:
-    """Every scan, or None for one that cannot be used; why is in the account."""
-    look, views = _Look(drive.log, drive.segmenter, drive.settings, account), Views(drive, account)
-    for scan, (points, classes) in prefetch(look, scans, under_way=READ_AHEAD):
-        yield None if points is None else _see(drive, scan, points, classes, views, account, keep_points)
+    """Every scan, or None for one that cannot be used; the reason is in `stats`."""
+    read, views = _Read(drive.log, drive.segmenter, drive.settings, stats), Views(drive, stats)
+    for scan, (points, classes) in prefetch(read, scans, under_way=READ_AHEAD):
+        yield None if points is None else _see(drive, scan, points, classes, views, stats, keep_points)
 
 
 def _see(
@@ -118,10 +118,10 @@ def _see(
     points: Points,
     image: tuple[Image, ClassImage] | None,
     views: Views,
-    account: RunStats,
+    stats: RunStats,
     keep_points: bool = False,
 ) -> LabelledScan | None:
-    """Everything between reading a scan and fusing it, in one pass over its points."""
+    """Deskew one scan, find its voxels and its labels, in one pass over its points."""
     log, n = drive.log, len(points.xyz)
     mapping, labelling = drive.settings.mapping, drive.settings.labelling
     valid, keys, p_map = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(3 * n if keep_points else 0)
@@ -130,7 +130,7 @@ def _see(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
         )  # fmt: skip
     except MeasurementError as error:
-        account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+        stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         return None
     view = views.of(image, n)
     count, inside = kernels.place(
@@ -139,7 +139,7 @@ def _see(
         valid, keys, p_map, *view.inside, view.nearest,
     )  # fmt: skip
     if count == 0:
-        account.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
+        stats.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
         return None
     pixels = np.full(count, -1, np.int32)
     classes = np.empty((0, len(drive.label_set.names) + 1), np.uint8)
@@ -147,26 +147,26 @@ def _see(
         looking, seen = visible(view, inside, image[1], labelling)
         classes = image[1].at(seen)
         pixels[looking] = np.arange(len(looking))
-    account.counts["scans"] += 1
-    account.counts["points"] += n
-    account.counts["points left out"] += n - count
-    account.counts["points labelled"] += len(classes)
-    account.counts["points unlabelled"] += count - len(classes)
+    stats.counts["scans"] += 1
+    stats.counts["points"] += n
+    stats.counts["points left out"] += n - count
+    stats.counts["points labelled"] += len(classes)
+    stats.counts["points unlabelled"] += count - len(classes)
     kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
     seen_scan = LabelledScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
     if not seen_scan.keys.all():
-        keys_of(seen_scan.p_map, mapping.voxel_size_m)  # says which point it is
+        keys_of(seen_scan.p_map, mapping.voxel_size_m)  # its error names the point
     return seen_scan
 
 
 class Views:
-    """From where the images of a drive looked at its scans, one after another: each view is written over the last."""
+    """Camera views of the images of a drive, one after another; each view reuses the memory of the last."""
 
-    def __init__(self, drive: Drive, account: RunStats) -> None:
-        self._drive, self._account, self._last = drive, account, NO_VIEW
+    def __init__(self, drive: Drive, stats: RunStats) -> None:
+        self._drive, self._stats, self._last = drive, stats, NO_VIEW
 
     def of(self, image: tuple[Image, ClassImage] | None, n: int) -> View:
-        """From where an image looked at n points; NO_VIEW without one, or where the trajectory does not reach."""
+        """Camera view of an image for n points; NO_VIEW without an image, or outside the trajectory."""
         if image is None:
             return NO_VIEW
         log, trajectory = self._drive.log, self._drive.trajectory
@@ -174,7 +174,7 @@ class Views:
         try:
             self._last = view_at(exposed, trajectory, log.calibration, n, over=self._last)
         except MeasurementError as error:
-            self._account.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
+            self._stats.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
             return NO_VIEW
         return self._last
 
@@ -182,19 +182,19 @@ class Views:
 def map_points(
     points: Points, scan: Scan, trajectory: Trajectory, log: SensorLog, settings: MappingSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The points of a sweep that are finite and in range, in the map (m, 3) m, and which of all those are (n,)."""
+    """The finite points in range of a sweep, in the map (m, 3) m, and their mask among all points (n,)."""
     return usable_points_in_map(
         points, scan.stamp, trajectory, log.calibration.T_imu_lidar, settings.nearest_m, settings.farthest_m
     )
 
 
-class _Look:
-    """What a scan's image shows: read, segmented, and counted when there is nothing to see."""
+class _Read:
+    """Reads a scan and segments its image; what is missing is counted."""
 
     def __init__(
-        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, account: RunStats
+        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats
     ) -> None:
-        self._log, self._segmenter, self._account = log, segmenter, account
+        self._log, self._segmenter, self._stats = log, segmenter, stats
         self._within_s = settings.labelling.image_within_s
         self._label_set = open_label_set(settings.classes)
 
@@ -202,14 +202,14 @@ class _Look:
         try:
             points = scan.read()
         except DataError as error:
-            self._account.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+            self._stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
             return None, None
         size = self._log.calibration.image_size
         if self._segmenter is None or size is None or not self._log.images:
             return points, None
         image = self._log.image_at(scan.stamp, self._within_s)
         if image is None:
-            self._account.skips.append(Skip("labels", f"frame {scan.number}", "no image near its stamp"))
+            self._stats.skips.append(Skip("labels", f"frame {scan.number}", "no image near its stamp"))
             return points, None
         try:
             where = f"labels of image {image.number}"
@@ -222,6 +222,6 @@ class _Look:
             return points, (image, class_image(seen, names, self._label_set, size, where))
         except WriteError:
             raise
-        except DataError as error:  # of this one image; the others have theirs
-            self._account.skips.append(Skip("labels", f"frame {image.number}", str(error)))
+        except DataError as error:  # only this image has no labels
+            self._stats.skips.append(Skip("labels", f"frame {image.number}", str(error)))
             return points, None

@@ -1,7 +1,7 @@
-"""One map laid onto another of the same place: what remains between them after georeferencing is the error of both.
+"""Registration of one map to another of the same place, which corrects the errors of their georeferences.
 
-Two drives' positions differ by some decimetres, often by more than a voxel, and then every wall stands twice in
-what they are added to. The surfaces say by how much.
+The positions of two drives differ by some decimetres, often by more than a voxel. Without registration, every wall is
+twice in the merged map.
 """
 
 from __future__ import annotations
@@ -18,43 +18,43 @@ from gnss_sem_map.scans.downsampling import one_per_cube
 Array = NDArray[np.float64]
 
 SPACING_M = 0.4
-"""One point of a map per cube of this edge: two voxels."""
+"""Maps are downsampled to one point per cube of this edge (two voxels)."""
 NEIGHBOURS = 10
-"""A point's plane is that of so many: voxel centres lie up to half a voxel off their surface."""
+"""Points for the plane at each point: voxel centres are up to half a voxel off their surface."""
 REACHES_M = (2.0, 0.5, 0.25)
-"""So far away a point looks for its surface, in one registration after the other."""
+"""Largest correspondence distance of each registration; one follows the other."""
 FARTHEST_M, MOST_TURN_DEG = 3.0, 2.0
-"""Farther no georeference is off; such a match has gone to another wall."""
+"""No georeference has a larger error; such a registration has found another wall."""
 LEAST_POINTS = 300
-"""Fewer points that find a surface say nothing."""
+"""Fewer correspondences give no registration."""
 OPEN_SHARE, OPEN_STDDEV_M = 0.003, 10.0
-"""As of a sweep: a direction that less than this share of the points hold is left as it is."""
+"""As in LiDAR odometry: a direction that less than this share of the points constrain is not moved."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapMatch:
-    """How one map has to be moved to lie on another."""
+    """The motion that aligns one map, the source, to another, the target."""
 
     T_target_source: Array
     """(4, 4)."""
     shift_m: float
-    """At the middle of the source."""
+    """Of the middle of the source."""
     turn_deg: float
 
 
 class NoMatch(Exception):
-    """Why one map cannot be laid onto another."""
+    """One map cannot be registered to another; the message says why."""
 
 
 def match_maps(target: Array, source: Array) -> MapMatch:
     """Register the surfaces of two maps, (n, 3) and (m, 3) m in frames that nearly agree; raises NoMatch.
 
-    Generalised ICP of `small_gicp`, wider first. Along a direction that the place leaves open, such as that of a
-    street without corners, nothing is moved.
+    Generalised ICP of `small_gicp`, the widest distance first. A direction that the surfaces do not constrain, such as
+    that of a street without corners, is not moved.
     """
     if min(len(target), len(source)) < LEAST_POINTS:
         raise NoMatch(f"one of the maps has less than {LEAST_POINTS} voxels")
-    middle = source.mean(axis=0)  # turns are then about it, and do not mix with shifts
+    middle = source.mean(axis=0)  # rotations about it do not mix with shifts
     surfaces, points = _surfaces(target - middle), _surfaces(source - middle)
     tree, T = small_gicp.KdTree(surfaces), np.eye(4)
     for reach_m in REACHES_M:
@@ -63,7 +63,7 @@ def match_maps(target: Array, source: Array) -> MapMatch:
             max_iterations=registration.MAX_ITERATIONS, translation_epsilon=1e-4, rotation_epsilon=1e-6,
         )  # fmt: skip
         if result.num_inliers < LEAST_POINTS:
-            raise NoMatch(f"only {result.num_inliers} places of one lie within {reach_m:g} m of the other")
+            raise NoMatch(f"only {result.num_inliers} points of one lie within {reach_m:g} m of the other")
         T = registration.rigid(result.T_target_source)
     length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
     known, weight = registration.information(result, points)
@@ -83,7 +83,7 @@ def _checked(T: Array, middle: Array) -> MapMatch:
     shift_m, turn_deg = float(np.linalg.norm(T[:3, 3])), registration.turn_deg(T)
     if shift_m > FARTHEST_M or turn_deg > MOST_TURN_DEG:
         raise NoMatch(
-            f"the registration went {shift_m:.2f} m and {turn_deg:.1f}° from the georeference, expected at most"
+            f"the registration is {shift_m:.2f} m and {turn_deg:.1f}° off the georeference, expected at most"
             f" {FARTHEST_M:g} m and {MOST_TURN_DEG:g}°"
         )
     about_origin = T.copy()

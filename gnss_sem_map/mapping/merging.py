@@ -1,9 +1,9 @@
-"""Two maps of the same place in one frame, added: what both drives saw counts twice as much.
+"""Merging of two maps of the same place: the second is brought into the frame of the first, and both are added.
 
-Voxels are moved by their centres, through the Earth: east, north and up differ from origin to origin. Then the surfaces
-of the second are laid onto those of the first, since the georeference of both errs. A moved voxel lands in the one that
-holds its centre, so geometry shifts by up to half a voxel along each axis; evidence and hits are carried over whole. In
-its own frame a map is added exactly, unless it is laid anew.
+Voxel centres are transformed through geodetic coordinates, because the axes of two local frames differ. Then the second
+map is registered to the first, because both georeferences have errors. Evidence and hits of a voxel are added to the
+voxel that holds its transformed centre, so geometry shifts by up to half a voxel along each axis. A map in the same
+frame that is not registered is added exactly.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HITS_LIMIT
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
 PARKED = "vehicle"
-"""Class of what stands elsewhere when the second drive comes: no map is laid onto it."""
+"""Class that is left out of the registration: parked vehicles differ between drives."""
 
 
 @dataclass(frozen=True, eq=False)
-class Laid:
-    """How the second map came to lie on the first."""
+class Alignment:
+    """How the second map was aligned to the first."""
 
     match: MapMatch | None
-    """By which it was moved; None: by its georeference alone."""
+    """The registration; None if only the georeference was used."""
     reason: str
-    """Why there is no match; empty where there is one, or none was asked for."""
-    coinciding: tuple[float, float]
-    """Share of the second's voxels that fall into one of the first: by georeference, and as it lies now."""
+    """Why the registration failed; empty if it succeeded, or was not wanted."""
+    overlap: tuple[float, float]
+    """Share of the second's voxels that fall into a voxel of the first: by georeference, and as aligned."""
 
 
 @dataclass(frozen=True, eq=False)
 class MergedRuns:
     """Two runs as one."""
 
-    stands: VoxelMap
-    """Everything but what moved."""
+    static: VoxelMap
+    """The map without moving points."""
     evidence: RunEvidence
     frame: LocalFrame
-    """Of the first run, and now of both."""
-    laid: Laid
+    """Of the first run."""
+    alignment: Alignment
 
 
 def merge(
@@ -61,10 +61,9 @@ def merge(
     second_frame: LocalFrame | None,
     T: NDArray[np.float64] | None = None,
 ) -> VoxelMap:
-    """Both maps in the frame of the first; `T` (4, 4) moves the second in that frame.
+    """Both maps in the frame of the first; `T` (4, 4) then moves the second in that frame.
 
-    Raises DataError for another voxel size or class set, and for maps of which one is not georeferenced: nothing says
-    then how they lie to each other.
+    Raises DataError if voxel size or class set differ, or one of the maps is not georeferenced.
     """
     return first + into_frame(second, _known(second_frame), _known(first_frame), T)
 
@@ -72,19 +71,21 @@ def merge(
 def merge_runs(
     first: Path, second: Path, label_set: LabelSet | None = None, match: bool = True
 ) -> MergedRuns:
-    """What stands and what was removed in two run folders, in the frame of the first.
+    """Maps and evidence of two run folders, in the frame of the first.
 
-    The second is laid onto the first where the two `match`. Raises DataError for a folder without maps, a damaged one,
-    and maps that do not fit together.
+    With `match`, the second is registered to the first. Raises DataError for a folder without maps, a damaged one, and
+    maps that do not fit together.
     """
     label_set = label_set or tiles.read(first / "map").voxels.label_set
     frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
     known = [evidence.read(run, label_set) for run in (first, second)]
     static = [_without(run, label_set, one.moved) for run, one in zip((first, second), known, strict=True)]
-    laid = lay_onto(static[0], static[1], frames[0], frames[1], match)
-    T = laid.match.T_target_source if laid.match else None
-    stands = merge(static[0], static[1], frames[0], frames[1], T)
-    return MergedRuns(stands, _merged_evidence(known[0], known[1], frames[0], frames[1], T), frames[0], laid)
+    alignment = align(static[0], static[1], frames[0], frames[1], match)
+    T = alignment.match.T_target_source if alignment.match else None
+    evidence_of_both = _merged_evidence(known[0], known[1], frames[0], frames[1], T)
+    return MergedRuns(
+        merge(static[0], static[1], frames[0], frames[1], T), evidence_of_both, frames[0], alignment
+    )
 
 
 def _without(run: Path, label_set: LabelSet, moved: VoxelMap) -> VoxelMap:
@@ -101,7 +102,7 @@ def _merged_evidence(
     second_frame: LocalFrame,
     T: NDArray[np.float64] | None,
 ) -> RunEvidence:
-    """What both runs know beside their maps, in the frame of the first; frame numbers are of one drive only."""
+    """The evidence of both runs in the frame of the first; moving points, which belong to one drive, are left out."""
     moved = merge(first.moved, second.moved, first_frame, second_frame, T)
     T_first_second = _rigid(second_frame, first_frame, np.eye(4) if T is None else T)
     keyframes = [one.keyframes for one in (first, second)]
@@ -120,7 +121,7 @@ def _merged_evidence(
 
 
 def _rigid(source: LocalFrame, target: LocalFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """T_target_source of two local frames, then moved by `T`: both are tangent planes of one ellipsoid."""
+    """`T` after T_target_source of two local frames, both tangent planes of one ellipsoid."""
     if source == target:
         return T
     corners = target.to_map(*source.to_geodetic(np.vstack([np.zeros(3), np.eye(3)])))
@@ -129,31 +130,31 @@ def _rigid(source: LocalFrame, target: LocalFrame, T: NDArray[np.float64]) -> ND
     return np.asarray(T @ T_target_source)
 
 
-def lay_onto(
+def align(
     first: VoxelMap, second: VoxelMap, first_frame: LocalFrame, second_frame: LocalFrame, match: bool = True
-) -> Laid:
-    """How to move the second map in the frame of the first, and whether more of both coincides then."""
+) -> Alignment:
+    """Align the second map to the first: register it with `match`, and keep that if the overlap grows."""
     p_second = _centres_in(second, second_frame, first_frame)
-    before = _coinciding(first, p_second)
+    before = _overlap(first, p_second)
     if not match:
-        return Laid(None, "", (before, before))
+        return Alignment(None, "", (before, before))
     try:
-        found = match_maps(first.centres[_stays(first)], p_second[_stays(second)])
-        after = _coinciding(first, _moved(p_second, found.T_target_source))
+        found = match_maps(first.centres[_is_static(first)], p_second[_is_static(second)])
+        after = _overlap(first, _moved(p_second, found.T_target_source))
         if after <= before:
-            raise NoMatch(f"{after:.0%} of the voxels would coincide, {before:.0%} do by georeference")
+            raise NoMatch(f"{after:.0%} of the voxels would overlap, by georeference {before:.0%} do")
     except NoMatch as error:
-        return Laid(None, str(error), (before, before))
-    return Laid(found, "", (before, after))
+        return Alignment(None, str(error), (before, before))
+    return Alignment(found, "", (before, after))
 
 
-def _stays(voxels: VoxelMap) -> NDArray[np.bool_]:
+def _is_static(voxels: VoxelMap) -> NDArray[np.bool_]:
     names = voxels.label_set.names
     return np.asarray(voxels.labels != (names.index(PARKED) if PARKED in names else len(names)))
 
 
-def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
-    """Share of the points (n, 3) that lie in a voxel of the map."""
+def _overlap(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
+    """Share of the points (n, 3) m that lie in a voxel of the map."""
     if not len(p_map):
         return 0.0
     return float((voxels.indices_of(keys_of(p_map, voxels.voxel_size_m)) >= 0).mean())
@@ -162,7 +163,7 @@ def _coinciding(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:
 def _known(frame: LocalFrame | None) -> LocalFrame:
     if frame is None:
         raise DataError(
-            "cannot merge a map without a georeference: its poses are in a frame of their own; give drives with GNSS"
+            "cannot merge a map without a georeference, whose poses are in a local frame; give drives with GNSS"
         )
     return frame
 
@@ -170,9 +171,9 @@ def _known(frame: LocalFrame | None) -> LocalFrame:
 def into_frame(
     voxels: VoxelMap, source: LocalFrame, target: LocalFrame, T: NDArray[np.float64] | None = None
 ) -> VoxelMap:
-    """The map of one frame in another, moved there by `T` (4, 4); evidence of voxels that land in one is added.
+    """The map in another frame, then moved by `T` (4, 4); the evidence of voxels that fall into one is added.
 
-    Raises DataError when a sum overflows, or the frames lie farther apart than voxels reach.
+    Raises DataError when a sum overflows, or the frames are too far apart for voxel keys.
     """
     if source == target and T is None:
         return voxels

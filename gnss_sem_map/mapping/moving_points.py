@@ -1,4 +1,4 @@
-"""Before the map: which points of a drive belong to something that moved."""
+"""Search for the points of moving objects in all scans of a drive, before mapping."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.scans.prefetch import prefetch
 
 MOVABLE = ("vehicle", "person", "pedestrian", "rider", "cyclist", "bicycle", "motorcycle")
-"""Classes, where the class set has them, whose objects may move."""
+"""Classes of objects that may move, if the class set has them."""
 
 
 def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
-    """Look at all scans once, and say which of their usable points moved; skips are counted when mapping.
+    """The moving points among the usable points of all scans, and the moving objects; skips are counted when mapping.
 
-    What no image shows is followed too, but is only said to have moved when it was seen to go elsewhere.
+    Objects outside of all images are tracked too, but count as moving only if they were displaced.
     """
     detector = MovingObjectDetector(drive.settings.dynamics, drive.matched)
     along = KeyframeSelector()
@@ -42,14 +42,14 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
     return MovingObjects(points | dict(rest.points), (*objects, *rest.objects), along.keyframes())
 
 
-def told(
+def movable_and_known(
     shown: NDArray[np.int8], class_names: tuple[str, ...]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which points the image calls something that may move (n,), and of which it says anything (n,).
+    """Masks of the points that the image labels as movable (n,), and of those that it labels at all (n,).
 
-    `shown` (n,) as `LabelledScan.labels`. What is `other` to the map may be a pole or a pedestrian: unknown.
+    `shown` (n,) as `LabelledScan.labels`. The class `other` may be a pole or a pedestrian, so it counts as unknown.
     """
-    is_movable = np.isin([*class_names, OTHER, ""], MOVABLE)  # the last one: in no image
+    is_movable = np.isin([*class_names, OTHER, ""], MOVABLE)  # the last one: not in an image
     return is_movable.take(shown), (shown >= 0) & (shown < len(class_names))
 
 
@@ -58,6 +58,6 @@ def _observed(seen: LabelledScan) -> Observation:
     T_map_imu = drive.trajectory.at(np.array([scan.stamp]), EXTRAPOLATE_S)[0]
     T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
     return observe(
-        scan.number, scan.stamp, seen.p_map, T_map_lidar, *told(seen.labels, drive.label_set.names),
+        scan.number, scan.stamp, seen.p_map, T_map_lidar, *movable_and_known(seen.labels, drive.label_set.names),
         drive.settings.dynamics,
     )  # fmt: skip

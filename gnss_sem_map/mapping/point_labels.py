@@ -1,4 +1,4 @@
-"""From voxels back to points: what a map says of every original point of the drive that it was made of."""
+"""Point labels: class, confidence and removal of every original point, looked up in the voxels of a map."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from gnss_sem_map.voxels.voxel_map import keys_of
 
 @dataclass(frozen=True, eq=False)
 class PointLabels:
-    """What a map says of every original point of one scan."""
+    """Labels of every original point of one scan, by one map."""
 
     labels: NDArray[np.int8]
-    """(n,) class index, -1 where nothing is known."""
+    """(n,) class index, -1 unknown."""
     confidence: NDArray[np.float32]
-    """(n,) probability of that class, 0 where nothing is known."""
+    """(n,) probability of that class, 0 if unknown."""
     removed: NDArray[np.bool_]
-    """(n,) part of something that moved."""
+    """(n,) mask of the points of moving objects."""
 
 
 def label_points(
@@ -42,19 +42,19 @@ def label_points(
     moving: Mapping[int, NDArray[np.int64]] | None = None,
     kerbs: Kerbs | None = None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
-    """For every usable scan, what each of the maps says of its original points.
+    """For every usable scan, the labels of its original points by each of the maps.
 
-    Two things concern the last map, the refined one, alone: the points `moving` (see `Drive`) are vehicles that it has
-    removed, whatever stands there; and the points in its `kerbs` are told apart into road and sidewalk.
+    Two rules apply to the last map, the refined one, only: the points `moving` (see `Drive`) are removed vehicles,
+    whatever the class of their voxel; and the points in its `kerbs` are classified one by one as road or sidewalk.
     """
     one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
 
-    def look(scan: Scan) -> list[PointLabels] | None:
+    def label(scan: Scan) -> list[PointLabels] | None:
         try:
             points = scan.read()
             p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
-            return None  # counted when the map was built
+            return None  # was reported when the map was built
         if not valid.any():
             return None  # likewise
         keys = keys_of(p_map, settings.mapping.voxel_size_m)
@@ -63,13 +63,14 @@ def label_points(
         found = [_look_up(m, there, valid) for m, there in zip(maps, places, strict=True)]
         if kerbs is not None:
             inside, chosen, probability = kerbs.decide(places[-1], p_map)
-            told = np.flatnonzero(valid)[inside]
-            found[-1].labels[told], found[-1].confidence[told] = chosen, probability
+            points_of_kerbs = np.flatnonzero(valid)[inside]
+            found[-1].labels[points_of_kerbs] = chosen
+            found[-1].confidence[points_of_kerbs] = probability
         if moving is not None and scan.number in moving:
             _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
         return found
 
-    for scan, found in prefetch(look, log.scans, threads=os.cpu_count() or 1):
+    for scan, found in prefetch(label, log.scans, threads=os.cpu_count() or 1):
         if found is not None:
             yield scan, found
 

@@ -18,7 +18,7 @@ from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
 ENOUGH_SCANS = 50
-"""Of a drive with more than `EVERY` times as many, every `EVERY`th tells the heights as well as all do."""
+"""Of a drive with more than `EVERY` times as many scans, only every `EVERY`th is used: the heights are as accurate."""
 EVERY = 4
 
 
@@ -31,7 +31,7 @@ def measure_surface_heights(
         try:
             p_map, _ = map_points(scan.read(), scan, trajectory, log, settings.mapping)
         except (DataError, MeasurementError):
-            return None  # counted when the map was built
+            return None  # was reported when the map was built
         row = voxels.indices_of(keys_of(p_map, settings.mapping.voxel_size_m))
         return row[row >= 0], p_map[row >= 0, 2]
 

@@ -1,4 +1,4 @@
-"""A drive's trajectory: GNSS and IMU smoothed, then once more, bound by the sweeps matched with the first one."""
+"""Trajectory of a drive: smoothed from GNSS and IMU, then once more with relative poses from LiDAR odometry."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from gnss_sem_map.scans.lidar_odometry import TrajectorySettings, match_scans
 from gnss_sem_map.sensor_log import SensorLog
 
 MATCHED_SHARE = 0.95
-"""With so many of its scans matched a trajectory is sharp enough to tell what creeps from what stands."""
+"""With this share of matched scans, poses are accurate enough to tell slow objects from static ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class DriveTrajectory:
-    """The trajectory of a drive, and how it was found."""
+    """The trajectory of a drive, and how it was estimated."""
 
     trajectory: Trajectory
     solution: Solution | None = None
-    """How the smoother came to it; None: the poses came with the drive."""
+    """Solution of the smoother; None if the drive has poses."""
     without_lidar: Trajectory | None = None
-    """What GNSS and IMU alone say; None where LiDAR odometry had no part in it."""
+    """The estimate from GNSS and IMU alone; None if LiDAR odometry was not used."""
     from_lidar_odometry: bool = False
-    """Whether nearly all scans were matched, so that what stands, stands still in the map."""
+    """Whether nearly all scans were matched, so that static objects are not blurred in the map."""
 
 
 def estimate_trajectory(
@@ -45,9 +45,9 @@ def locate(
     progress: Progress = silent,
     first: Solution | None = None,
 ) -> DriveTrajectory:
-    """The poses that came with the drive, or GNSS and IMU smoothed, then once more with the sweeps matched by that.
+    """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
-    `first` is what `smooth_log` makes of this log, where somebody has it already.
+    `first` is the result of `smooth_log` for this log, if it is known already.
     """
     if log.given is not None:
         return DriveTrajectory(log.given)
@@ -70,7 +70,7 @@ def locate(
 def smooth_log(
     log: SensorLog, settings: TrajectorySettings, relative_poses: RelativePoses | None = None
 ) -> Solution:
-    """IMU and GNSS of a drive smoothed; the drive's own word on the noise of its IMU counts unless a setting is given.
+    """Smooth IMU and GNSS of a drive; the setting for the noise of the IMU takes precedence over the drive's own.
 
     Raises DataError without IMU and GNSS, MeasurementError and EstimationError.
     """

@@ -1,7 +1,7 @@
-"""Work shared by processes that end with us: whoever is killed, nobody waits for ever and nobody stays.
+"""Work in several processes that end with the main process: when one is killed, no other waits or stays.
 
-A worker is told over a pipe what to do, and tells when it is done. Its end of the pipe closes when it dies, ours when
-we do; nothing big is given to it while it starts, for it may die then, and nobody would ever read it.
+A worker receives its items through a pipe, and answers when each is done. Its end of the pipe closes when it dies, and
+ours when the main process dies. Large data are sent only after a worker has started: it may die before it reads them.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ def _start() -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
     ours, theirs = context.Pipe()
     process = context.Process(target=_work, args=(theirs,))
-    with theirs, _for_us_alone():
+    with theirs, _signals_blocked():
         process.start()
     return ours, process
 
 
 @contextmanager
-def _for_us_alone() -> Iterator[None]:
-    """What starts here does not hear Ctrl-C or the closing of the terminal: we do, and end it."""
+def _signals_blocked() -> Iterator[None]:
+    """Processes that start here ignore Ctrl-C and the closing of the terminal; the main process handles both."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
@@ -98,7 +98,7 @@ def _work(parent: Connection) -> None:
                 parent.send(error)
                 return
             parent.send(item)
-    except (EOFError, ConnectionError):  # the parent needs no more, or is gone
+    except (EOFError, ConnectionError):  # the parent has finished, or died
         return
 
 

@@ -10,10 +10,10 @@ from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.export.report import findings_table, page_of
 from gnss_sem_map.files.atomic import replacing
 
-VERDICTS = {
-    Level.GREEN: "Nothing speaks against this drive.",
-    Level.AMBER: "Something is in doubt: read what is amber before you trust the map.",
-    Level.RED: "A run stops here: what is red makes a wrong map. Mend it, or run with --force.",
+SUMMARIES = {
+    Level.GREEN: "No check found a fault in this drive.",
+    Level.AMBER: "Some checks are amber: read them before you trust the map.",
+    Level.RED: "A run stops here: the red findings would make a wrong map. Correct them, or run with --force.",
 }
 GENERATOR = b'<meta name="generator" content="gnss-sem-map">'
 
@@ -29,7 +29,7 @@ def check_writable(path: Path) -> None:
 def write_check_page(path: Path, name: str, page: Preflight) -> None:
     """Write the findings of a drive as one self-contained page, replacing an earlier one; raises DataError."""
     check_writable(path)
-    facts = f'<p class="facts">{escape(VERDICTS[page.level])} Checked in {page.seconds:.1f} s.</p>'
+    facts = f'<p class="facts">{escape(SUMMARIES[page.level])} Checked in {page.seconds:.1f} s.</p>'
     title = f"Pre-flight of {name}"
     body = (f"<h1>{escape(title)}</h1>", facts, findings_table(page.as_dict()["findings"]))
     with replacing(path) as file:

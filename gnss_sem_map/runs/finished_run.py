@@ -1,4 +1,4 @@
-"""A finished run is an object: look at its map, refine it again, label it anew, export it, without starting over."""
+"""A finished run as an object: its map can be read, refined, relabelled and exported again."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.merged_run import TRACK, write_merged
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -80,7 +81,7 @@ def run_log(
     force: bool = False,
     progress: Progress = silent,
 ) -> Run:
-    """Map a drive that is open already; `drive` and `frames` say what `log` was opened from. See `run`."""
+    """Map a drive that is open already; `log` was opened from `drive` and `frames`. See `run`."""
     with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
         refuse_inputs(claim.out, sorted(log.folders))
         network = None
@@ -97,7 +98,7 @@ def run_log(
 
 @dataclass(frozen=True)
 class Run:
-    """The folder of a finished run; `Run.open(OUT)` checks that it is one."""
+    """A finished run in its folder, also a merged one; `Run.open(OUT)` checks it."""
 
     folder: Path
 
@@ -105,10 +106,9 @@ class Run:
     def open(cls, folder: Path | str) -> Run:
         """Raises DataError for a folder that holds no finished map."""
         folder = Path(folder)
-        if "merged" in read_run(folder) or not is_folder(folder / "refined"):
-            raise DataError(
-                f"{shown(folder)}: found no map of one drive in it; expected the -o of `gnss-sem-map run`"
-            )
+        read_run(folder)
+        if not is_folder(folder / "refined"):
+            raise DataError(f"{shown(folder)}: found no map in it; expected the -o of `gnss-sem-map run`")
         return cls(folder)
 
     @property
@@ -116,19 +116,25 @@ class Run:
         """The content of run.json."""
         return read_run(self.folder)
 
+    @property
+    def is_merged(self) -> bool:
+        """Whether it was merged from two runs: then it has no drive, no trajectory and no point labels."""
+        return "merged" in self.about
+
     @cached_property
     def settings(self) -> Settings:
-        """What the run was made with."""
+        """The settings of the run."""
         return config.load(self.folder / "config.yaml")
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the IMU in the map, with covariances."""
+        """Poses of the IMU in the map, with covariances; raises DataError for a merged run."""
+        self._refuse_merged("trajectory")
         return Trajectory.load(self.folder / "trajectory.parquet")
 
     @cached_property
     def frame(self) -> LocalFrame | None:
-        """Where the map's origin is; None for a map in its drive's own poses."""
+        """The local frame of the map; None for a map without a georeference."""
         return tiles.read_frame(self.folder / "map")
 
     @cached_property
@@ -137,13 +143,13 @@ class Run:
         return open_label_set(self.settings.classes)
 
     def map(self, box: tuple[ArrayLike, ArrayLike] | None = None, *, refined: bool = True) -> SemanticMap:
-        """The map, or what of it lies in a box (low, high), each (3,) m: only its tiles are read."""
+        """The map, or its part in a box (low, high), each (3,) m; only the tiles of the box are read."""
         return tiles.read(self.folder / ("refined" if refined else "map"), self.label_set, box)
 
     def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
-        """Refine the map again with other settings, in place or into `out`; no scan is matched, no network is asked.
+        """Refine the map again with other settings, in place or into `out`; nothing is matched or segmented again.
 
-        Scans are read only where the run has point labels. Raises ConfigError where more than the refinement changes.
+        Scans are read only if the run has point labels. Raises ConfigError if other settings differ too.
         """
         _check_same_map(self.settings, settings)
         found, raw, stats = evidence.read(self.folder, self.label_set), self.map(refined=False), RunStats()
@@ -151,8 +157,10 @@ class Run:
             state, report = pipeline.refine_map(raw.voxels - found.moved, found, settings)
         assert state.decided is not None
         result = pipeline.Result(
-            self.trajectory, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
+            self._track, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
         )
+        if self.is_merged:
+            return self._written_merged(out, result, settings)
         log = self.drive() if is_folder(self.folder / "labels") else None
         return self._written(out, result, settings, log, {}, same_map=True)
 
@@ -164,7 +172,11 @@ class Run:
         device: str = "auto",
         progress: Progress = silent,
     ) -> Run:
-        """Map the drive again along the same trajectory with the labels of another segmenter."""
+        """Map the drive again along the same trajectory with the labels of another segmenter.
+
+        Raises DataError for a merged run, and if the drive was moved or removed.
+        """
+        self._refuse_merged("relabelling")
         log, settings = self.drive(), self.settings
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_sharp = bool(self.about.get("from_lidar_odometry"))
@@ -199,7 +211,7 @@ class Run:
         return self.folder / format_.file
 
     def drive(self) -> SensorLog:
-        """The log that the run was made of; raises DataError where it is no longer there."""
+        """The log of the run's drive; raises DataError if it was moved or removed."""
         inputs = inputs_of(self.folder)
         if "drive" not in inputs:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
@@ -208,8 +220,30 @@ class Run:
 
     @property
     def _driven(self) -> Trajectory:
+        if self.is_merged:
+            return self._track
         first, last = self.about["scans_s"]
         return run_folder.between(self.trajectory, first, last)
+
+    @property
+    def _track(self) -> Trajectory:
+        """The trajectory for pictures."""
+        return Trajectory.load(self.folder / TRACK) if self.is_merged else self.trajectory
+
+    def _refuse_merged(self, what: str) -> None:
+        if self.is_merged:
+            names = " and ".join(map(str, self.about["merged"]))
+            raise DataError(
+                f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; use one of those"
+            )
+
+    def _written_merged(self, out: Path | str | None, result: pipeline.Result, settings: Settings) -> Run:
+        place = self.folder if out is None else Path(out)
+        inputs = [self.folder] if place.resolve() != self.folder.resolve() else []
+        with run_folder.claimed_run(place, inputs):
+            about = self.about | {"map": run_folder.about_map(result)}
+            write_merged(place, self.folder / TRACK, result, settings, self.frame, about)
+        return Run(place)
 
     def _written(
         self,
@@ -227,11 +261,11 @@ class Run:
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:
-    """Raise ConfigError where more than the refinement differs."""
+    """Raise ConfigError if settings other than those of the refinement differ."""
     same = after.model_copy(update={"refinement": before.refinement})
     if same == before:
         return
     differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
     raise ConfigError(
-        f"refine: {', '.join(differ)} differ from those of the run, and only refinement may; run the drive again"
+        f"refine: {', '.join(differ)} differ from those of the run, and only refinement can; run the drive again"
     )

@@ -1,35 +1,41 @@
-"""Two run folders become a third: both maps in the frame of the first, added, refined again and exported."""
+"""Merging of two run folders into a third: both maps in the frame of the first, added, refined again and exported."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
+from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.merging import Laid, merge_runs
+from gnss_sem_map.mapping.merging import Alignment, merge_runs
 from gnss_sem_map.pipeline import Result, refine_map
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_raw, write_refined
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
+TRACK = "track.parquet"
+"""Trajectory of the first run, for pictures: a merged run has no trajectory of its own."""
+
 
 def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:
     """Write the merged run into `out`, refined with the settings of the first; returns the content of run.json.
 
-    The second is laid onto the first where the two `match`; pictures show the track of the first. Raises DataError for
+    With `match`, the second is registered to the first. Pictures show the track of the first. Raises DataError for
     folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
         read_run(run)
     if first.resolve() == second.resolve():
         raise DataError(
-            f"{second}: is the first run as well; merged with itself, all it saw would count twice; give another run"
+            f"{second}: is the first run as well, and all its evidence would count twice; give another run"
         )
     with claimed_run(out, [first, second]):
         return _merge(first, second, out, match)
@@ -39,9 +45,9 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     settings = config.load(first / "config.yaml")
     label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
-    state, report = refine_map(merged.stands, merged.evidence, settings)
+    state, report = refine_map(merged.static, merged.evidence, settings)
     assert state.decided is not None
-    raw, frame = SemanticMap.of(merged.stands + merged.evidence.moved), merged.frame
+    raw = SemanticMap.of(merged.static + merged.evidence.moved)
     result = Result(
         Trajectory.load(first / "trajectory.parquet"),
         None,
@@ -55,24 +61,37 @@ def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
-        "local_frame": asdict(frame),
+        "local_frame": asdict(merged.frame),
         "map": about_map(result),
-        "match": _about(merged.laid),
+        "match": _about(merged.alignment),
     }
-    with new_folder(out) as folder:
-        write_raw(folder, result, frame)
-        write_refined(folder, result, frame, result.trajectory, str(about["name"]))
-        write_about(folder, settings, about, {})
+    write_merged(out, first / "trajectory.parquet", result, settings, merged.frame, about)
     return about
 
 
-def _about(laid: Laid) -> dict[str, Any]:
-    """How the second map came to lie on the first, for run.json."""
-    found = laid.match
+def write_merged(
+    out: Path,
+    track: Path,
+    result: Result,
+    settings: Settings,
+    frame: LocalFrame | None,
+    about: dict[str, Any],
+) -> None:
+    """Write the folder of a merged run; `track` is the file of its trajectory. Raises DataError."""
+    with new_folder(out) as folder:
+        write_raw(folder, result, frame)
+        write_refined(folder, result, frame, result.trajectory, str(about["name"]))
+        shutil.copyfile(track, folder / TRACK)
+        write_about(folder, settings, about, {})
+
+
+def _about(alignment: Alignment) -> dict[str, Any]:
+    """How the second map was aligned to the first, for run.json."""
+    found = alignment.match
     return {
         "shift_m": None if found is None else round(found.shift_m, 3),
         "turn_deg": None if found is None else round(found.turn_deg, 3),
         "T_first_second": None if found is None else found.T_target_source.tolist(),
-        "reason": laid.reason,
-        "coinciding": dict(zip(("by_georeference", "now"), laid.coinciding, strict=True)),
+        "reason": alignment.reason,
+        "overlap": dict(zip(("by_georeference", "aligned"), alignment.overlap, strict=True)),
     }

@@ -1,4 +1,4 @@
-"""The run folder: one drive's results as a value, written beside and renamed into place."""
+"""Writing of the run folder: all results of one drive."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ RUN_FILES = re.compile(
     + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
     r"|(labels|labels_raw|removed)/(\d+\.label)?|confidence/(\d+\.bin)?"
 )
-"""Paths of everything that runs write: those of older versions have no list of it."""
+"""Pattern of all paths in run folders of older versions, which have no list of their files."""
 
 
 def is_run_file(name: str) -> bool:
@@ -53,14 +53,14 @@ def is_run_file(name: str) -> bool:
 
 
 def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> AbstractContextManager[Claim]:
-    """A place for a run that is ours until the claim ends; see `output.place.claimed`."""
+    """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
     return claimed(out, inputs, is_run_file)
 
 
 def places_read(
     drive: Path, settings: Settings, segmenter: str | None = None, config: Path | None = None
 ) -> list[Path | str | None]:
-    """Every place that a run reads, as far as it is known before the drive is opened."""
+    """All inputs of a run that are known before the drive is opened."""
     place = (segmenter or "").partition(":")[2].partition("?")[0]
     classes = settings.classes if Path(settings.classes).suffix else None
     return [drive, config, place or None, settings.calibration, classes]
@@ -144,7 +144,7 @@ def write_again(
 
 
 def write_raw(folder: Path, result: Result, frame: LocalFrame | None) -> None:
-    """The map before refinement, and what is known beside it."""
+    """Write the map before refinement, and its evidence."""
     tiles.write(result.raw, folder / "map", frame)
     evidence.write(result.evidence, folder, frame)
 
@@ -152,13 +152,13 @@ def write_raw(folder: Path, result: Result, frame: LocalFrame | None) -> None:
 def write_refined(
     folder: Path, result: Result, frame: LocalFrame | None, driven: Trajectory, title: str
 ) -> None:
-    """The refined map, as tiles and in all formats."""
+    """Write the refined map, as tiles and in all formats."""
     tiles.write(result.refined, folder / "refined", frame)
     write_exports(Exported(result.refined, frame, driven, title), folder)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:
-    """What a run says of itself, for programs and for people."""
+    """Write settings, run.json, metrics.json and the report."""
     (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
     _write_json(folder / "run.json", about)
     _write_json(folder / "metrics.json", metrics)
@@ -166,7 +166,7 @@ def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics
 
 
 def _while_mapping(trajectory: Trajectory, log: SensorLog) -> Trajectory:
-    """The part of the trajectory that was driven while there were scans: what a picture of the map shows."""
+    """The part of the trajectory with scans, for pictures of the map."""
     return between(trajectory, log.scans[0].stamp, log.scans[-1].stamp)
 
 
@@ -226,7 +226,7 @@ def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
 
 
 def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: Settings) -> None:
-    """Per original point: the class before and after refinement, how sure that is, and what was removed.
+    """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
     """
@@ -245,7 +245,7 @@ def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: S
 
 
 def about_run(drive: Path, log: SensorLog, stats: RunStats) -> dict[str, Any]:
-    """What went in, what was left out and why, and what it cost."""
+    """Inputs, skips with their reasons, times and memory, for run.json."""
     skips = sorted(set(stats.skips), key=astuple)
     frames: Counter[str] = Counter()
     for skip in skips:
@@ -318,7 +318,7 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
 
 
 def absolute(segmenter: str | None) -> str | None:
-    """The segmenter's description, good in any working directory."""
+    """The segmenter's SPEC with an absolute path."""
     kind, colon, rest = (segmenter or "").partition(":")
     place, mark, options = rest.partition("?")
     if not place or not Path(place).exists():

@@ -63,21 +63,21 @@ def no_segmenter_message(drive: str) -> str:
     """Help text for a drive without labels: three networks for real streets, how to get them, their licences."""
     lines = [f"{drive}: no segmenter given and no labels found; the map needs one of, for instance:"]
     for model, about in (
-        ("tue-mps/cityscapes_semantic_eomt_large_1024", "EoMT, best, wants a GPU; MIT licence"),
+        ("tue-mps/cityscapes_semantic_eomt_large_1024", "EoMT, best, needs a GPU; MIT licence"),
         (
             "facebook/mask2former-swin-large-cityscapes-semantic",
-            "Mask2Former, wants a GPU; licence in its model card",
+            "Mask2Former, needs a GPU; licence in its model card",
         ),
         (
             "nvidia/segformer-b1-finetuned-cityscapes-1024-1024",
-            "SegFormer, runs on a CPU; NVIDIA, not for commerce",
+            "SegFormer, runs on a CPU; NVIDIA, non-commercial licence",
         ),
     ):
         lines.append(
             f"  hf download {model} && gnss-sem-map run {drive} --segmenter hf:{model} ...   ({about})"
         )
     lines.append(
-        "Labels that you already have: --segmenter labels:FOLDER. Several runs: `gnss-sem-map segment` once."
+        "For existing labels: --segmenter labels:FOLDER. For several runs, run `gnss-sem-map segment` once."
     )
     return "\n".join(lines)
 
@@ -85,10 +85,10 @@ def no_segmenter_message(drive: str) -> str:
 def open_segmenter(
     spec: str, label_set: LabelSet, device: str = "auto", expected_size: tuple[int, int] | None = None
 ) -> Segmenter:
-    """Open a segmenter from its SPEC, and check as much as possible before the run starts.
+    """Open a segmenter from its SPEC; as much as possible is checked before the run starts.
 
     `spec` is one of `SCHEMES`; `expected_size` (width, height) is the camera's, px; `device` is auto, cpu, cuda or a
-    torch device. Raises ConfigError for a wrong description, DataError for files that are not what they must be.
+    torch device. Raises ConfigError for a wrong description, DataError for wrong or damaged files.
     """
     scheme, place, options = _parse(spec)
     match scheme:

@@ -1,4 +1,4 @@
-"""ResNet and MobileNet-v2 as feature pyramids, with the tensor names that their checkpoints carry."""
+"""ResNet and MobileNet-v2 as feature pyramids, with the tensor names of their checkpoints."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet(nn.Module):
-    """The trunk of a ResNet with 50, 101 or 152 layers."""
+    """A ResNet without its classifier, with 50, 101 or 152 layers."""
 
     CHANNELS = (256, 512, 1024, 2048)
     """Of `pyramid`, at strides 4, 8, 16 and 32."""
@@ -96,7 +96,7 @@ class InvertedResidual(nn.Module):
 
 
 class MobileNetV2(nn.Module):
-    """The trunk of MobileNet-v2: `layer1` is the stem, `layer2` to `layer8` are the stages of INVERTED_RESIDUALS."""
+    """MobileNet-v2 without its classifier: `layer1` is the stem, `layer2` to `layer8` are INVERTED_RESIDUALS."""
 
     CHANNELS = tuple(channels for _, channels, _, _ in INVERTED_RESIDUALS[1:])
     """Of `pyramid`: 24, 32, 64, 96, 160, 320."""

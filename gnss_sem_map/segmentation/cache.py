@@ -26,7 +26,7 @@ from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
 
 ABOUT = "about.json"
-"""Names the segmenter of a cache; frames of two segmenters are not mixed."""
+"""File with the segmenter of a cache; frames of two segmenters are not mixed."""
 
 
 PARTIAL = re.compile(r"\.(\d+\.npz|about\.json)\.\d+\.part")
@@ -185,7 +185,7 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
     found = read_json(file)
     if found != about:
         raise ConfigError(
-            f"cache {folder}: was begun with {found}, now called with {about}; choose another folder"
+            f"cache {folder}: was started with {found}, now called with {about}; choose another folder"
         )
 
 

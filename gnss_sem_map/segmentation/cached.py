@@ -30,8 +30,8 @@ class CachedLabels:
     An `.npz` holds `probabilities` (h, w, c), uint8 as round(255 p) or floating in 0..1, and `class_names` (c,). A
     PNG holds one 8-bit id per pixel, named by `ids` of `taxonomy`: the class gets HARD_LABEL_PROBABILITY, every other
     class an equal share of the rest, and a void pixel no evidence at all. Frame numbers may be padded with zeros to
-    any width. The first good file says what the others must be like. Raises ConfigError or DataError when the folder is
-    not like that, or none of some files from all over it.
+    any width. The classes of the first valid file are expected in all others. Raises ConfigError or DataError for
+    another folder, or if none of several files from the whole folder is valid.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class CachedLabels:
         self._try(label_set)
 
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
-        """The probabilities of this frame; raises MissingLabels where the folder has none, DataError for a bad file."""
+        """The probabilities of this frame; raises MissingLabels if there are none, DataError for a bad file."""
         seen = self.kept(image)
         return seen.probabilities if isinstance(seen, LabelImage) else seen
 
@@ -72,7 +72,7 @@ class CachedLabels:
         return self._read(path)
 
     def _try(self, label_set: LabelSet) -> None:
-        """Find a good file, and what classes it has; raises DataError when there is none among those tried."""
+        """Find a valid file and its classes; raises DataError if none of the tried files is valid."""
         files = list(self._files.values())
         tried = files[:: -(-len(files) // MOST_TRIED)]
         refused: list[DataError] = []
@@ -82,12 +82,12 @@ class CachedLabels:
                     self._read_ids(path)
                 else:
                     self.class_names = read_probabilities(path, self._size)[1]
-                    label_set.table_from(self.class_names)  # a name that nobody knows is refused here
+                    label_set.table_from(self.class_names)  # refuses an unknown name
                 return
             except DataError as error:
                 refused.append(error)
         if len(files) > 1:
-            raise DataError(f"{refused[0]}; nor can any of {len(tried)} label files be used that were tried")
+            raise DataError(f"{refused[0]}; none of {len(tried)} label files that were tried can be used")
         raise refused[0]
 
     def _read(self, path: Path) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
@@ -108,7 +108,7 @@ class CachedLabels:
         if cv2.LUT(ids, self._unknown.view(np.uint8)).any():  # many times faster than indexing
             unknown = np.unique(ids[self._unknown[ids]]).tolist()
             raise DataError(
-                f"{path}: found ids {unknown}, which are no {self._ids}; say what they are with ?ids="
+                f"{path}: found ids {unknown}, which are no {self._ids}; name their kind with ?ids="
             )
         return ids
 

@@ -24,7 +24,7 @@ ABOUT = "about.json"
 
 @dataclass(frozen=True, eq=False)
 class CachedSegmenter:
-    """A segmenter that keeps its probabilities in a folder, in the classes of the map: the second call reads a file."""
+    """A segmenter that saves its probabilities, in the classes of the map, to a folder; the second call reads them."""
 
     segmenter: Segmenter
     label_set: LabelSet
@@ -43,7 +43,7 @@ class CachedSegmenter:
         try:
             return np.asarray(read_probabilities(file)[0], np.uint8)
         except DataError:
-            pass  # not there yet, or damaged
+            pass  # not saved yet, or damaged
         seen = class_image(
             self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_size,
             f"labels of image {image.number}",
@@ -52,7 +52,7 @@ class CachedSegmenter:
         return seen.probabilities
 
 
-def answers_folder(work: Path, fingerprint: str, resume: bool) -> Path:
+def probabilities_folder(work: Path, fingerprint: str, resume: bool) -> Path:
     """Folder for a network's probabilities; with `resume`, those of an interrupted run with this fingerprint are kept.
 
     Raises DataError when it cannot be written.
@@ -61,7 +61,7 @@ def answers_folder(work: Path, fingerprint: str, resume: bool) -> Path:
     folder = work / work_folder.ANSWERS
     try:
         if not (resume and _fingerprint(folder / ABOUT) == fingerprint):
-            work_folder.forget_answers(work)
+            work_folder.remove_answers(work)
         folder.mkdir(exist_ok=True)
         write_whole(folder / ABOUT, json.dumps({"fingerprint": fingerprint}).encode())
     except OSError as error:

@@ -25,7 +25,7 @@ from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD, LightWeightRefineNet, RefineNet
 
 METADATA = "gnss_sem_map"
-"""The entry of a safetensors file with what is stored besides the tensors, as JSON."""
+"""Key of our JSON in the metadata of a safetensors file."""
 
 LOAD_ERRORS = (
     pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError, IndexError,
@@ -52,7 +52,7 @@ def open_refinenet(
     path: Path, label_set: LabelSet, device: str = "auto", classes: str | None = None,
     scale: str | None = None, shrink: str | None = None,
 ) -> NetworkSegmenter:  # fmt: skip
-    """RefineNet or Light-Weight RefineNet from a checkpoint, whose tensors say which of them it is.
+    """RefineNet or Light-Weight RefineNet from a checkpoint; its tensors show which of them it is.
 
     Class names come from `classes` (see `named_classes`), from the file, or from their number. Raises DataError for a
     file that is not such a checkpoint, ConfigError for class names that do not fit.
@@ -107,7 +107,7 @@ def network_like(checkpoint: Checkpoint) -> nn.Module:
 
 
 def class_count(checkpoint: Checkpoint) -> int:
-    """The number of classes that the last layer tells apart; raises DataError where there is no such layer."""
+    """Number of classes of the last layer; raises DataError if there is no such layer."""
     for name in ("clf_conv.bias", "segm.bias"):
         if name in checkpoint.tensors:
             return checkpoint.tensors[name].numel()
@@ -115,7 +115,7 @@ def class_count(checkpoint: Checkpoint) -> int:
 
 
 def load_strictly(network: nn.Module, checkpoint: Checkpoint) -> None:
-    """Put the tensors into the network; raises DataError unless names and shapes agree and all values are finite.
+    """Load the tensors into the network; raises DataError unless names and shapes agree and all values are finite.
 
     Only batch counters may be missing: they were not yet saved when the first checkpoints were published.
     """
@@ -152,7 +152,7 @@ def write_network(
     about = {METADATA: json.dumps({"class_names": class_names, "scale": scale})}
     beside = path.with_name(path.name + ".part")
     save_file(tensors, beside, about)
-    beside.chmod(0o644)  # it comes readable by nobody else
+    beside.chmod(0o644)  # temporary files are readable by their owner only
     beside.replace(path)
 
 
@@ -190,5 +190,5 @@ def _other_architecture(checkpoint: Checkpoint) -> DataError:
     found = sorted(checkpoint.tensors)[:3]
     return DataError(
         f"checkpoint {checkpoint.path}: found tensors such as {found}, expected those of RefineNet, full or"
-        " light-weight, on a ResNet or MobileNet-v2; other networks come through hf:, onnx: or python:"
+        " light-weight, on a ResNet or MobileNet-v2; for other networks use hf:, onnx: or python:"
     )

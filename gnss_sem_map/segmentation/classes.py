@@ -31,7 +31,7 @@ def named_classes(
         names = tuple(_expand(BY_COUNT[count], label_set))
     else:
         raise ConfigError(
-            f"{where}: found {count} classes without names; say them with ?classes=road,sidewalk,..."
+            f"{where}: found {count} classes without names; name them with ?classes=road,sidewalk,..."
         )
     if len(names) != count or len(set(names)) != count:
         raise ConfigError(

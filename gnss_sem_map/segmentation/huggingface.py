@@ -1,7 +1,8 @@
 """Networks of the transformers library as segmenters: those that give logits, and those that give masks.
 
-A mask network answers with queries: what each of them is, and where. Its post-processing gives the best class of every
-pixel only; we need all of them (Cheng et al., "MaskFormer", NeurIPS 2021, section 3.4).
+The output of a mask network is a set of queries, each with class probabilities and a mask. Its post-processing gives
+only the best class of every pixel; we need the probabilities of all (Cheng et al., "MaskFormer", NeurIPS 2021, section
+3.4).
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ from gnss_sem_map.segmentation.pixels import scale_and_shrink
 from gnss_sem_map.segmentation.refinenet import MEAN, STD
 
 MASK_NETWORKS = ("maskformer", "mask2former", "oneformer", "eomt", "eomt_dinov3")
-"""Those that answer with queries; any other that the library knows for semantic segmentation gives logits."""
+"""Mask networks; all others of the library for semantic segmentation give logits."""
 
 STRIDE = 32
 """Of the coarsest features; images are stretched to whole multiples of it."""
 
 TASK = "the task is semantic"
-"""What OneFormer is told."""
+"""Task prompt of OneFormer."""
 
 
 def open_huggingface(
     model: str, label_set: LabelSet, device: str = "auto", classes: str | None = None,
     scale: str | None = None, shrink: str | None = None,
 ) -> NetworkSegmenter:  # fmt: skip
-    """A network of transformers from a folder, or from what `hf download MODEL` left on this machine.
+    """A network of transformers from a folder, or from the local cache of `hf download MODEL`.
 
     Mean and standard deviation are those of its image processor (ImageNet's where it has none); its resizing is not
-    used, for it would squeeze a wide street. Class names are its own unless `classes` says otherwise. Raises DataError
-    for a model that is not there or of another kind, ConfigError for class names that the class set does not know.
+    used, because it would distort wide images. Class names are its own unless `classes` is given. Raises
+    DataError for a missing model or one of another kind, ConfigError for class names that the class set does not know.
     """
     where = find_device(device)
     as_scale, as_shrink = scale_and_shrink(scale, shrink, f"hf:{model}")
@@ -99,7 +100,7 @@ def _kind(config: Any, model: str) -> Any:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No progress bars and no tables of the library: what is wrong is said by our own errors."""
+    """Switch off progress bars and tables of the library; errors are reported by ours."""
     verbosity, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()
@@ -142,7 +143,7 @@ def _masks(
 
 
 def _in_windows(masses: Probabilities, side: int) -> Probabilities:
-    """For a network of a fixed, square input: the shorter side is scaled to it, the longer is seen in windows."""
+    """For a network of a fixed, square input: the shorter side is scaled to it, the longer is processed in windows."""
 
     def windowed(images: Tensor, size: tuple[int, int]) -> Tensor:
         height, width = images.shape[2:]
@@ -187,7 +188,7 @@ def _task_tokens(model: str, config: Any) -> Tensor:
     masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
     if len(masked.unique()) < len(
         TASK.split()
-    ):  # without its vocabulary a tokenizer takes every word for the same
+    ):  # without its vocabulary a tokenizer gives every word the same token
         raise DataError(
             f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json and merges.txt are missing"
         )

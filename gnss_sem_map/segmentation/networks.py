@@ -1,4 +1,4 @@
-"""A torch network as a segmenter: pixels in, probabilities out, on the processor or on a GPU."""
+"""A torch network as a segmenter, on a CPU or a GPU."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Probabilities = Callable[[Tensor, tuple[int, int]], Tensor]
 
 
 class NetworkSegmenter:
-    """Runs a network at `scale` times the image's size, and answers at the image's size divided by `shrink`.
+    """Runs a network at `scale` times the image's size; its output has the image's size divided by `shrink`.
 
-    What the integer division cuts off at the right and lower border (less than `shrink` pixels) the network does not
-    see. Raises DataError for an image that is not (h, w, 3) uint8, for probabilities that are not finite, or when the
-    device's memory is full.
+    The remainder of that division at the right and lower border (less than `shrink` pixels) is not segmented. Raises
+    DataError for an image that is not (h, w, 3) uint8, for probabilities that are not finite, or when the device's
+    memory is full.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class NetworkSegmenter:
 
     @property
     def threads(self) -> int:
-        """Number of threads: one per core on a CPU, where cores that share an image would wait; one on a GPU."""
+        """Number of threads: one on a GPU; one per core on a CPU, where cores that share an image would wait."""
         return torch.get_num_threads() if self._device.type == "cpu" else 1
 
     def on_one_core(self, image: Image) -> NDArray[np.float32]:
@@ -61,7 +61,7 @@ class NetworkSegmenter:
         return self(image)
 
     def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
-        """Class probabilities of several images of one size in one go, as if each had been alone."""
+        """Class probabilities of several images of one size in one batch; the same as one by one."""
         pixels = [checked_pixels(image) for image in images]
         if len({p.shape for p in pixels}) > 1:
             return [seen for image in images for seen in self.segment_many([image])]
@@ -91,7 +91,7 @@ def from_logits(network: Callable[[Tensor], Tensor], class_names: Sequence[str])
 
 
 def find_device(name: str) -> torch.device:
-    """The device of that name; `auto` is a GPU where there is one. Raises ConfigError for one that is not there."""
+    """The device of that name; `auto` is a GPU if there is one. Raises ConfigError for a missing one."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -107,7 +107,7 @@ def find_device(name: str) -> torch.device:
 
 @contextmanager
 def enough_memory(device: torch.device, advice: str) -> Iterator[None]:
-    """Turns the end of a GPU's memory into a DataError that gives `advice`."""
+    """Raise a DataError with `advice` when the memory of a GPU is full."""
     try:
         yield
     except torch.cuda.OutOfMemoryError:
@@ -128,6 +128,6 @@ def for_inference(network: nn.Module, device: torch.device) -> nn.Module:
 
 
 def placed(network: nn.Module, device: torch.device) -> nn.Module:
-    """The network on its device, with its weights laid out as pixels are, channels last: that is faster."""
+    """The network on its device, with weights in the memory format channels-last, which is faster."""
     network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return network

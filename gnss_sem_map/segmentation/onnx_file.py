@@ -87,7 +87,7 @@ def _open_session(path: Path, device: str) -> Any:
     if not is_file(path):
         raise DataError(f"onnx {shown(path)}: no such file")
     with os.fdopen(open_file(path), "rb"):
-        pass  # says why it may not be read
+        pass  # its error gives the reason
     wanted = (
         ["CPUExecutionProvider"] if device == "cpu" else ["CUDAExecutionProvider", "CPUExecutionProvider"]
     )
@@ -100,9 +100,7 @@ def _open_session(path: Path, device: str) -> Any:
         raise ConfigError(f"device {device!r}: expected auto, cpu or cuda")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    options.add_session_config_entry(
-        "session.intra_op.allow_spinning", "0"
-    )  # idle threads leave the cores alone
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads do not spin
     try:
         return onnxruntime.InferenceSession(path, options, available)
     except ONNX_ERRORS as error:

@@ -20,8 +20,8 @@ from gnss_sem_map.sensor_log import Image
 class PythonSegmenter:
     """Calls `module:callable`, with class names from its attribute `class_names` or from `classes`.
 
-    Raises ConfigError when there is no such callable or nothing says its class names; DataError, at the call, when
-    what it gives is not probabilities of one image.
+    Raises ConfigError when there is no such callable or it has no class names; DataError, at the call, when
+    it does not return the probabilities of one image.
     """
 
     def __init__(self, place: str, label_set: LabelSet, classes: str | None = None) -> None:
@@ -32,7 +32,7 @@ class PythonSegmenter:
             raise ConfigError(f"{self._where}: found class_names {str(own)[:100]}, expected a list of names")
         if classes is None and own is None:
             raise ConfigError(
-                f"{self._where} has no class_names; give it that attribute, or say ?classes=road,..."
+                f"{self._where} has no class_names; give it that attribute, or use ?classes=road,..."
             )
         count = len(own) if own is not None else 1 + str(classes).count(",")
         self.class_names = named_classes(classes, count, label_set, self._where, own)
@@ -43,7 +43,7 @@ class PythonSegmenter:
         where = f"{self._where} on image {image.number}"
         try:
             answer = np.asarray(self._function(pixels))
-        except Exception as error:  # the user's own function may fail in any way
+        except Exception as error:  # the user's function may raise anything
             raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
         seen = checked_probabilities(answer, len(self.class_names), where)
         check_size(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
@@ -60,7 +60,7 @@ def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:
         raise ConfigError(f"python:{place}: {error}; is its folder on PYTHONPATH?") from None
     except AttributeError:
         raise ConfigError(f"python:{place}: module {module!r} has no {name!r}") from None
-    except Exception as error:  # so may the import of their module
+    except Exception as error:  # and so may the import of its module
         raise ConfigError(
             f"python:{place}: cannot be imported, {type(error).__name__} {str(error)[:200]}"
         ) from error

@@ -48,7 +48,7 @@ def LightWeightRefineNet(
 
 
 class ChannelGains(nn.Module):
-    """One factor per channel: what a 1x1 convolution with as many groups is, and stores, without its cost."""
+    """One factor per channel: equals a 1x1 convolution with one group per channel, at less cost."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ class ResidualUnits(nn.Module):
 
 
 class ResNetRefineNet(ResNet):
-    """Four refinement stages, from the coarsest features to the finest, each taking in the next finer ones.
+    """Four refinement stages, from the coarsest features to the finest, each adds the next finer ones.
 
     The light-weight kind has 1x1 convolutions and no residual units. Raises ConfigError for an unknown backbone.
     """

@@ -1,7 +1,7 @@
-"""Training a RefineNet on images with label images, as the paper did: elsewhere first, then on one's own streets.
+"""Training of a RefineNet on images with label images, as in the paper: on public data first, then on one's own.
 
-Every step draws its images and its randomness from the seed and its own number alone. So a training that was
-interrupted goes on as if it had not been, and on the processor the same seed gives the same weights.
+The images and the random numbers of a step depend only on the seed and the number of the step. So an interrupted
+training continues exactly, and on a CPU the same seed gives the same weights.
 """
 
 from __future__ import annotations
@@ -111,12 +111,12 @@ def train(
     resume: bool = False,
     progress: Progress = silent,
 ) -> TrainingReport:
-    """Train on folders of images with label PNGs to tell the classes of `label_set` and `other` apart.
+    """Train on folders of images with label PNGs, for the classes of `label_set` and `other`.
 
-    `taxonomy` and `ids` say what the ids in the PNGs mean; `initial` is a checkpoint to begin with, whose last layer is
-    kept if it has the same class names. `out` gets NETWORK, STATE and LOG; with `resume`, a training that was
-    interrupted there goes on. Raises DataError for images, labels or checkpoints that are not right and when the
-    device's memory is full, ConfigError when `out` already holds a training, or one with other settings.
+    `taxonomy` and `ids` define the ids in the PNGs; `initial` is a checkpoint to start from, whose last layer is kept
+    if it has the same class names. NETWORK, STATE and LOG are written to `out`; with `resume`, an interrupted
+    training there continues. Raises DataError for wrong images, labels or checkpoints and when the device's memory is
+    full, ConfigError when `out` already holds a training, or one with other settings.
     """
     settings = settings or TrainingSettings()
     learnt = labelled_images(training, label_set, taxonomy, ids)
@@ -177,7 +177,7 @@ class _Run:
         self._weights = torch.from_numpy(class_weights(data)).to(device) if settings.weigh_classes else None
         self._done, self.best = 0, (-1.0, 0)
         if (out / STATE).exists() and not resume:
-            raise ConfigError(f"{out}: holds a training; go on with it (resume), or choose another folder")
+            raise ConfigError(f"{out}: holds a training; continue it (resume), or choose another folder")
         if (out / STATE).exists():
             self._load()
         _claim(out)
@@ -268,7 +268,7 @@ class _Run:
         }
         if changed or state["class_names"] != list(self._data.class_names):
             raise ConfigError(
-                f"{path}: began with other settings (then, now): {changed}; resume with the same ones"
+                f"{path}: was started with other settings (then, now): {changed}; resume with the same ones"
             )
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
@@ -277,7 +277,7 @@ class _Run:
 
 
 def precision_on(device: torch.device, settings: TrainingSettings) -> torch.dtype:
-    """What the layers calculate in; weights and loss stay float32 (Micikevicius et al., ICLR 2018)."""
+    """Number type of the layers; weights and loss stay float32 (Micikevicius et al., ICLR 2018)."""
     automatic = "float16" if device.type == "cuda" else "float32"
     name = automatic if settings.precision == "auto" else settings.precision
     precision: torch.dtype = getattr(torch, name)
@@ -336,7 +336,7 @@ def _to_input(pixels: NDArray[np.uint8], device: torch.device) -> Tensor:
 
 
 def _claim(out: Path) -> None:
-    """Have a folder for a training; raises ConfigError for one with files that no training wrote."""
+    """Make the folder of a training; raises ConfigError for one with other files."""
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
         strange = sorted(
@@ -359,13 +359,13 @@ def _writing(out: Path) -> Iterator[None]:
         OSError,
         RuntimeError,
         SafetensorError,
-    ) as error:  # the last two are torch's and safetensors' words for it
+    ) as error:  # the last two are of torch and safetensors
         reason = str(error).splitlines()[0]
         raise DataError(f"{out}: cannot be written ({reason}); free some space there, then resume") from None
 
 
 def _append_row(path: Path, header: list[str], row: list[object]) -> None:
-    """Add a row; rows of that step and later ones are what an interrupted training left, and go."""
+    """Add a row; rows of that step and later ones, of an interrupted training, are removed."""
     rows: list[list[str]] = []
     if path.exists():
         with path.open(newline="") as file:

@@ -77,7 +77,7 @@ def labelled_images(
 ) -> LabelledImages:
     """Every image of the folders and the folders in them, in order, with the PNG of the same name and place.
 
-    Cityscapes' own names are understood: `_leftImg8bit` goes with the suffix of the chosen ids. Raises DataError
+    Cityscapes' file names are known: `_leftImg8bit` is paired with the suffix of the chosen ids. Raises DataError
     when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
     """
     source = taxonomy(taxonomy_name)
@@ -156,10 +156,10 @@ def augmented(
     seen[: cut.shape[0], : cut.shape[1]], said[: cut.shape[0], : cut.shape[1]] = cut, cut_truth
     if rng.random() < 0.5:
         seen, said = seen[:, ::-1], said[:, ::-1]
-    return np.ascontiguousarray(_in_another_light(seen, rng)), np.ascontiguousarray(said)
+    return np.ascontiguousarray(_with_changed_colours(seen, rng)), np.ascontiguousarray(said)
 
 
-def _in_another_light(pixels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def _with_changed_colours(pixels: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Another gamma, gain and tint, by one table per channel."""
     levels = (np.arange(256) / 255.0) ** np.exp(rng.uniform(-0.3, 0.3))
     gains = np.exp(rng.uniform(-0.2, 0.2) + rng.uniform(-0.06, 0.06, 3))

@@ -393,7 +393,7 @@ def test_all_label_files_damaged_is_said_early_and_one_is_a_skip(
         path.write_bytes(b"")
     outcome = gnss_sem_map(*arguments, folder=tmp_path / "2")
     assert outcome.code == 1
-    assert "nor can any of 12 label files be used" in outcome.err
+    assert "none of 12 label files that were tried can be used" in outcome.err
     trial("whole runs", outcome.faults, outcome)
 
 

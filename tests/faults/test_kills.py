@@ -118,20 +118,20 @@ def test_the_command_that_puts_it_right_may_be_killed_too(results, trial, tmp_pa
 
 
 def assert_same_chunks(small_drive: Street, work: Path, at_once) -> None:
-    drive, account = street_drive(small_drive.drive, small_drive.labels), RunStats()
-    store = map_chunks(drive, work, account, resume=True)
+    drive, stats = street_drive(small_drive.drive, small_drive.labels), RunStats()
+    store = map_chunks(drive, work, stats, resume=True)
     for layer, expected in ((STATIC, at_once[0].static), (REMOVED, at_once[0].removed)):
         found = store.whole(layer)
         for name in ("keys", "evidence", "hits"):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    assert account.counts == at_once[1].counts
+    assert stats.counts == at_once[1].counts
     assert not list(work.glob(".*.part"))
 
 
 @pytest.fixture(scope="module")
 def at_once(small_drive: Street):
-    account = RunStats()
-    return build_maps(street_drive(small_drive.drive, small_drive.labels), account), account
+    stats = RunStats()
+    return build_maps(street_drive(small_drive.drive, small_drive.labels), stats), stats
 
 
 def kill_the_mapping(

@@ -200,7 +200,7 @@ def test_what_lies_beside_is_somebody_elses(small_drive: Street, name: str, tria
 
 
 def test_notes_in_the_folder_of_an_interrupted_run_stay(small_drive: Street, trial, tmp_path: Path) -> None:
-    for name in ("notes.txt", "chunks/notes.txt", "0/notes.txt", "answers/notes.txt"):
+    for name in ("notes.txt", "chunks/notes.txt", "0/notes.txt", "answers/notes.txt", "motion/notes.txt"):
         work = tmp_path / name.replace("/", "_") / ".out.work"
         write_result(work, {})
         (work / name).parent.mkdir(exist_ok=True)

@@ -24,7 +24,7 @@ def stop(
     faults += [f"code {outcome.code}"] * (outcome.code != 128 + number)
     faults += ["a result"] * (folder / "out").exists()
     beside = {path.name for path in folder.iterdir()} - {"trial"}
-    kept = any(name.endswith("record.json") for name in content(folder / ".out.work"))
+    kept = any(name.endswith(("record.json", "motion/about.json")) for name in content(folder / ".out.work"))
     faults += [f"left {beside}"] * (beside != ({".out.work"} if kept else set()))
     faults += ["does not name --resume"] * (kept and "--resume" not in outcome.err)
     faults += ["names --resume, but nothing is kept"] * (not kept and "--resume" in outcome.err)

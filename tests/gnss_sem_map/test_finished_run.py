@@ -13,6 +13,7 @@ from street import Street
 from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.runs.merged_run import merge_run_folders
 
 MADE_ANEW = {"run.json", "report.html", ".gnss-sem-map.json"}
 """They say how long it took."""
@@ -122,3 +123,36 @@ def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Ru
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no run folder"):
         Run.open(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def merged(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("merged")
+    for name, frames in (("a", "0:6"), ("b", "6:12")):
+        run(small_drive.drive, folder / name, f"labels:{small_drive.labels}", frames=frames, force=True)
+    merge_run_folders(folder / "a", folder / "b", folder / "merged", match=False)
+    return Run.open(folder / "merged")
+
+
+def test_a_merged_run_is_read_refined_and_exported(merged: Run, tmp_path: Path) -> None:
+    whole = merged.map()
+    low, high = whole.voxels.centres.min(axis=0), whole.voxels.centres.mean(axis=0)
+    assert 0 < len(merged.map((low, high))) < len(whole)
+    again = merged.refine(merged.settings, tmp_path / "again")
+    assert again.is_merged
+    assert files(again.folder) == files(merged.folder)
+    assert again.about == merged.about
+    other = with_refinement(merged.settings, potts_mrf={"enabled": False})
+    changed = again.refine(other)
+    assert changed.settings == other
+    assert files(changed.folder / "map") == files(merged.folder / "map")
+    assert files(changed.folder / "refined") != files(merged.folder / "refined")
+    [ply] = merged.export(["ply"], tmp_path / "files")
+    assert ply.read_bytes() == (merged.folder / "map.ply").read_bytes()
+
+
+def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, small_drive: Street) -> None:
+    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for trajectory"):
+        _ = merged.trajectory
+    with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for relabelling"):
+        merged.relabel(f"labels:{small_drive.labels}")

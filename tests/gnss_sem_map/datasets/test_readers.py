@@ -327,3 +327,42 @@ def test_the_real_sequence_has_more_poses_than_scans(real_data: Path) -> None:
     assert log.given is not None
     assert len(log.given) == 4071
     assert log.calibration.image_size == (1226, 370)
+
+
+def test_a_raw_drive_is_the_same_through_a_link_and_from_inside(
+    small_drive: Street, copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Calibration and the twin with the fast IMU lie beside the drive itself, not beside the link."""
+    twin = copy.with_name(copy.name.replace("_sync", "_extract"))
+    shutil.copytree(copy / "oxts", twin / "oxts")
+    (twin / "oxts/data" / sorted(path.name for path in (twin / "oxts/data").iterdir())[1]).unlink()
+    direct = open_drive(copy)
+    assert direct.imu is not None
+    assert len(direct.imu.stamps) == len(list((twin / "oxts/data").iterdir()))
+    link = tmp_path / "elsewhere" / "my_drive"
+    link.parent.mkdir()
+    link.symlink_to(copy)
+    linked = open_drive(link)
+    monkeypatch.chdir(copy)
+    for log in (linked, open_drive(".")):
+        assert log.imu is not None
+        np.testing.assert_array_equal(log.imu.stamps, direct.imu.stamps)
+        for name in ("T_imu_lidar", "T_camera_lidar", "K"):
+            np.testing.assert_array_equal(getattr(log.calibration, name), getattr(direct.calibration, name))
+    assert linked.name == "my_drive"
+    assert open_drive(".").name == copy.name
+
+
+def test_calibration_beside_a_link_comes_first(small_drive: Street, copy: Path, tmp_path: Path) -> None:
+    """A date folder may hold links to drives on another disk."""
+    date = tmp_path / "links" / "2011_09_26"
+    date.mkdir(parents=True)
+    for file in copy.parent.glob("calib_*.txt"):
+        shutil.move(file, date / file.name)
+    (date / copy.name).symlink_to(copy)
+    log = open_drive(date / copy.name)
+    np.testing.assert_array_equal(
+        log.calibration.T_imu_lidar, open_drive(small_drive.drive).calibration.T_imu_lidar
+    )
+    with pytest.raises(DataError, match="calib_imu_to_velo"):
+        open_drive(copy)

@@ -50,8 +50,8 @@ def drive(small_drive: Street) -> Drive:
 
 @pytest.fixture(scope="module")
 def at_once(drive: Drive) -> tuple[Maps, RunStats]:
-    account = RunStats()
-    return build_maps(drive, account), account
+    stats = RunStats()
+    return build_maps(drive, stats), stats
 
 
 def by_chunks(drive: Drive, scans: int) -> Drive:
@@ -69,8 +69,8 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
     drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
     """All images but two: the map is that of the others' labels, with every point in it."""
-    kept, account = drive.log.images[3:5], RunStats()
-    found = build_maps(replace(drive, log=replace(drive.log, images=kept)), account).static
+    kept, stats = drive.log.images[3:5], RunStats()
+    found = build_maps(replace(drive, log=replace(drive.log, images=kept)), stats).static
     np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
     np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
     shown = [scan for scan in drive.log.scans if scan.number in [image.number for image in kept]]
@@ -78,7 +78,7 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
     places = found.indices_of(few.keys)
     np.testing.assert_array_equal(found.evidence[places], few.evidence)
     assert found.observed.sum() == few.observed.sum() > 0
-    reasons = [(skip.what, skip.reason) for skip in account.skips]
+    reasons = [(skip.what, skip.reason) for skip in stats.skips]
     assert reasons == [("labels", "no image near its stamp")] * (len(drive.log.scans) - 2)
 
 
@@ -95,16 +95,14 @@ def test_points_that_are_kept_on_the_way_are_those_that_are_found_later(drive: D
 def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_scans(
     drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
-    settings, account = drive.settings, RunStats()
+    settings, stats = drive.settings, RunStats()
     late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0})
-    found = build_maps(
-        replace(drive, settings=settings.model_copy(update={"labelling": late})), account
-    ).static
+    found = build_maps(replace(drive, settings=settings.model_copy(update={"labelling": late})), stats).static
     np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
     np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
     assert not found.observed.any()
-    assert [skip.what for skip in account.skips] == ["labels"] * len(drive.log.scans)
-    assert all("trajectory" in skip.reason for skip in account.skips)
+    assert [skip.what for skip in stats.skips] == ["labels"] * len(drive.log.scans)
+    assert all("trajectory" in skip.reason for skip in stats.skips)
 
 
 class Refusing:
@@ -129,11 +127,11 @@ def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
     assert size is not None
     refusing = CachedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
     for _ in range(2):
-        account = RunStats()
-        found = build_maps(replace(drive, segmenter=refusing), account)
-        assert account.skips == [Skip("labels", "frame 5", "this image is damaged")]
+        stats = RunStats()
+        found = build_maps(replace(drive, segmenter=refusing), stats)
+        assert stats.skips == [Skip("labels", "frame 5", "this image is damaged")]
         np.testing.assert_array_equal(found.static.hits, at_once[0].static.hits)
-        counts = account.counts
+        counts = stats.counts
         parts = ("points left out", "points unlabelled", "points labelled")
         assert counts["points"] == sum(counts[part] for part in parts)
         assert 0 < counts["points labelled"] < at_once[1].counts["points labelled"]
@@ -146,11 +144,11 @@ def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive
         def __call__(self, image: Image) -> NDArray[np.uint8]:
             raise DataError("this network is broken")
 
-    account = RunStats()
-    assert len(build_maps(replace(drive, segmenter=Hopeless()), account).static) > 1000
-    assert account.counts["points labelled"] == 0
+    stats = RunStats()
+    assert len(build_maps(replace(drive, segmenter=Hopeless()), stats).static) > 1000
+    assert stats.counts["points labelled"] == 0
     first = drive.log.scans[0].number
-    assert account.warnings == [
+    assert stats.warnings == [
         "no point got a label, and the map shows geometry only; first reason:"
         f" frame {first}: this network is broken"
     ]
@@ -168,15 +166,15 @@ def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_
 @pytest.mark.parametrize(
     ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
 )
-def test_chunks_and_processes_give_the_same_map_and_account(
+def test_chunks_and_processes_give_the_same_map_and_stats(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, chunk: int, workers: int
 ) -> None:
-    account = RunStats()
-    maps = build_maps(by_chunks(drive, chunk), account, work=tmp_path / "work", workers=workers)
+    stats = RunStats()
+    maps = build_maps(by_chunks(drive, chunk), stats, work=tmp_path / "work", workers=workers)
     assert_same(maps.static, at_once[0].static)
     assert len(maps.removed) == 0
-    assert account.counts == at_once[1].counts
-    assert account.skips == at_once[1].skips
+    assert stats.counts == at_once[1].counts
+    assert stats.skips == at_once[1].skips
 
 
 def test_tiles_come_from_the_chunks_one_by_one(
@@ -247,10 +245,10 @@ def resumed_after_kills(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], work: Path, times: int, seed: int
 ) -> list[int]:
     done = kill_at_random(small_drive, work, times, seed)
-    account = RunStats()
-    maps = build_maps(by_chunks(drive, 1), account, work=work, resume=True)
+    stats = RunStats()
+    maps = build_maps(by_chunks(drive, 1), stats, work=work, resume=True)
     assert_same(maps.static, at_once[0].static)
-    assert account.counts == at_once[1].counts
+    assert stats.counts == at_once[1].counts
     assert not list(work.glob(".*.part"))
     return done
 
@@ -317,10 +315,10 @@ def test_a_damaged_chunk_is_mapped_again(
     build_maps(drive, RunStats(), work=tmp_path / "work")
     others = {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
     damage(sorted((tmp_path / "work/1").glob(what))[0])
-    account = RunStats()
-    maps = build_maps(drive, account, work=tmp_path / "work", resume=True)
+    stats = RunStats()
+    maps = build_maps(drive, stats, work=tmp_path / "work", resume=True)
     assert_same(maps.static, at_once[0].static)
-    assert account.counts == at_once[1].counts
+    assert stats.counts == at_once[1].counts
     assert others == {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
 
 
@@ -437,7 +435,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path)
     )  # fmt: skip
     first, second = done.stdout.splitlines()
     assert "cannot write the map" in first
-    assert "cannot put voxels away" in second
+    assert "cannot save voxels" in second
     assert [path.name for path in tmp_path.iterdir()] == ["work"]
     assert {path.name for path in (tmp_path / "work").iterdir()} == {"chunks.json", MARKER}
 

@@ -14,7 +14,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.evidence import RunEvidence
-from gnss_sem_map.mapping.merging import into_frame, lay_onto, merge, merge_runs
+from gnss_sem_map.mapping.merging import align, into_frame, merge, merge_runs
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import refine
 from gnss_sem_map.voxels import tiles
@@ -68,25 +68,25 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
         tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
         evidence.write(RunEvidence(voxels[moved]), tmp_path / name, frame)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    stands, removed = runs.stands, runs.evidence.moved
+    static, removed = runs.static, runs.evidence.moved
     assert runs.frame == HERE
-    assert stands.hits.sum() + removed.hits.sum() == 120_000
+    assert static.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
-    assert URBAN.index("building") not in stands.labels
-    again, _ = refine(stands, beside=Evidence(moved=removed))
+    assert URBAN.index("building") not in static.labels
+    again, _ = refine(static, beside=Evidence(moved=removed))
     assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
-        stands.indices_of(removed.keys) < 0
+        static.indices_of(removed.keys) < 0
     )
 
 
-def test_merged_runs_keep_what_moved_through_standing_voxels_apart(tmp_path: Path) -> None:
-    """Twice the same run: twice the evidence of what stands, and twice that of what moved, in the voxels of both."""
-    stands, moved = street(HERE, 0), street(HERE, 1)
+def test_merged_runs_keep_moving_points_in_static_voxels_apart(tmp_path: Path) -> None:
+    """The same run twice: twice the evidence of static points and of moving points, also in voxels of both."""
+    static, moved = street(HERE, 0), street(HERE, 1)
     for name in ("a", "b"):
-        tiles.write(SemanticMap.of(stands + moved), tmp_path / name / "map", HERE)
+        tiles.write(SemanticMap.of(static + moved), tmp_path / name / "map", HERE)
         evidence.write(RunEvidence(moved), tmp_path / name, HERE)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    for found, once in ((runs.stands, stands), (runs.evidence.moved, moved)):
+    for found, once in ((runs.static, static), (runs.evidence.moved, moved)):
         np.testing.assert_array_equal(found.keys, once.keys)
         np.testing.assert_array_equal(found.hits, 2 * once.hits)
         np.testing.assert_array_equal(found.evidence, 2 * once.evidence)
@@ -128,16 +128,16 @@ OFF[:3, :3] = Rotation.from_euler("zx", [0.3, 0.1], degrees=True).as_matrix()
 OFF[:3, 3] = 0.6, -0.4, 0.3
 
 
-def test_the_second_map_is_laid_onto_the_first() -> None:
+def test_the_second_map_is_registered_to_the_first() -> None:
     """Two drives of one place, the second's positions off by 0.8 m: its surfaces come back to a few centimetres."""
     there = (corner(1) - OFF[:3, 3]) @ OFF[:3, :3]  # OFF brings it back
     first, second = voxels_of(corner(0)), voxels_of(there)
-    laid = lay_onto(first, second, HERE, HERE)
-    assert laid.match is not None, laid.reason
-    back = there @ laid.match.T_target_source[:3, :3].T + laid.match.T_target_source[:3, 3]
+    alignment = align(first, second, HERE, HERE)
+    assert alignment.match is not None, alignment.reason
+    back = there @ alignment.match.T_target_source[:3, :3].T + alignment.match.T_target_source[:3, 3]
     assert np.abs(back - corner(1)).max() < 0.05
-    assert laid.coinciding[1] > laid.coinciding[0] + 0.3
-    together = merge(first, second, HERE, HERE, laid.match.T_target_source)
+    assert alignment.overlap[1] > alignment.overlap[0] + 0.3
+    together = merge(first, second, HERE, HERE, alignment.match.T_target_source)
     assert len(together) < 0.75 * len(merge(first, second, HERE, HERE))
     assert together.hits.sum() == first.hits.sum() + second.hits.sum()
 
@@ -147,34 +147,34 @@ def test_a_street_without_an_end_is_not_moved_along_itself() -> None:
     street = corner(0)[:60_000]  # without the facade across
     middle = (street[:, 0] > 10) & (street[:, 0] < 50)  # its ends would tell
     second = voxels_of(corner(1)[:60_000][middle] + np.array([0.5, 0.5, 0.2]))
-    laid = lay_onto(voxels_of(street), second, HERE, HERE)
-    assert laid.match is not None, laid.reason
-    np.testing.assert_allclose(laid.match.T_target_source[:3, :3], np.eye(3), atol=2e-3)
+    alignment = align(voxels_of(street), second, HERE, HERE)
+    assert alignment.match is not None, alignment.reason
+    np.testing.assert_allclose(alignment.match.T_target_source[:3, :3], np.eye(3), atol=2e-3)
     centre = np.append(second.centres.mean(axis=0), 1)
-    moved = laid.match.T_target_source @ centre - centre
+    moved = alignment.match.T_target_source @ centre - centre
     assert abs(moved[0]) < 0.05
     np.testing.assert_allclose(moved[1:3], [-0.5, -0.2], atol=0.05)
 
 
 def test_parked_cars_do_not_hold_a_map() -> None:
-    """Cars that were parked elsewhere the second time are not what it is laid onto."""
+    """Cars that were parked elsewhere the second time are left out of the registration."""
     rng = np.random.default_rng(5)
     cars = [rng.uniform([10 * k, 3, 0], [10 * k + 4, 5, 1.5], (4_000, 3)) for k in range(1, 5)]
     first, second = (
         voxels_of(corner(seed)) + voxels_of(np.vstack(cars) + np.array([shift, 0, 0]), "vehicle")
         for seed, shift in ((0, 0.0), (1, 1.0))
     )
-    laid = lay_onto(first, second, HERE, HERE)
-    assert laid.match is None or laid.match.shift_m < 0.02
+    alignment = align(first, second, HERE, HERE)
+    assert alignment.match is None or alignment.match.shift_m < 0.02
 
 
 def test_maps_that_share_nothing_lie_by_their_georeference() -> None:
     elsewhere = voxels_of(corner(1) + np.array([300, 0, 0]))
-    laid = lay_onto(voxels_of(corner(0)), elsewhere, HERE, HERE)
-    assert laid.match is None
-    assert "lie within" in laid.reason
-    assert laid.coinciding == (0.0, 0.0)
-    few = lay_onto(voxels_of(corner(0)[:100]), elsewhere, HERE, HERE)
+    alignment = align(voxels_of(corner(0)), elsewhere, HERE, HERE)
+    assert alignment.match is None
+    assert "lie within" in alignment.reason
+    assert alignment.overlap == (0.0, 0.0)
+    few = align(voxels_of(corner(0)[:100]), elsewhere, HERE, HERE)
     assert "less than 300 voxels" in few.reason
 
 

@@ -1,13 +1,13 @@
-"""What an image says of the points of a scan before they are judged."""
+"""Which points the labels of an image mark as movable, before the search for moving objects."""
 
 import numpy as np
 
-from gnss_sem_map.mapping.moving_points import told
+from gnss_sem_map.mapping.moving_points import movable_and_known
 
 
 def test_what_is_other_to_the_map_is_as_unknown_as_what_no_image_shows():
     names = ("road", "vehicle", "person", "building")
     in_no_image, other = -1, len(names)
-    may_move, is_known = told(np.array([in_no_image, 0, 1, 2, 3, other], np.int8), names)
+    may_move, is_known = movable_and_known(np.array([in_no_image, 0, 1, 2, 3, other], np.int8), names)
     assert may_move.tolist() == [False, False, True, True, False, False]
     assert is_known.tolist() == [False, True, True, True, True, False]

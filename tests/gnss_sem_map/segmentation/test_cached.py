@@ -197,7 +197,9 @@ def test_damaged_files_spoil_their_own_frames_only(tmp_path: Path, suffix: str) 
         segment(frame(3))
     for path in files[-4:]:
         path.write_bytes(b"")
-    with pytest.raises(DataError, match=r"000000.*damaged.*; nor can any of 17 label files be used"):
+    with pytest.raises(
+        DataError, match=r"000000.*damaged.*; none of 17 label files that were tried can be used"
+    ):
         open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,6 +53,9 @@ UNLABELLED_ALONE = (150, 158, 172)
 
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
+_matplotlib = Lock()
+"""Its figures may not be drawn by two threads at once."""
+
 
 def write_topview(
     semantic_map: SemanticMap,
@@ -74,15 +78,17 @@ def write_topview(
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
     strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // columns)
-    figure, axes = _frame(view, image, zoom, strip_px)
-    strip = _strip(figure, strip_px)
-    _draw_entries(strip, entries, columns, "black")
-    _draw_scale_and_north(strip, view.cell_m / zoom)
-    if trajectory is not None:
-        _draw_track(axes, trajectory)
-    if title is not None:
-        axes.set_title(title, fontsize=11, loc="left", parse_math=False)
-    _write_png(_drawn(figure), path)
+    with _matplotlib:
+        figure, axes = _frame(view, image, zoom, strip_px)
+        strip = _strip(figure, strip_px)
+        _draw_entries(strip, entries, columns, "black")
+        _draw_scale_and_north(strip, view.cell_m / zoom)
+        if trajectory is not None:
+            _draw_track(axes, trajectory)
+        if title is not None:
+            axes.set_title(title, fontsize=11, loc="left", parse_math=False)
+        pixels = _drawn(figure)
+    _write_png(pixels, path)
 
 
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
@@ -290,9 +296,10 @@ def _legend(width: int, entries: list[tuple[str, Colour]]) -> NDArray[np.uint8]:
     """A dark strip (h, width, 3) with the classes."""
     columns = max(1, (width - 2 * MARGIN_PX) // ENTRY_PX[0])
     strip_px = 28 + ENTRY_PX[1] * -(-len(entries) // columns)
-    figure = _figure(width, strip_px, SKY[0] / 255)
-    _draw_entries(_strip(figure, strip_px), entries, columns, "white")
-    return _drawn(figure)
+    with _matplotlib:
+        figure = _figure(width, strip_px, SKY[0] / 255)
+        _draw_entries(_strip(figure, strip_px), entries, columns, "white")
+        return _drawn(figure)
 
 
 def _figure(width: int, height: int, colour: Any) -> Figure:

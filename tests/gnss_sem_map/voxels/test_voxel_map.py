@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels import voxel_map
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import LARGE_TABLE, VoxelMap, VoxelTable, keys_of, log_table, pack, unpack
 
 URBAN = open_label_set()

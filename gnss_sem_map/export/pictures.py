@@ -53,7 +53,7 @@ UNLABELLED_ALONE = (150, 158, 172)
 
 Colour = NDArray[np.uint8] | tuple[int, int, int]
 
-_matplotlib = Lock()
+_MATPLOTLIB = Lock()
 """Its figures may not be drawn by two threads at once."""
 
 
@@ -78,7 +78,7 @@ def write_topview(
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
     strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // columns)
-    with _matplotlib:
+    with _MATPLOTLIB:
         figure, axes = _frame(view, image, zoom, strip_px)
         strip = _strip(figure, strip_px)
         _draw_entries(strip, entries, columns, "black")
@@ -296,7 +296,7 @@ def _legend(width: int, entries: list[tuple[str, Colour]]) -> NDArray[np.uint8]:
     """A dark strip (h, width, 3) with the classes."""
     columns = max(1, (width - 2 * MARGIN_PX) // ENTRY_PX[0])
     strip_px = 28 + ENTRY_PX[1] * -(-len(entries) // columns)
-    with _matplotlib:
+    with _MATPLOTLIB:
         figure = _figure(width, strip_px, SKY[0] / 255)
         _draw_entries(_strip(figure, strip_px), entries, columns, "white")
         return _drawn(figure)

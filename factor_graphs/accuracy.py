@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
+from factor_graphs.chi_square import quantile
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 
@@ -128,7 +128,7 @@ def pose_nees(estimate: Trajectory, reference: Trajectory) -> tuple[Array, Array
 def anees_band(dof: int, runs: int, confidence: float = 0.99) -> tuple[float, float]:
     """Where the mean NEES of independent runs must lie if the covariances are right (Bar-Shalom 2001, 5.4)."""
     tail = (1 - confidence) / 2
-    return float(chi2.ppf(tail, dof * runs) / runs), float(chi2.ppf(1 - tail, dof * runs) / runs)
+    return quantile(tail, dof * runs) / runs, quantile(1 - tail, dof * runs) / runs
 
 
 def state_error(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from factor_graphs.alignment import AttitudePrior, first_guess
+from factor_graphs.chi_square import probability_below, quantile
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import (
@@ -28,11 +28,11 @@ from factor_graphs.settings import SmootherSettings
 Array = NDArray[np.float64]
 
 # 99 % of good measurements have a squared whitened residual below the first, 99.9 % below the second: fixes ...
-GATE, REJECTION = float(chi2.ppf(0.99, 3)), float(chi2.ppf(0.999, 3))
-GOOD_MEAN = float(3 * chi2.cdf(GATE, 5) / chi2.cdf(GATE, 3))
+GATE, REJECTION = quantile(0.99, 3), quantile(0.999, 3)
+GOOD_MEAN = 3 * probability_below(GATE, 5) / probability_below(GATE, 3)
 # ... and relative poses.
-RELATIVE_GATE, RELATIVE_REJECTION = float(chi2.ppf(0.99, 6)), float(chi2.ppf(0.999, 6))
-RELATIVE_GOOD_MEAN = float(6 * chi2.cdf(RELATIVE_GATE, 8) / chi2.cdf(RELATIVE_GATE, 6))
+RELATIVE_GATE, RELATIVE_REJECTION = quantile(0.99, 6), quantile(0.999, 6)
+RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below(RELATIVE_GATE, 6)
 # Prior of the first keyframe's position m and speed m/s: finite, and no information.
 START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
 
@@ -47,7 +47,7 @@ LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
 # A norm of six residuals is larger than one of three: Huber's loss begins where it leaves the usual.
 RELATIVE_LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
     "quadratic": None,
-    "huber": gtsam.noiseModel.mEstimator.Huber.Create(float(chi2.ppf(0.8, 6)) ** 0.5),
+    "huber": gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.8, 6) ** 0.5),
     "truncated": gtsam.noiseModel.mEstimator.TruncatedLeastSquares.Create(RELATIVE_REJECTION**0.5),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +77,10 @@ def _frame(exported: Exported) -> LocalFrame:
 
 
 def write_exports(exported: Exported, folder: Path) -> None:
-    """All files that can be written of a map."""
-    for each in FORMATS:
-        if exported.frame is not None or each.name != "geotiff":
-            each.write(exported, folder / each.file)
+    """All files that can be written of a map, two at a time."""
+    possible = [each for each in FORMATS if exported.frame is not None or each.name != "geotiff"]
+    with ThreadPoolExecutor(2) as pool:
+        # the last takes longest, so it begins
+        writing = [pool.submit(each.write, exported, folder / each.file) for each in reversed(possible)]
+    for each in writing:
+        each.result()

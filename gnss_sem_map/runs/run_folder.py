@@ -36,6 +36,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
+RAW_LABELS = "labels_raw"
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
 
@@ -130,7 +131,7 @@ def write_again(
                 write_raw(folder, result, frame)
             write_refined(folder, result, frame, driven, str(about["name"]))
             if log is not None:
-                write_point_labels(folder, log, result, settings)
+                write_point_labels(folder, log, result, settings, source / RAW_LABELS if same_map else None)
         about |= changed | {
             "seconds": about["seconds"] | _seconds(result.stats),
             "counts": about["counts"] | dict(sorted(result.stats.counts.items())),
@@ -225,20 +226,28 @@ def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
     }
 
 
-def write_point_labels(folder: Path, log: SensorLog, result: Result, settings: Settings) -> None:
+def write_point_labels(
+    folder: Path, log: SensorLog, result: Result, settings: Settings, known_raw: Path | None = None
+) -> None:
     """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
+    `known_raw`: a folder with the labels before refinement, which are copied.
     """
-    for name in ("labels", "labels_raw", "confidence", "removed"):
+    for name in ("labels", "confidence", "removed"):
         (folder / name).mkdir()
+    if known_raw is None:
+        (folder / RAW_LABELS).mkdir()
+    else:
+        shutil.copytree(known_raw, folder / RAW_LABELS)
     known_ids = result.raw.voxels.label_set.semantic_kitti_ids
     ids = np.append(known_ids, 0).astype("<u4")  # the label -1 finds the last
-    maps = (result.raw, result.refined)
-    for scan, (raw, refined) in label_points(
+    maps = [result.raw] * (known_raw is None) + [result.refined]
+    for scan, (*raw, refined) in label_points(
         log, result.trajectory, maps, settings, result.evidence.moving, result.kerbs
     ):
-        ids[raw.labels].tofile(folder / "labels_raw" / f"{scan.name}.label")
+        if raw:
+            ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{scan.name}.label")
         ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
         refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{scan.name}.bin")
         refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")

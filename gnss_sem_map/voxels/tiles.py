@@ -187,10 +187,13 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
 
 def _column(table: Any, name: str) -> NDArray[Any]:
     """A column as numbers without gaps; raises ValueError for anything else."""
-    values: NDArray[Any] = table[name].to_numpy()
-    if table[name].null_count or values.dtype.kind not in ("f" if name == "confidence" else "iu"):
-        raise ValueError(f"column {name} is {values.dtype} with {table[name].null_count} gaps")
-    return values
+    import pyarrow as pa
+
+    column = table[name].combine_chunks()
+    is_number = pa.types.is_floating if name == "confidence" else pa.types.is_integer
+    if column.null_count or not is_number(column.type):
+        raise ValueError(f"column {name} is {column.type} with {column.null_count} gaps")
+    return np.from_dlpack(column)  # `to_numpy` imports pandas, which takes half a second
 
 
 def _join(

@@ -36,6 +36,7 @@ def stop_at_mapping(stage: str, done: int, total: int) -> None:
         raise Interrupted
 
 
+@pytest.mark.integration
 def test_resuming_asks_a_network_nothing_again(small_drive: street.Street, tmp_path: Path) -> None:
     log, settings = (
         open_drive(small_drive.drive),

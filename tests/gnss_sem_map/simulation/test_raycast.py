@@ -31,21 +31,16 @@ def sheet_height(ground: Ground, p: Floats) -> Floats:
 
 
 def kerb_distance(ground: Ground, p: Floats) -> Floats:
-    """Signed distance to the nearest kerb, positive on a block: the least over all blocks."""
-    uv = town_coordinates(ground, p)
-    gaps = []
-    for streets in (ground.streets_u, ground.streets_v):
+    """Signed distance to the nearest kerb, positive on a block: a block is a rounded rectangle."""
+    uv, r = town_coordinates(ground, p), ground.corner_radius
+    q = np.empty_like(uv)  # beyond the straight part of the nearest block's sides
+    for axis, streets in enumerate((ground.streets_u, ground.streets_v)):
         low = np.concatenate([[-5000.0], streets[:, 0] + streets[:, 1]])
         high = np.concatenate([streets[:, 0] - streets[:, 1], [5000.0]])
-        gaps.append((low, high))
-    nearest = np.full(len(p), np.inf)
-    r = ground.corner_radius
-    for u0, u1 in zip(*gaps[0], strict=True):
-        for v0, v1 in zip(*gaps[1], strict=True):
-            q = np.abs(uv - 0.5 * np.array([u0 + u1, v0 + v1])) - (0.5 * np.array([u1 - u0, v1 - v0]) - r)
-            out = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0) - r
-            nearest = np.minimum(nearest, out)
-    return -nearest
+        beyond = np.abs(uv[:, axis, None] - 0.5 * (low + high)) - (0.5 * (high - low) - r)
+        q[:, axis] = beyond.min(axis=1)  # blocks stand in rows: the nearest is so along both axes
+    out = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0) - r
+    return -out
 
 
 def shape_gap(shape: Floats, p: Floats) -> Floats:

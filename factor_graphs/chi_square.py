@@ -1,0 +1,13 @@
+"""The chi-square distribution by its special functions: importing scipy.stats would take most of a second."""
+
+from scipy.special import chdtr, gammaincinv
+
+
+def quantile(probability: float, dof: int) -> float:
+    """The value that a sum of `dof` squared standard normal variables stays below with this probability."""
+    return float(2 * gammaincinv(dof / 2, probability))
+
+
+def probability_below(value: float, dof: int) -> float:
+    """The probability that such a sum stays below a value."""
+    return float(chdtr(dof, value))

@@ -12,8 +12,6 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import MissingLabels, open_segmenter
 from gnss_sem_map.segmentation.cache import STEP, write_cache
-from gnss_sem_map.segmentation.checkpoints import write_network
-from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet
 from gnss_sem_map.sensor_log import Image
 
 URBAN = open_label_set("urban")
@@ -156,7 +154,11 @@ def test_progress_runs_from_what_is_there_to_all_there_is(tmp_path: Path) -> Non
     assert steps == [("segmenting", done, 5) for done in (1, 3, 5)]
 
 
+@pytest.mark.integration
 def test_a_network_in_batches_writes_what_it_writes_alone(tmp_path: Path) -> None:
+    from gnss_sem_map.segmentation.checkpoints import write_network
+    from gnss_sem_map.segmentation.refinenet import LightWeightRefineNet
+
     names = (*URBAN.names, "other")
     network = LightWeightRefineNet(6, "mobilenet_v2", width=16, depth_head=False)
     write_network(tmp_path / "net.safetensors", network, names, 1.0)

@@ -272,9 +272,10 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
 
 def _read_sweep(path: Path, start: float, end: float, state: frames.State | None) -> Points:
     """A sweep with the stamp of every point, from its azimuth: rear, left, front, right, rear."""
+    from gnss_sem_map.scans.angles import azimuths_deg  # compiled: only those who read scans need it
+
     rows = frames.read_points(path, state=state)
-    azimuths = np.arctan2(rows[:, 1], rows[:, 0], dtype=np.float64)
-    stamps = azimuths * ((start - end) / (2 * np.pi))
+    stamps = azimuths_deg(rows) * ((start - end) / 360)
     stamps += (start + end) / 2
     return Points(rows[:, :3], rows[:, 3], stamps)
 

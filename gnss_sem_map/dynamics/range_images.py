@@ -22,6 +22,7 @@ WIDTH = COLUMNS + 2
 """An image has a margin of one pixel: empty rows above and below; left and right the column from the other side."""
 NEAREST_M, FARTHEST_M = 2.5, 650.0
 """Nearer returns are of the vehicle that carries the LiDAR; farther ones do not fit the 16 bits of a pixel."""
+IMAGE_SHAPE = (ROWS + 2, WIDTH)
 UNITS_PER_M = 100
 EMPTY = np.uint16(65535)
 LEAST_FILLED = 3
@@ -178,4 +179,4 @@ def _in_range(positions, T_lidar_map, nearest_m, farthest_m, p_lidar, index):
 
 def empty_image() -> NDArray[np.uint16]:
     """A range image without returns."""
-    return np.full((ROWS + 2, WIDTH), EMPTY, np.uint16)
+    return np.full(IMAGE_SHAPE, EMPTY, np.uint16)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.dynamics.range_images import IMAGE_SHAPE
 from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import Archive, open_archive
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import MOST_BYTES, is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels import tiles
@@ -28,6 +30,8 @@ MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (
     "keyframes.npz",
     "surface_heights.npz",
 )
+MOST_KEYFRAME_BYTES = 100_000 * math.prod(IMAGE_SHAPE) * 2
+"""Images of keyframe scans that are read: a drive of a hundred kilometres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +99,9 @@ def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
         frames, counts, places = (
             _array(archive, path, name, "iu", 1) for name in ("frames", "counts", "places")
         )
-    if len(frames) != len(counts) or (counts < 0).any() or counts.sum() != len(places):
+    if len(frames) != len(counts) or (counts < 0).any() or counts.sum() != len(places) or (places < 0).any():
         raise DataError(
-            f"{shown(path)}: found counts that do not fit its {len(places)} points; make the run again"
+            f"{shown(path)}: found counts or numbers that do not fit its {len(places)} points; make the run again"
         )
     parts = np.split(places.astype(np.int64), np.cumsum(counts)[:-1]) if len(frames) else []
     return dict(zip(frames.tolist(), parts, strict=True))
@@ -105,15 +109,15 @@ def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
 
 def read_keyframes(path: Path) -> KeyframeScans:
     """Range images and poses of keyframe scans; raises DataError."""
-    with open_archive(path) as archive:
-        images, T = _array(archive, path, "images", "u", 3), _array(archive, path, "T_lidar_map", "f", 3)
-    if (
-        len(images) != len(T)
-        or T.shape[1:] != (4, 4)
-        or images.dtype != np.uint16
-        or not np.isfinite(T).all()
-    ):
-        raise DataError(f"{shown(path)}: found {len(images)} images and {T.shape} poses; make the run again")
+    with open_archive(path, MOST_KEYFRAME_BYTES) as archive:
+        images = _array(archive, path, "images", "u", 3, MOST_KEYFRAME_BYTES)
+        T = _array(archive, path, "T_lidar_map", "f", 3)
+    is_image = images.dtype == np.uint16 and images.shape == (len(T), *IMAGE_SHAPE)
+    if not is_image or T.shape[1:] != (4, 4) or not np.isfinite(T).all():
+        raise DataError(
+            f"{shown(path)}: found images {images.shape} and poses {T.shape}, expected {(len(T), *IMAGE_SHAPE)} and"
+            f" {(len(T), 4, 4)}; make the run again"
+        )
     return KeyframeScans(images, T.astype(np.float64))
 
 
@@ -126,8 +130,10 @@ def _heights(path: Path) -> SurfaceHeights:
     return SurfaceHeights(keys.astype(np.int64), sums.astype(np.float64), counts.astype(np.int64))
 
 
-def _array(archive: Archive, path: Path, name: str, kinds: str, dimensions: int) -> NDArray[Any]:
-    found = archive.array(name).read()
+def _array(
+    archive: Archive, path: Path, name: str, kinds: str, dimensions: int, most_bytes: int = MOST_BYTES
+) -> NDArray[Any]:
+    found = archive.array(name, most_bytes).read()
     if found.dtype.kind not in kinds or found.ndim != dimensions:
         raise DataError(f"{shown(path)}: {name} is {found.dtype} {found.shape}; make the run again")
     return found

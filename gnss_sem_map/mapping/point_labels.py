@@ -67,7 +67,13 @@ def label_points(
             found[-1].labels[points_of_kerbs] = chosen
             found[-1].confidence[points_of_kerbs] = probability
         if moving is not None and scan.number in moving:
-            _remove(found[-1], np.flatnonzero(valid)[moving[scan.number]], maps[-1])
+            usable, moved = np.flatnonzero(valid), moving[scan.number]
+            if moved.max(initial=-1) >= len(usable):
+                raise DataError(
+                    f"frame {scan.number}: found {len(usable)} usable points, expected more than {moved.max()}, which"
+                    " is said to have moved; was the scan changed? make the run again"
+                )
+            _remove(found[-1], usable[moved], maps[-1])
         return found
 
     for scan, found in prefetch(label, log.scans, threads=os.cpu_count() or 1):

@@ -16,6 +16,7 @@ from gnss_sem_map import Settings, run
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
 from gnss_sem_map.dynamics.moving_objects import MovingObjects
+from gnss_sem_map.dynamics.range_images import empty_image
 from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive
@@ -144,7 +145,9 @@ FOUND = MovingObjects(
         ),
         TrackedObject(Motion.MOVING, 1.0, True, "", (4,), 6, 1.0, 1.0, np.array([[1.0, 2.0]])),
     ),
-    KeyframeScans(np.arange(24, dtype=np.uint16).reshape(2, 3, 4), np.random.default_rng(1).normal(size=(2, 4, 4))),
+    KeyframeScans(
+        np.stack([empty_image(), empty_image() // 2]), np.random.default_rng(1).normal(size=(2, 4, 4))
+    ),
 )  # fmt: skip
 
 

@@ -1,0 +1,55 @@
+"""What a run keeps beside its map comes back as it was, however long the drive; what cannot be used is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnss_sem_map.dynamics.range_images import IMAGE_SHAPE
+from gnss_sem_map.dynamics.visibility import KeyframeScans
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.mapping import evidence
+
+
+def keyframes(count: int) -> KeyframeScans:
+    images = np.random.default_rng(0).integers(0, 1 << 16, (count, *IMAGE_SHAPE), np.uint16)
+    return KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)))
+
+
+def test_keyframes_come_back(tmp_path: Path) -> None:
+    written = keyframes(3)
+    evidence.write_keyframes(written, tmp_path / "k.npz")
+    read = evidence.read_keyframes(tmp_path / "k.npz")
+    np.testing.assert_array_equal(read.images, written.images)
+    np.testing.assert_array_equal(read.T_lidar_map, written.T_lidar_map)
+
+
+@pytest.mark.slow
+def test_those_of_more_than_a_gibibyte_too(tmp_path: Path) -> None:
+    """10 km of drive."""
+    count = (1 << 30) // (2 * int(np.prod(IMAGE_SHAPE))) + 1
+    images = np.zeros((count, *IMAGE_SHAPE), np.uint16)
+    evidence.write_keyframes(KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1))), tmp_path / "k.npz")
+    assert len(evidence.read_keyframes(tmp_path / "k.npz").images) == count
+
+
+@pytest.mark.parametrize("shape", [(3, 68, 900), (2, *IMAGE_SHAPE), (3, IMAGE_SHAPE[0], IMAGE_SHAPE[1] + 1)])
+def test_images_of_another_shape_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
+    """They would be read beyond their end."""
+    np.savez(tmp_path / "k.npz", images=np.zeros(shape, np.uint16), T_lidar_map=np.tile(np.eye(4), (3, 1, 1)))
+    with pytest.raises(DataError, match="expected"):
+        evidence.read_keyframes(tmp_path / "k.npz")
+
+
+@pytest.mark.parametrize(
+    ("counts", "places"), [([2], [1, -1]), ([3], [1, 2]), ([-1, 3], [1, 2]), ([2, 2], [1, 2])]
+)
+def test_moving_points_that_no_scan_can_have_are_refused(
+    counts: list[int], places: list[int], tmp_path: Path
+) -> None:
+    path = tmp_path / "m.npz"
+    np.savez(path, frames=np.arange(len(counts)), counts=np.array(counts), places=np.array(places))
+    with pytest.raises(DataError, match="do not fit"):
+        evidence.read_moving_points(path)

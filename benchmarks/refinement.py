@@ -190,7 +190,9 @@ def by_the_paper(drive: Drive) -> Points:
 def removed_in_all(drive: Drive, found: MovingObjects) -> Points:
     """The points of what moved and, as in a run, those in voxels that witnesses look through."""
     maps = build_maps(replace(drive, moving=found.points), RunStats())
-    refined, _ = refine(maps.static, beside=Evidence(keyframes=found.keyframes if drive.matched else None))
+    refined, _ = refine(
+        maps.static, beside=Evidence(keyframes=found.keyframes if drive.from_lidar_odometry else None)
+    )
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last
     points = {}
     for seen in labelled_scans(replace(drive, segmenter=None)):
@@ -228,7 +230,7 @@ def on_raw_drive(data: Path) -> Figures:
         ("the unit's own poses", log.reference),
         ("GNSS and IMU alone", estimate_trajectory(log, alone, RunStats())[0]),
     ):
-        drive = Drive(log, trajectory, segmenter, Settings(), matched=name == AS_IT_RUNS)
+        drive = Drive(log, trajectory, segmenter, Settings(), from_lidar_odometry=name == AS_IT_RUNS)
         found, cost = timed_find_moving(drive)
         figures[name] = tracklets.removal(drive, removed_in_all(drive, found), data / RAW_0005) | cost
         figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
@@ -247,7 +249,11 @@ def perfectly_seen(folder: Path) -> Drive:
     log = open_drive(folder)
     segmenter = open_segmenter(f"labels:{folder / 'truth/train_ids'}", URBAN)
     return Drive(
-        log, estimate_trajectory(log, Settings(), RunStats())[0], segmenter, Settings(), matched=True
+        log,
+        estimate_trajectory(log, Settings(), RunStats())[0],
+        segmenter,
+        Settings(),
+        from_lidar_odometry=True,
     )
 
 

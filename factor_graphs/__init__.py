@@ -1,4 +1,4 @@
-"""A GNSS/IMU trajectory from a factor graph, with covariance one can believe.
+"""A GNSS/IMU trajectory from a factor graph, with consistent covariance.
 
 Knows no map and no scans. Read in this order: `measurements` and `geodesy` (what goes in), `smoothing`
 (the graph), `trajectory` (what comes out), `accuracy` (how good it is), `simulation` (exact truth to test

@@ -107,23 +107,7 @@ def pose_problem(
     relative: RelativePoses = NO_RELATIVE_POSES,
 ) -> Problem:
     """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
-    within = inside(fixes, imu)
-    used = within.copy()
-    used[within] = plausible(fixes[within], settings.max_speed_mps)
-    notes = (
-        [f"{np.sum(~within)} of {len(fixes)} fixes outside the IMU's span: not used"]
-        if np.any(~within)
-        else []
-    )
-    if np.any(within & ~used):
-        notes.append(
-            f"{np.sum(within & ~used)} of {len(fixes)} fixes need more than {settings.max_speed_mps:g} m/s: not used"
-        )
-    if used.sum() < 3:
-        raise MeasurementError(
-            f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."
-            f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
-        )
+    used, notes = _usable(fixes, imu, settings.max_speed_mps)
     relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
     relative = relative[relative_used]
     correlation_times_s = correlation_times(fixes[used], settings, relative.stamps)
@@ -153,6 +137,29 @@ def pose_problem(
         guess=guess,
         notes=tuple(notes),
     )
+
+
+def _usable(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[NDArray[np.bool_], list[str]]:
+    """Which fixes (n,) are within the IMU's span and need no impossible speed, and what is to be said of the others.
+
+    Raises MeasurementError below three.
+    """
+    within = inside(fixes, imu)
+    used = within.copy()
+    used[within] = plausible(fixes[within], max_speed_mps)
+    notes = []
+    if np.any(~within):
+        notes.append(f"{np.sum(~within)} of {len(fixes)} fixes outside the IMU's span: not used")
+    if np.any(within & ~used):
+        notes.append(
+            f"{np.sum(within & ~used)} of {len(fixes)} fixes need more than {max_speed_mps:g} m/s: not used"
+        )
+    if used.sum() < 3:
+        raise MeasurementError(
+            f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."
+            f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
+        )
+    return used, notes
 
 
 def motion_graph(problem: Problem, inflation: float) -> gtsam.NonlinearFactorGraph:

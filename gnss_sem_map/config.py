@@ -44,12 +44,12 @@ class Settings(BaseModel):
 
     classes: str = Field("urban", description="Class set of the map: a shipped one, or a YAML file.")
     calibration: Path | None = Field(
-        None, description="File of `gnss-sem-map calibrate`: what the network's answers are worth."
+        None, description="Confusion model of the segmentation network: a file of `gnss-sem-map calibrate`."
     )
     fusion: Literal["evidence", "paper"] = Field(
         "evidence",
-        description="`paper` is eq. 6 alone: observations count in full, without priors; what contradicts it is an"
-        " error.",
+        description="`paper`: evidence by eq. 6, without discount, geometric prior and neighbours; a setting"
+        " that contradicts it is an error. All rules of the paper: examples/paper.yaml.",
     )
     sensors: SensorConventions = Field(
         SensorConventions(),

@@ -1,7 +1,8 @@
-"""The pipeline on one page: from a drive to its trajectory and its semantic map (Fig. 1 of the paper).
+"""The stages of a run: from a drive to its trajectory and its semantic map (Fig. 1 of the paper).
 
     preflight           check the log against physics, and its sensors against each other; a probable mistake stops
     trajectory          smooth GNSS and IMU in batch (or take the poses of the drive), then add LiDAR odometry
+    sharpness           measure the thickness of surfaces under the trajectories
     motion              find the points of moving objects
     mapping             every scan: deskew into the map, label from its image, fuse into the voxels
     refinement          the steps of `refinement.steps`
@@ -35,7 +36,7 @@ from gnss_sem_map.mapping.moving_points import find_moving
 from gnss_sem_map.mapping.surface_heights import measure_surface_heights
 from gnss_sem_map.mapping.trajectory import estimate_trajectory, locate
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.refinement.road_sidewalk import ways
+from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, run_steps
 from gnss_sem_map.refinement.surface_heights import SurfaceHeights
@@ -47,7 +48,7 @@ from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-__all__ = ["Result", "check_drive", "estimate_trajectory", "map_drive", "refine_map", "run"]
+__all__ = ["Result", "check_drive", "estimate_trajectory", "locate", "map_drive", "refine_map", "run"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ def run(
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
         figures = of_drive(log, trajectories, progress=progress)
         sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
-    drive = Drive(log, found.trajectory, segmenter, settings, matched=found.from_lidar_odometry)
+    drive = Drive(log, found.trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     result = map_drive(
         drive, stats, progress, work=work, resume=resume, workers=workers, labels_from=labels_from
     )
@@ -132,7 +133,7 @@ def map_drive(
     raw = SemanticMap.of(maps.static + maps.removed)
     with stats.stage("refinement"):
         progress("refinement", 0, 1)
-        keyframes = found.keyframes if drive.matched else None
+        keyframes = found.keyframes if drive.from_lidar_odometry else None
         heights = _heights(drive, raw.voxels)
         evidence = RunEvidence(maps.removed, drive.moving or {}, keyframes, heights)
         state, report = refine_map(maps.static, evidence, drive.settings)
@@ -143,7 +144,7 @@ def map_drive(
     report = replace(report, tracked=found.objects)
     return Result(
         drive.trajectory, None, raw, refined, report, stats, evidence,
-        from_lidar_odometry=drive.matched, kerbs=state.kerbs,
+        from_lidar_odometry=drive.from_lidar_odometry, kerbs=state.kerbs,
     )  # fmt: skip
 
 
@@ -168,7 +169,7 @@ def _heights(drive: Drive, voxels: VoxelMap) -> SurfaceHeights | None:
     """Heights of surfaces, if a step needs them and the map has labels."""
     steps, label_set = drive.settings.refinement, drive.label_set
     if (
-        ways(label_set) is None
+        road_and_sidewalk(label_set) is None
         or not (steps.levels.enabled or steps.kerbs.enabled)
         or not voxels.observed.any()
     ):

@@ -85,7 +85,7 @@ def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path)
     command = [sys.executable, "-c", WITHOUT_TORCH, "demo", "-o", str(tmp_path / "demo")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert "torch is not installed; pip install 'gnss-sem-map[segmentation]'" in done.stderr
+    assert "torch is not installed; in the clone: pip install -e '.[segmentation]'" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -89,7 +89,10 @@ def calibrate(
 def check(
     drive: Drive,
     out: Annotated[Path, typer.Option("-o", "--out", help="Page to write.")] = Path("check.html"),
-    segmenter: Segmenter = None,
+    segmenter: Annotated[
+        str | None,
+        typer.Option(help="labels:FOLDER: check these class probabilities as well; a network is not run."),
+    ] = None,
     config: Config = None,
     set_: Set = None,
     frames: Frames = None,

@@ -104,12 +104,11 @@ def trajectory(
         stats = RunStats(skips=list(log.skips))
         page = pipeline.check_drive(log, None, settings, stats, force)
         with progress_bars() as progress, stats.stage("trajectory"):
-            estimate, solution = pipeline.estimate_trajectory(log, settings, stats, progress)
-        about = run_folder.write_trajectory_run(out, drive, log, estimate, solution, stats, settings, page)
+            found = pipeline.locate(log, settings, stats, progress, page.solution)
+        about = run_folder.write_trajectory_run(out, drive, log, found, stats, settings, page)
     warn(stats.warnings)
     if as_json:
         typer.echo(json.dumps(about))
     else:
-        typer.echo(
-            f"{log.name}: {len(estimate)} poses over {estimate.end - estimate.start:.1f} s; results in {out}"
-        )
+        poses = found.trajectory
+        typer.echo(f"{log.name}: {len(poses)} poses over {poses.end - poses.start:.1f} s; results in {out}")

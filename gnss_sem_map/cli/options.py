@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     from gnss_sem_map.sensor_log import SensorLog
 
 
-Drive = Annotated[
-    Path, typer.Argument(help="Folder of the drive: KITTI raw, KITTI odometry, or a table log.")
-]
+Drive = Annotated[Path, typer.Argument(help="Folder of the drive: KITTI raw, KITTI odometry, or a CSV log.")]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write; an earlier run there is replaced.")]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file of settings (see `config`).")]
 Set = Annotated[

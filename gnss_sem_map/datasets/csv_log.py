@@ -80,16 +80,16 @@ class LogFile(SensorConventions):
     )
 
 
-FORMAT, SIGNS = "table", "imu.csv and gnss.csv (table log)"
+FORMAT, SIGNS = "table", "imu.csv and gnss.csv (CSV log)"
 
 
 def is_drive(drive: Path) -> bool:
-    """Whether a folder looks like a table log."""
+    """Whether a folder looks like a CSV log."""
     return is_file(drive / "imu.csv") or is_file(drive / "gnss.csv")
 
 
 def read(drive: Path) -> SensorLog:
-    """Open a table log; raises DataError when a table is missing, malformed or empty."""
+    """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
     about = _about(drive / "log.yaml")
     imu_rows = _table(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])

@@ -1,6 +1,6 @@
 """Segments of one scan: candidates for vehicles, found by clustering.
 
-A candidate has points that the image labels as vehicle, or lies outside of the image and has the size of a vehicle.
+A candidate has points that the image labels as movable, or lies outside of the image and has the size of a vehicle.
 Points are grouped into voxels once, and segments are computed from voxels: a scan has ten times as many points.
 """
 
@@ -39,7 +39,7 @@ class PointSets:
     points: NDArray[np.int64]
     """(p,) number of points."""
     labelled: NDArray[np.int64]
-    """(p,) number of points that the image labels as vehicle."""
+    """(p,) number of points that the image labels as movable."""
     sums: NDArray[np.float64]
     """(p, 3) m: sums of the coordinates."""
     lowest: NDArray[np.float64]
@@ -143,7 +143,7 @@ def _enclosing_clusters(low, high):
 def find_segments(p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float) -> Segments:
     """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
-    `is_object` (n,) marks the points that the image labels as vehicle; the other points lie outside of the image. A
+    `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image. A
     vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
     its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
     is a segment. Source: the clustering of section 3.3.2 (Ester et al., 1996), here on single scans.
@@ -203,7 +203,7 @@ def split_segments(
     hits: NDArray[np.int32],
     misses: NDArray[np.int32],
     eps_m: float,
-    least_through_per_hit: float,
+    displaced_misses_per_hit: float,
 ) -> Segments:
     """Split segments that hold both a moving object and something static beside it.
 
@@ -213,7 +213,7 @@ def split_segments(
     segment.
     """
     points, number, count = segments.parts.points, segments.number.copy(), len(segments.truncated)
-    once_empty = misses > least_through_per_hit * hits
+    once_empty = misses > displaced_misses_per_hit * hits
     stood = (hits > 0) & (misses == 0)
     all_of, empty_of, stood_of = (
         np.bincount(number, points * which, count) for which in (np.ones_like(stood), once_empty, stood)
@@ -224,7 +224,7 @@ def split_segments(
         part = np.flatnonzero(number == mixed)
         clusters = _cluster(segments.keys[part], SPLIT_EPS_SHARE * eps_m)
         hit, missed = (np.bincount(clusters, points[part] * counts[part]) for counts in (hits, misses))
-        moved = (missed > least_through_per_hit * hit)[clusters]
+        moved = (missed > displaced_misses_per_hit * hit)[clusters]
         if min(points[part[moved]].sum(), points[part[~moved]].sum()) >= least[mixed]:
             number[part[moved]] = len(truncated)
             truncated = np.append(truncated, truncated[mixed])

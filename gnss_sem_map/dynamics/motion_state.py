@@ -14,7 +14,7 @@ from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
 
 LEAST_TRACKED_POINTS = 5
 """Smaller segments are not tracked; each is classified on its own."""
-SEEN_THROUGH_ALONE = 20
+MISSES_OF_ONE_SEGMENT = 20
 """A segment with more misses than this, and twice as many misses as hits, has moved, whatever its track says."""
 LENGTH_M = 5.0
 """Length of a car."""
@@ -46,19 +46,19 @@ class MotionSettings(BaseModel):
     gate_m: float = Field(
         default=1.5, gt=0, description="Tracking gate: largest distance to the prediction, m."
     )
-    through_per_hit: float = Field(
+    misses_per_hit: float = Field(
         default=1.0,
         gt=0,
         description="An object has moved if its points have more misses per hit than this,",
     )
-    matched_through_per_hit: float = Field(
+    lidar_odometry_misses_per_hit: float = Field(
         default=0.4,
         gt=0,
         description="or than this, if the poses come from LiDAR odometry (they blur static objects less).",
     )
     least_shift_m: float = Field(default=1.5, gt=0, description="Displacement: both ends moved this far, m,")
     least_speed_m_s: float = Field(default=1.0, gt=0, description="and at least this fast, m/s,")
-    least_through_per_hit: float = Field(
+    displaced_misses_per_hit: float = Field(
         default=0.25, ge=0, description="and the points of the track have at least so many misses per hit."
     )
     farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
@@ -97,29 +97,32 @@ def classify_motion(
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
     settings: MotionSettings,
-    matched: bool = False,
+    from_lidar_odometry: bool = False,
 ) -> list[TrackedObject]:
     """Track the segments and give every object its motion state.
 
     `hits` and `misses` (s,) count how often other scans hit the points of a segment and how often they saw through
-    them. `matched`: the poses come from LiDAR odometry. A car ahead that moves by 0.4 of its length while observed
-    has 0.4 misses per hit, by 0.8 of its length 1.0 (measured in the simulated street of the tests). Parked cars reach
-    0.3 misses per hit with poses from LiDAR odometry, and more than 1 without (six simulated drives, KITTI 0005).
+    them. `from_lidar_odometry`: the poses come from LiDAR odometry. A car ahead that moves by 0.4 of its length while
+    observed has 0.4 misses per hit, by 0.8 of its length 1.0 (measured in the simulated street of the tests). Parked
+    cars reach 0.3 misses per hit with poses from LiDAR odometry, and more than 1 without (six simulated drives, KITTI
+    0005).
 
     This takes the place of eq. 13, which calls long and dense clusters of the map moving vehicles.
     """
-    through_per_hit = settings.matched_through_per_hit if matched else settings.through_per_hit
+    misses_per_hit = (
+        settings.lidar_odometry_misses_per_hit if from_lidar_odometry else settings.misses_per_hit
+    )
     large = [n for n, segment in enumerate(segments) if segment.points >= LEAST_TRACKED_POINTS]
     alone = [n for n, segment in enumerate(segments) if segment.points < LEAST_TRACKED_POINTS]
     objects = []
-    mostly_free = (misses > settings.through_per_hit * hits)[large]
+    mostly_free = (misses > settings.misses_per_hit * hits)[large]
     for one in track([segments[n] for n in large], settings.gate_m, mostly_free):
         members = [large[place] for place in one.segments]
         if not any(segments[n].shown for n in members):
             objects += _motion_without_labels(members, segments, hits, misses, settings)
             continue
-        whole = _motion_of_track(members, segments, hits, misses, settings, through_per_hit)
-        gone = [n for n in members if misses[n] > max(2 * hits[n], SEEN_THROUGH_ALONE)]
+        whole = _motion_of_track(members, segments, hits, misses, settings, misses_per_hit)
+        gone = [n for n in members if misses[n] > max(2 * hits[n], MISSES_OF_ONE_SEGMENT)]
         if whole.motion in GONE or not gone:
             objects.append(whole)
             continue
@@ -140,17 +143,17 @@ def _motion_of_track(
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
     settings: MotionSettings,
-    through_per_hit: float,
+    misses_per_hit: float,
 ) -> TrackedObject:
     """Motion state of a track: it was displaced, or its volume was free at other times."""
     hit, missed = float(hits[members].sum()), float(misses[members].sum())
-    vanished = _probability(missed, through_per_hit * hit)
+    vanished = _probability(missed, misses_per_hit * hit)
     moved = displacement_of([segments[n] for n in members])
     displaced = 0.0
     if moved and moved.speed_m_s > settings.least_speed_m_s and moved.shift_m > 0:
         away = _away_from_median(members, segments, settings.least_shift_m)
         # an object that moved less than its length hides the volume where it was: it must be free more often
-        least = settings.least_through_per_hit * max(1.0, LENGTH_M / moved.shift_m)
+        least = settings.displaced_misses_per_hit * max(1.0, LENGTH_M / moved.shift_m)
         if misses[away].sum() > least * hits[away].sum():
             displaced = float(ndtr((moved.shift_m - settings.least_shift_m) / SHIFT_STDDEV_M))
     reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
@@ -181,9 +184,9 @@ def _motion_without_labels(
 ) -> list[TrackedObject]:
     """Motion state of a track without vehicle labels: it must be displaced, and its volume free at other times."""
     away = _away_from_median(members, segments, settings.least_shift_m)
-    if misses[away].sum() <= settings.through_per_hit * hits[away].sum():
+    if misses[away].sum() <= settings.misses_per_hit * hits[away].sum():
         return []
-    whole = _motion_of_track(members, segments, hits, misses, settings, settings.through_per_hit)
+    whole = _motion_of_track(members, segments, hits, misses, settings, settings.misses_per_hit)
     return [whole] if whole.displaced else []
 
 

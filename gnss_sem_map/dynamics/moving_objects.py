@@ -63,9 +63,9 @@ class Observation:
 class MovingObjectDetector:
     """Collects scans in time order. Memory: a few windows of scans, with the range image and some points of each."""
 
-    def __init__(self, settings: MotionSettings | None = None, matched: bool = False) -> None:
-        """`matched`: the poses come from LiDAR odometry, so that static objects are not blurred."""
-        self._settings, self._matched = settings or MotionSettings(), matched
+    def __init__(self, settings: MotionSettings | None = None, from_lidar_odometry: bool = False) -> None:
+        """`from_lidar_odometry`: the poses come from LiDAR odometry, so that static objects are not blurred."""
+        self._settings, self._from_lidar_odometry = settings or MotionSettings(), from_lidar_odometry
         self._observations: list[Observation] = []
         self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
         """Range images and poses of decided scans, which still count as evidence."""
@@ -101,7 +101,11 @@ class MovingObjectDetector:
         counts = self._observations_by_others()
         segments = [
             split_segments(
-                seen.segments, counted[0], counted[1], settings.segment_eps_m, settings.least_through_per_hit
+                seen.segments,
+                counted[0],
+                counted[1],
+                settings.segment_eps_m,
+                settings.displaced_misses_per_hit,
             )
             for seen, counted in zip(self._observations, counts, strict=True)
         ]
@@ -109,7 +113,7 @@ class MovingObjectDetector:
             [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
         )
         listed = _all_segments(self._observations, segments)
-        objects = classify_motion(listed, hits, misses, settings, self._matched)
+        objects = classify_motion(listed, hits, misses, settings, self._from_lidar_odometry)
         gone = np.zeros(len(listed), np.bool_)
         for one in objects:
             gone[list(one.segments)] = one.motion in GONE
@@ -152,7 +156,7 @@ def observe(
     """Segments and range image of one scan, for `MovingObjectDetector.add`.
 
     `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) marks the
-    points that the image labels as vehicle, `is_known` (n,) those with any label.
+    points that the image labels as movable, `is_known` (n,) those with any label.
     """
     T_lidar_map = np.asarray(np.linalg.inv(T_map_lidar), np.float64)
     image = range_images.empty_image()

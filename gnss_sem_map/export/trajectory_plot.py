@@ -83,7 +83,7 @@ def _residuals(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     axes.grid(alpha=0.3)
 
 
-def _stddevs(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+def _stddevs(axes: "Axes", solution: Solution, _fixes: GnssFixes) -> None:
     stddevs = solution.trajectory.position_stddevs
     for name, colour, stddev in zip(AXES, COLOURS, stddevs.T, strict=True):
         axes.plot(solution.trajectory.stamps, stddev, color=colour, linewidth=1, label=name)
@@ -92,7 +92,7 @@ def _stddevs(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     axes.grid(alpha=0.3)
 
 
-def _heading(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
+def _heading(axes: "Axes", solution: Solution, _fixes: GnssFixes) -> None:
     stddev = np.degrees(heading_stddevs(solution.trajectory))
     axes.plot(solution.trajectory.stamps, stddev, color="tab:purple", linewidth=1)
     axes.set(ylabel="heading stddev, °", ylim=(0.0, HEADROOM * stddev.max()))

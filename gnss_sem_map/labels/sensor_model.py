@@ -87,7 +87,7 @@ class LabelCalibration:
     ) -> NDArray[np.float32]:
         """ln P(height, flatness | class) (v, c) nat, for heights (v,) m over ground and flatness (v,), NaN unknown.
 
-        Takes the place of the rules of eq. 8 to 11 where a calibration file is given.
+        Replaces the rules of `refinement.geometric_prior` where a calibration file is given.
         """
         counts = np.stack([drive.cells.reshape(len(self.names), -1) for drive in self.drives])
         logs = np.log(_mean_share(counts, CELL_PSEUDO_COUNTS)).T.astype(np.float32)

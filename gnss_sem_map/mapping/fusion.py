@@ -1,8 +1,8 @@
 """From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
 
-A short drive is mapped in memory. A long one is mapped in independent chunks of scans, one after another or in several
-processes. Each chunk is saved (`checkpoints`): memory does not grow with the drive, and an interrupted run can be
-resumed. Sums are integers, so the result has the same bytes in all cases.
+Without a work folder and with one process, scans are fused in memory. Else they are fused in chunks of scans, which are
+saved (`checkpoints`), so an interrupted run can be resumed. `build_maps` then loads the whole map; the memory of
+`map_chunks` alone does not grow with the drive. Sums are integers, so the result has the same bytes in all cases.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.labelled_scans import Drive, look_at
+from gnss_sem_map.mapping.labelled_scans import Drive, label_each_scan
 from gnss_sem_map.mapping.worker_processes import in_processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
@@ -121,7 +121,7 @@ def fuse_scans(
     """Fuse some scans of a drive: the static points, and the points of moving objects."""
     settings = drive.settings
     static, removed = _table(settings), _table(settings)
-    for done, seen in enumerate(look_at(drive, scans, stats)):
+    for done, seen in enumerate(label_each_scan(drive, scans, stats)):
         if seen is not None:
             keys = seen.keys
             moved = np.zeros(len(keys), np.bool_)

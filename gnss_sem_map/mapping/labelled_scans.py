@@ -49,7 +49,7 @@ class Drive:
     settings: Settings
     moving: Mapping[int, NDArray[np.int64]] | None = None
     """Frame number -> indices of the moving points in what `map_points` returns."""
-    matched: bool = False
+    from_lidar_odometry: bool = False
     """Whether the poses come from LiDAR odometry, so that static objects are not blurred."""
 
     @cached_property
@@ -100,10 +100,10 @@ def labelled_scans(
     `keep_points` computes every `p_map` in the same pass, which takes less time than computing it later.
     """
     stats = stats or RunStats()
-    return (seen for seen in look_at(drive, drive.log.scans, stats, keep_points) if seen is not None)
+    return (seen for seen in label_each_scan(drive, drive.log.scans, stats, keep_points) if seen is not None)
 
 
-def look_at(
+def label_each_scan(
     drive: Drive, scans: Sequence[Scan], stats: RunStats, keep_points: bool = False
 ) -> Iterator[LabelledScan | None]:
     """Every scan, or None for one that cannot be used; the reason is in `stats`."""

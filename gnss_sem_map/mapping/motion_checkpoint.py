@@ -95,7 +95,7 @@ def open_checkpoint(work: Path, drive: Drive, labels_from: str, resume: bool) ->
 def _fingerprint(drive: Drive, labels_from: str) -> str:
     """What two runs share when the search finds the same in both: what decides the map, and the search's settings."""
     of_map = fingerprint(replace(drive, moving=None), labels_from)
-    said = [of_map, drive.settings.dynamics.model_dump_json(), drive.matched]
+    said = [of_map, drive.settings.dynamics.model_dump_json(), drive.from_lidar_odometry]
     return hashlib.sha256(repr(said).encode()).hexdigest()
 
 

@@ -23,7 +23,7 @@ def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
 
     Objects outside of all images are tracked too, but count as moving only if they were displaced.
     """
-    detector = MovingObjectDetector(drive.settings.dynamics, drive.matched)
+    detector = MovingObjectDetector(drive.settings.dynamics, drive.from_lidar_odometry)
     along = KeyframeSelector()
     points: dict[int, NDArray[np.int64]] = {}
     objects: list[TrackedObject] = []

@@ -53,18 +53,18 @@ def locate(
         return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
     found = first if first is not None else smooth_log(log, settings.trajectory)
-    is_matched, without_lidar = False, None
+    from_lidar_odometry, without_lidar = False, None
     if settings.trajectory.lidar_odometry and log.scans:
         matches = match_scans(log, found.trajectory, settings.trajectory.scan_matching, progress)
         stats.counts.update(matches.counts)
         # a scan that cannot be used at all is reported when the map is built
         stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
-        is_matched = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
+        from_lidar_odometry = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
         if len(matches.relative_poses):
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
     stats.warnings.extend(found.notes)
-    return DriveTrajectory(found.trajectory, found, without_lidar, is_matched)
+    return DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
 
 
 def smooth_log(

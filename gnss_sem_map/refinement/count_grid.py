@@ -23,7 +23,7 @@ THREADS = os.cpu_count() or 1
 LEAST_AT_ONCE = 1 << 18
 """Fewer voxels are not worth a thread."""
 LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
-"""A map's own word on its errors is believed within these: to agree with itself is not to be right."""
+"""Limits of the error rate that is estimated from the map: self-agreement is not accuracy."""
 
 OWN_LIMIT_NAT = 1.0
 """A voxel's own evidence counts at most this much: a column may then overrule it."""
@@ -49,7 +49,7 @@ class CountGridSettings(StepSettings):
         default=0.2,
         gt=0,
         lt=0.5,
-        description="Mode `paper`: share of building and vegetation voxels that are labelled wrongly.",
+        description="Method `paper`: share of building and vegetation voxels that are labelled wrongly.",
     )
 
 

@@ -18,7 +18,7 @@ from gnss_sem_map.voxels.voxel_map import softmax
 class DecisionSettings(StepSettings):
     """How sure a map is of its decisions."""
 
-    enabled: Literal[True] = Field(default=True, description="A map without decisions is none.")
+    enabled: Literal[True] = Field(default=True, description="Always on: the map needs one class per voxel.")
     temperature: float = Field(
         default=1.0,
         gt=0,

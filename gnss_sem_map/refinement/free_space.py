@@ -27,10 +27,10 @@ POINTS_PER_MISS = 2.0
 class FreeSpaceSettings(StepSettings):
     """How often a voxel must be traversed before it is removed; keyframe scans are 1 m or 1 s apart."""
 
-    least_through: int = Field(
+    least_misses: int = Field(
         default=6, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
-    through_per_hit: float = Field(default=3.0, gt=0, description="and least ratio of misses to hits.")
+    misses_per_hit: float = Field(default=3.0, gt=0, description="and least ratio of misses to hits.")
     farthest_m: float = Field(
         default=80.0,
         gt=0,
@@ -58,8 +58,8 @@ def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSet
     """
     high = np.flatnonzero(_stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M]))
     hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings.farthest_m)
-    empty = misses >= settings.least_through
-    empty &= misses > settings.through_per_hit * hits
+    empty = misses >= settings.least_misses
+    empty &= misses > settings.misses_per_hit * hits
     empty &= voxels.hits[high] < POINTS_PER_MISS * misses
     cleared = np.zeros(len(voxels), np.bool_)
     cleared[high[empty]] = True

@@ -18,9 +18,9 @@ from gnss_sem_map.refinement.road_sidewalk import (
     RoadEdgeSettings,
     around,
     heights_of,
+    is_road_or_sidewalk,
     meeting,
-    on_ways,
-    ways,
+    road_and_sidewalk,
 )
 from gnss_sem_map.refinement.state import MapState
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -55,10 +55,10 @@ def find_kerbs(
 
     `heights` (v,) m: of every voxel's surface, NaN where unknown.
     """
-    classes = ways(semantic_map.voxels.label_set)
+    classes = road_and_sidewalk(semantic_map.voxels.label_set)
     if classes is None:
         return None
-    labels = np.where(on_ways(semantic_map), semantic_map.labels, UNLABELLED)
+    labels = np.where(is_road_or_sidewalk(semantic_map), semantic_map.labels, UNLABELLED)
     edge = np.flatnonzero(meeting(semantic_map, labels, classes))
     if len(edge) == 0:
         return None

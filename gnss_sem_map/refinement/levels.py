@@ -22,9 +22,9 @@ from gnss_sem_map.refinement.road_sidewalk import (
     RoadEdgeSettings,
     around,
     heights_of,
+    is_road_or_sidewalk,
     meeting,
-    on_ways,
-    ways,
+    road_and_sidewalk,
 )
 from gnss_sem_map.refinement.state import MapState
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -51,7 +51,7 @@ class LevelSettings(RoadEdgeSettings):
 
 
 def reach_m(settings: LevelSettings, voxel_size_m: float) -> float:
-    """In every round of the fit a class hears planes, and a plane the classes of its surroundings."""
+    """Each iteration of the fit spreads information by the radius of one plane fit."""
     return (ROUNDS + 1) * (REACH[0] + 1) * CELL_M
 
 
@@ -69,8 +69,8 @@ def split_levels(
 
     `heights` (v,) m: of every voxel's surface, NaN where unknown. Nothing else changes.
     """
-    classes = ways(semantic_map.voxels.label_set)
-    voxels = np.flatnonzero(on_ways(semantic_map) & np.isfinite(heights))
+    classes = road_and_sidewalk(semantic_map.voxels.label_set)
+    voxels = np.flatnonzero(is_road_or_sidewalk(semantic_map) & np.isfinite(heights))
     if classes is None or len(voxels) == 0:
         return semantic_map
     labels, confidence = semantic_map.labels[voxels], semantic_map.confidence[voxels]
@@ -82,22 +82,22 @@ def split_levels(
         planes = _fit(ground, expit(images + _log_odds(planes, ground, settings)))
     of_height = _log_odds(planes, ground, settings)
     log_odds = images + of_height
-    told = np.where(log_odds > 0, classes[SIDEWALK], classes[ROAD])
+    split = np.where(log_odds > 0, classes[SIDEWALK], classes[ROAD])
     clear = _are_two(planes, settings)[ground.cell] & (of_height != 0)
-    clear &= ~_hold_both(semantic_map, voxels, told, classes)
-    return _decided(semantic_map, voxels[clear], told[clear], log_odds[clear])
+    clear &= ~_hold_both(semantic_map, voxels, split, classes)
+    return _decided(semantic_map, voxels[clear], split[clear], log_odds[clear])
 
 
 def _hold_both(
-    semantic_map: SemanticMap, voxels: NDArray[np.int64], told: NDArray[np.int64], classes: tuple[int, int]
+    semantic_map: SemanticMap, voxels: NDArray[np.int64], split: NDArray[np.int64], classes: tuple[int, int]
 ) -> NDArray[np.bool_]:
-    """Which of the voxels (g,) stand where the two meet, by the images and by what is told as well.
+    """Which of the voxels (g,) stand where the two meet, by the images and by the split as well.
 
-    A kerb goes through those, and they lie on neither level; their points are told apart, see `kerbs`.
+    A kerb goes through those, and they lie on neither level; their points are classified one by one, see `kerbs`.
     """
     before = np.where(semantic_map.shown, semantic_map.labels, UNLABELLED)
     after = before.copy()
-    after[voxels] = told
+    after[voxels] = split
     still = meeting(semantic_map, before, classes) & meeting(semantic_map, after, classes)
     return np.asarray(still[voxels])
 

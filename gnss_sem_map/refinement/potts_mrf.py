@@ -60,7 +60,7 @@ def mean_field(
     temper: float = TEMPER,
     iterations: int = ITERATIONS,
 ) -> Scores:
-    """Log probabilities (v, c) in which every voxel has heard its 26 neighbours.
+    """Log probabilities (v, c) in which every voxel has received messages from its 26 neighbours.
 
     `keys` (v,) sorted packed voxels, `scores` (v, c) log scores; what no camera `observed` (v,) has no say and stays as
     it is. q = softmax(U + coupling * sum of q over the neighbours), U = temper * scores, starting from softmax(U).
@@ -72,16 +72,16 @@ def mean_field(
     own = np.float32(temper) * scores[seen]
     q = softmax(own)
     for _ in range(iterations):
-        heard = np.zeros_like(q)
-        sum_of_neighbours(keys[seen], q, HALF_STENCIL, heard)
-        q = softmax(own + np.float32(coupling_nat) * heard)
+        messages = np.zeros_like(q)
+        sum_of_neighbours(keys[seen], q, HALF_STENCIL, messages)
+        q = softmax(own + np.float32(coupling_nat) * messages)
     result = scores.copy()
     result[seen] = np.log(np.maximum(q, LEAST_PROBABILITY))
     return result
 
 
 @njit(cache=True, nogil=True)
-def sum_of_neighbours(keys, q, stencil, heard):
+def sum_of_neighbours(keys, q, stencil, messages):
     """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""
     for offset in stencil:
         j = 0
@@ -91,5 +91,5 @@ def sum_of_neighbours(keys, q, stencil, heard):
                 j += 1
             if keys[j] == wanted:
                 for c in range(q.shape[1]):
-                    heard[i, c] += q[j, c]
-                    heard[j, c] += q[i, c]
+                    messages[i, c] += q[j, c]
+                    messages[j, c] += q[i, c]

@@ -16,7 +16,7 @@ from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 ROAD, SIDEWALK = 0, 1
-"""Which of the two `ways` is which."""
+"""Which of the two `road_and_sidewalk` is which."""
 
 
 class RoadEdgeSettings(StepSettings):
@@ -25,19 +25,19 @@ class RoadEdgeSettings(StepSettings):
     least_m: float = Field(
         default=0.06,
         gt=0,
-        description="What is lower is no step: the images are all that is known there.",
+        description="Least height of the step from road to sidewalk, m; below it only the images decide.",
     )
 
 
-def ways(label_set: LabelSet) -> tuple[int, int] | None:
+def road_and_sidewalk(label_set: LabelSet) -> tuple[int, int] | None:
     """Class indices of road and sidewalk; None for a class set that lacks one."""
     names = label_set.names
     return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
 
 
-def on_ways(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Which voxels (v,) are shown as road or sidewalk; none where either is missing: nothing is to be told apart."""
-    classes = ways(semantic_map.voxels.label_set)
+def is_road_or_sidewalk(semantic_map: SemanticMap) -> NDArray[np.bool_]:
+    """Which voxels (v,) are shown as road or sidewalk; none where either is missing: there is nothing to split."""
+    classes = road_and_sidewalk(semantic_map.voxels.label_set)
     shown = np.where(semantic_map.shown, semantic_map.labels, UNLABELLED)
     if classes is None or not all((shown == one).any() for one in classes):
         return np.zeros(len(shown), np.bool_)
@@ -49,7 +49,7 @@ def heights_of(state: MapState) -> NDArray[np.float64]:
     heights = state.beside.surface_heights
     if heights is None:
         raise NotApplicable("heights of surfaces were not measured")
-    if state.decided is None or not on_ways(state.decided).any():
+    if state.decided is None or not is_road_or_sidewalk(state.decided).any():
         raise NotApplicable("the map has no road, or no sidewalk")
     return heights.of(state.decided.voxels)
 

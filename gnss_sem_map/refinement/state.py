@@ -23,8 +23,8 @@ from gnss_sem_map.voxels.voxel_map import VoxelMap
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""
 
-NAT_PER_LOOK = 1.3
-"""Between a look that says nothing (1) and one that is sure (1.6 for five classes and a floor of 5 %)."""
+NAT_PER_OBSERVATION = 1.3
+"""Between an uninformative observation (1) and a certain one (1.6 for five classes and a floor of 5 %)."""
 WHOLE_MAP = float("inf")
 """The reach of a step that reads the whole map."""
 
@@ -125,7 +125,9 @@ class MapState:
         """
         count = len(self.voxels.label_set.names)
         nats = -self.voxels.evidence.sum(axis=1, dtype=np.float32) / np.float32(UNITS_PER_NAT)
-        return np.asarray(np.maximum(nats / np.float32(NAT_PER_LOOK * count * np.log(count)), 1), np.float32)
+        return np.asarray(
+            np.maximum(nats / np.float32(NAT_PER_OBSERVATION * count * np.log(count)), 1), np.float32
+        )
 
 
 def classes_of(label_set: LabelSet, *names: str) -> tuple[int, ...]:

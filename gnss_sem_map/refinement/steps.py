@@ -92,7 +92,7 @@ class RefinementSettings(BaseModel):
     )
     kerbs: KerbSettings = Field(
         default=KerbSettings(),
-        description="Points where road meets sidewalk go by their own place and height, in `labels/`.",
+        description="Points where road meets sidewalk are classified by their own position and height, in `labels/`.",
     )
 
 

@@ -39,16 +39,16 @@ def infer(
 ) -> tuple[Scores, NDArray[np.bool_]]:
     """Log scores (v, c) in which voxels without an observation repeat what their 26 neighbours say, and which (v,) do.
 
-    A voxel hears observed ones first and only then inferred ones.
+    Messages come from observed neighbours first, then from inferred ones.
     """
     scores, known = scores.copy(), observed.copy()
     for _ in range(settings.iterations):
         q = np.where(known[:, None], softmax(scores), np.float32(0))
-        heard = np.zeros_like(q)
-        sum_of_neighbours(keys, q, HALF_STENCIL, heard)
-        reached = ~known & heard.any(axis=1)
+        messages = np.zeros_like(q)
+        sum_of_neighbours(keys, q, HALF_STENCIL, messages)
+        reached = ~known & messages.any(axis=1)
         if not reached.any():
             break
-        scores[reached] = np.float32(COUPLING_NAT) * heard[reached]
+        scores[reached] = np.float32(COUPLING_NAT) * messages[reached]
         known |= reached
     return scores, known & ~observed

@@ -52,10 +52,10 @@ class VehicleSettings(StepSettings):
         default=0.3, ge=0, le=1, description="A vehicle stands with more than this share over road."
     )
     largest_parked_voxels: int = Field(
-        default=1500, ge=1, description="Mode `paper`: a group of this many voxels moved (eta_D of eq. 13)."
+        default=1500, ge=1, description="Method `paper`: a group of this many voxels moved (eta_D of eq. 13)."
     )
     longest_parked_m: float = Field(
-        default=6.0, gt=0, description="Mode `paper`: a group this long moved, m (eta_L of eq. 13)."
+        default=6.0, gt=0, description="Method `paper`: a group this long moved, m (eta_L of eq. 13)."
     )
 
 

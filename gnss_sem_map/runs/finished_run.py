@@ -179,8 +179,8 @@ class Run:
         self._refuse_merged("relabelling")
         log, settings = self.drive(), self.settings
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
-        is_sharp = bool(self.about.get("from_lidar_odometry"))
-        drive = Drive(log, self.trajectory, network, settings, matched=is_sharp)
+        is_from_lidar = bool(self.about.get("from_lidar_odometry"))
+        drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
         result = pipeline.map_drive(drive, RunStats(), progress, labels_from=segmenter)
         inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
@@ -267,5 +267,6 @@ def _check_same_map(before: Settings, after: Settings) -> None:
         return
     differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
     raise ConfigError(
-        f"refine: {', '.join(differ)} differ from those of the run, and only refinement can; run the drive again"
+        f"refine: {', '.join(differ)} differ from those of the run; refine changes only refinement settings:"
+        " run the drive again"
     )

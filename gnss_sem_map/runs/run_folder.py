@@ -30,6 +30,7 @@ from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import label_points
+from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.pipeline import Result
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import RunStats
@@ -77,7 +78,7 @@ def write_run(
     segmenter: str | None = None,
     frames: str | None = None,
 ) -> dict[str, Any]:
-    """Write everything that a run made (design: the run folder); returns the content of run.json."""
+    """Write everything that a run made; returns the content of run.json."""
     inputs = {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
     with claimed_run(out, [drive]), new_folder(out) as folder:
         with result.stats.stage("export"):
@@ -139,7 +140,7 @@ def write_again(
             "map": about_map(result),
         }
         if tracked is not None:
-            about["map"]["refinement"] |= {name: tracked[name] for name in ("tracked", "specks")}
+            about["map"]["refinement"] |= {name: tracked[name] for name in ("tracked", "untracked_segments")}
         write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
     return about
 
@@ -180,19 +181,18 @@ def write_trajectory_run(
     out: Path,
     drive: Path,
     log: SensorLog,
-    trajectory: Trajectory,
-    solution: Solution | None,
+    found: DriveTrajectory,
     stats: RunStats,
     settings: Settings,
     page: Preflight,
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        _write_trajectory(folder, log, trajectory, solution)
+        _write_trajectory(folder, log, found.trajectory, found.solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, stats) | {
             "preflight": page.as_dict(),
-            "trajectory": _about_solution(solution),
+            "trajectory": _about_solution(found.solution),
         }
         _write_json(folder / "run.json", about)
     return about
@@ -322,7 +322,7 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
             }
             for thing in followed
         ],
-        "specks": len(report.tracked) - len(followed),
+        "untracked_segments": len(report.tracked) - len(followed),
     }
 
 

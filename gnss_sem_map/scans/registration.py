@@ -60,7 +60,7 @@ def close_open_directions(
     covariance = (axes * variances) @ axes.T / np.outer(scale, scale)
     if is_open.any():
         held = axes[:, ~is_open]
-        T = guess @ _exp(held @ (held.T @ (scale * _log(inverse(guess) @ T))) / scale)
+        T = guess @ exp(held @ (held.T @ (scale * _log(inverse(guess) @ T))) / scale)
     return T, covariance, bool(is_open.any())
 
 
@@ -101,7 +101,8 @@ def _log(T: Array) -> Array:
     return np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
 
 
-def _exp(x: Array) -> Array:
+def exp(x: Array) -> Array:
+    """T (4, 4) of a rotation vector and a translation (6,), which are not coupled."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix()
     T[:3, 3] = x[3:]

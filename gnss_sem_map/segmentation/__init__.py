@@ -152,7 +152,7 @@ def _needs(extra: str, spec: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"segmenter {spec!r}: {error.name} is not installed; pip install 'gnss-sem-map[{extra}]'"
+            f"segmenter {spec!r}: {error.name} is not installed; in the clone: pip install -e '.[{extra}]'"
         ) from None
 
 

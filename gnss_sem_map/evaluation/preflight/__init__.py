@@ -1,7 +1,8 @@
 """Pre-flight check: a log is tested against physics, and its sensors against each other, before any work.
 
-`check` runs every check of this folder on a small sample of the drive. Every wrong sensor convention that we know makes
-one of them amber or red, and the finding names the probable mistake and the line that mends it.
+`check` runs every check of this folder on a small sample of the drive. A known wrong sensor
+convention makes a check amber or red if the drive shows it; the finding names the probable mistake and the setting that
+corrects it.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ def check(
     """
     start = time.perf_counter()
     sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
-    rooms = (inertial, positions, sweeps, *((camera,) if with_camera else ()))
+    groups = (inertial, positions, sweeps, *((camera,) if with_camera else ()))
     _ = sample.trajectory  # most checks need it: known before they run side by side
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda room: tuple(room.check(sample)), rooms))
+        found = list(pool.map(lambda group: tuple(group.check(sample)), groups))
     findings = tuple(finding for some in found for finding in some)
     return Preflight(findings, time.perf_counter() - start, sample.whole_solution)

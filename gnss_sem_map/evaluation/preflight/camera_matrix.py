@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.sensor_log import Calibration
 
+Array = NDArray[np.float64]
 NAME = "K"
 SAME_FOCAL = 0.1
 """Pixels are square to a few percent: fx and fy differ by no more than this part."""
@@ -19,8 +21,12 @@ VIEW_DEG = (15.0, 150.0)
 
 def check(calibration: Calibration, size: tuple[int, int]) -> Finding:
     """Figures of K, for images of (width, height)."""
-    K = calibration.K
-    assert K is not None
+    assert calibration.K is not None
+    return _form(calibration.K) or _of_images(calibration.K, size)
+
+
+def _form(K: Array) -> Finding | None:
+    """What is wrong with K as a camera matrix, whatever the images; None if nothing is."""
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if not np.allclose(K[2], (0, 0, 1), atol=1e-6) or abs(K[1, 0]) > MOST_SKEW * fx:
         return red(
@@ -43,6 +49,12 @@ def check(calibration: Calibration, size: tuple[int, int]) -> Finding:
             "fx and fy of K differ: pixels are square",
             "check fx and fy of K",
         )
+    return None
+
+
+def _of_images(K: Array, size: tuple[int, int]) -> Finding:
+    """Whether focal length and principal point are those of images of (width, height)."""
+    fx = float(K[0, 0])
     centre = np.array([K[0, 2] / size[0], K[1, 2] / size[1]])
     view = float(np.degrees(2 * np.arctan(size[0] / (2 * fx))))
     found = (

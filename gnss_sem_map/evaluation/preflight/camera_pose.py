@@ -202,7 +202,7 @@ def _pose(sample: Sample, edges: Edges) -> Finding:
                 NAME,
                 f"{found}; {elsewhere[1].agreement:.2f} times if so",
                 f"T_camera_lidar is {elsewhere[0]}",
-                "mend T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
+                "correct T_camera_lidar (KITTI: calib_velo_to_cam.txt)",
             )
     if is_better and abs(best.value) > best.family.same:
         if best.sigmas > SURE:

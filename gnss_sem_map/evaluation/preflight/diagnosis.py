@@ -44,7 +44,7 @@ class Diagnosis:
     rate: Array
     """(3, 3), the same of the angular rate."""
     imu: ImuSamples
-    """What was looked at, mended."""
+    """What was looked at, corrected."""
     track: Track | None
     lag: Lag
     mirrored: bool
@@ -55,7 +55,7 @@ class Diagnosis:
         """Whether axes and units are as they should be."""
         return bool((self.force == np.eye(3)).all() and (self.rate == np.eye(3)).all())
 
-    def mended(self, imu: ImuSamples) -> ImuSamples:
+    def corrected(self, imu: ImuSamples) -> ImuSamples:
         """Samples of the same IMU in our axes and units; the very same where it is right."""
         if self.is_right:
             return imu

@@ -273,7 +273,7 @@ def _rotation_finding(
     remedy = (
         "check Tr in calib.txt, and that poses.txt is of this sequence and in the camera frame"
         if is_given
-        else "mend T_imu_lidar (KITTI: R of calib_imu_to_velo.txt, which is its inverse)"
+        else "correct T_imu_lidar (KITTI: R of calib_imu_to_velo.txt, which is its inverse)"
     )
     if given_inverse < np.radians(5.0) and angle > np.radians(15.0):
         return level(NAME, found, f"{matrix} is inverted: it is turned the wrong way round", remedy)

@@ -71,7 +71,7 @@ class PreflightError(DataError):
     def __init__(self, name: str, page: Preflight) -> None:
         red = page.of(Level.RED)
         more = f" (and {len(red) - 1} more, see `gnss-sem-map check`)" if len(red) > 1 else ""
-        super().__init__(f"{name}: the pre-flight is red: {red[0]}{more}; mend it, or run with --force")
+        super().__init__(f"{name}: the pre-flight is red: {red[0]}{more}; correct it, or run with --force")
         self.page = page
 
 

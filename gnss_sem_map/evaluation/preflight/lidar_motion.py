@@ -15,7 +15,7 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.scans.registration import inverse
+from gnss_sem_map.scans.registration import exp, inverse
 from gnss_sem_map.sensor_log import Points, Scan
 from gnss_sem_map.voxels.hash_unique import distinct
 from gnss_sem_map.voxels.kernels import pack_keys
@@ -147,7 +147,7 @@ class Target:
             J = np.hstack([np.cross(at, n), n])
             weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(residuals), 1e-9))[:, None]
             # a little weight on the guess: along an open street nothing holds, and nothing may run away
-            T = _exp(-np.linalg.solve(J.T @ weighted + 0.1 * np.eye(6), weighted.T @ residuals)) @ T
+            T = exp(-np.linalg.solve(J.T @ weighted + 0.1 * np.eye(6), weighted.T @ residuals)) @ T
             H = J.T @ weighted
             along = H[3:, 3:] - H[3:, :3] @ np.linalg.lstsq(H[:3, :3], H[:3, 3:], rcond=None)[0]
             held = float(np.linalg.eigvalsh(along)[0] / len(use))
@@ -175,7 +175,7 @@ def stretch(scans: tuple[Scan, ...], first: int, starts: tuple[Array, ...] = ())
             tried = [target.match(sweeps[k].p_lidar, guess, FIRST_M) for guess in (np.eye(4), *starts)]
             found = min((t for t in tried if t is not None), key=lambda t: t.off, default=None)
         else:
-            found = target.match(sweeps[k].p_lidar, T[-1] @ _exp(np.concatenate(rates) * step_s), NEXT_M)
+            found = target.match(sweeps[k].p_lidar, T[-1] @ exp(np.concatenate(rates) * step_s), NEXT_M)
         if found is None or found.share < LEAST_SHARE:
             return None
         rates = _rates(inverse(T[-1]) @ found.T, step_s)
@@ -247,10 +247,3 @@ def _moved(p: Array, after_s: Array, rates: Rates) -> Array:
 
 def _rates(T: Array, seconds: float) -> Rates:
     return Rotation.from_matrix(T[:3, :3]).as_rotvec() / seconds, T[:3, 3] / seconds
-
-
-def _exp(x: Array) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(x[:3]).as_matrix()
-    T[:3, 3] = x[3:]
-    return T

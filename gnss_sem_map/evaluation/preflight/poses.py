@@ -56,7 +56,7 @@ def _jumps(given: Trajectory, steps: Array, durations: Array) -> Finding:
             "Poses",
             f"{evidence}: a step of {sizes[worst]:.1f} m at {given.stamps[worst + 1]:.2f} s (pose {worst + 1})",
             "the poses jump: a damaged row, or two drives in one file",
-            "mend or drop the poses after the jump (poses.txt)",
+            "correct or drop the poses after the jump (poses.txt)",
         )
     if np.any(change > allowed):
         k = int(np.argmax(change - allowed)) + 1
@@ -64,7 +64,7 @@ def _jumps(given: Trajectory, steps: Array, durations: Array) -> Finding:
             "Poses",
             f"{evidence}; at {given.stamps[k]:.2f} s (pose {k}) the velocity changes by {change[k - 1]:.1f} m/s",
             "the poses jump there",
-            "mend the poses around it (poses.txt)",
+            "correct the poses around it (poses.txt)",
         )
     return green("Poses", evidence)
 
@@ -79,7 +79,7 @@ def _turns(given: Trajectory, durations: Array) -> Finding:
             "Pose turns",
             f"{evidence} at {given.stamps[worst + 1]:.2f} s (pose {worst + 1})",
             "the rotations jump: a damaged row, or rows that are not rotations",
-            "mend these poses (poses.txt)",
+            "correct these poses (poses.txt)",
         )
     return green("Pose turns", evidence)
 

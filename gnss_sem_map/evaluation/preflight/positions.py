@@ -16,6 +16,7 @@ from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, re
 from gnss_sem_map.evaluation.preflight.fixes import Fixes
 from gnss_sem_map.evaluation.preflight.lever_arm import check_lever_arm
 from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.evaluation.preflight.track import scatter_of
 from gnss_sem_map.sensor_log import SensorLog
 
 Array = NDArray[np.float64]
@@ -30,7 +31,6 @@ NOTABLE_SHARE = 0.05
 BEST_RECEIVER_M = 0.008
 # Heights of a road change slowly: a scatter of so many claimed deviations, and this much, m, is the fixes' own.
 SCATTER_RATIO, SCATTER_M = 5.0, 0.1
-THIRD_DIFFERENCE, MAD = np.sqrt(20.0), 1.4826
 # A lag is told of from the first, s, and makes a wrong map when it moves the vehicle by the second, m.
 NOTABLE_LAG_S, WRONG_LAG_M = 0.25, 2.0
 # What stops a run is surer than what is told: twice the logarithm of the likelihood.
@@ -142,7 +142,10 @@ def _accuracy(log: SensorLog, fixes: GnssFixes) -> Finding:
             "standard deviations are too small: variances, or another unit",
             "give standard deviations in metres, or set trajectory.min_fix_stddev_m",
         )
-    scatter, claimed = _height_scatter(fixes), float(np.median(fixes.stddevs[:, 2])) if len(fixes) else np.inf
+    scatter, claimed = (
+        scatter_of(fixes.positions[:, 2]),
+        float(np.median(fixes.stddevs[:, 2])) if len(fixes) else np.inf,
+    )
     evidence += f", and their heights scatter by {scatter:.2g} of {claimed:.2g} m claimed"
     if scatter > max(SCATTER_RATIO * claimed, SCATTER_M):
         return amber(
@@ -156,11 +159,6 @@ def _accuracy(log: SensorLog, fixes: GnssFixes) -> Finding:
 
 def _is_of_accuracy(reason: str) -> bool:
     return any(word in reason for word in ("accuracy", "stddev", "standard deviation", "std_"))
-
-
-def _height_scatter(fixes: GnssFixes) -> float:
-    third = np.diff(fixes.positions[:, 2], n=3)
-    return float(MAD * np.median(np.abs(third)) / THIRD_DIFFERENCE) if len(third) else 0.0
 
 
 def _clock(diagnosis: Diagnosis) -> Finding:

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from factor_graphs.measurements import ImuSamples
 from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral
-from gnss_sem_map.evaluation.preflight.track import Track
+from gnss_sem_map.evaluation.preflight.track import MAD, Track
 
 Array = NDArray[np.float64]
 
 # Speed changes and bends are looked at over this long, s: brakes and bends last longer, steps and bumps do not.
 LEAST_SPAN_S = 1.0
-MAD = 1.4826
 # A median of n values is so much less sure than their mean.
 MEDIAN_LOSS = 1.2533
 LEAST_INTERVALS = 4
@@ -33,8 +32,6 @@ class TurnGain:
     stddev: float
     misfit: float
     """Mean absolute difference between the turns, rad."""
-    turned_rad: float
-    """By how much the course turned in all, left and right."""
     intervals: int
     """Independent ones."""
 
@@ -83,7 +80,6 @@ def turn_gain(
         gain,
         stddev,
         float(misfit.mean()),
-        float(np.abs(by_course).sum() / overlap),
         int(len(first) / overlap),
     )
 

@@ -80,7 +80,7 @@ class Sample:
 
     @property
     def whole_solution(self) -> Solution | None:
-        """The drive smoothed as a run smooths it first; None where only a stretch was, or what was mended."""
+        """The drive smoothed as a run smooths it first; None where only a stretch was, or what was corrected."""
         is_as_logged = self.diagnosis is None or self.diagnosis.is_right
         return self._solution if is_as_logged and self._is_short else None
 
@@ -90,7 +90,7 @@ class Sample:
         if log.given is not None or log.imu is None or log.gnss is None:
             return None
         if self.diagnosis is not None:
-            log = replace(log, imu=self.diagnosis.mended(log.imu))
+            log = replace(log, imu=self.diagnosis.corrected(log.imu))
         try:
             return smooth_log(log if self._is_short else _stretch_of(log), self.settings.trajectory)
         except FactorGraphError:

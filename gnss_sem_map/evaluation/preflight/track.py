@@ -31,8 +31,6 @@ class Track:
     velocities: Array
     stddev_mps: float
     width_s: float
-    scatter_m: float
-    """White noise of the fixes, from their own third differences, horizontally and per axis."""
 
     @property
     def speeds(self) -> Array:
@@ -53,7 +51,7 @@ class Track:
 def track_of(fixes: GnssFixes) -> Track:
     """The track of at least four fixes; empty when gaps leave nothing."""
     step = float(np.median(np.diff(fixes.stamps)))
-    scatter = scatter_of(fixes)
+    scatter = scatter_of(fixes.positions[:, :2])
     for width in WIDTHS_S:
         count = max(3, 2 * round(width / step / 2) + 1)
         span = (count - 1) * step
@@ -62,12 +60,12 @@ def track_of(fixes: GnssFixes) -> Track:
             break
     every = max(1, count // KNOTS_PER_LINE)
     stamps, velocities = (a[::every] for a in _slopes(fixes, min(count, len(fixes)), 1.5 * span))
-    return Track(stamps, velocities, float(stddev), float(span), scatter)
+    return Track(stamps, velocities, float(stddev), float(span))
 
 
-def scatter_of(fixes: GnssFixes) -> float:
-    """White noise of the fixes, m per horizontal axis; what a vehicle does from fix to fix counts with it."""
-    third = np.diff(fixes.positions[:, :2], n=3, axis=0)
+def scatter_of(positions: Array) -> float:
+    """White noise of positions (n,) or (n, k), m per axis; motion between neighbours counts with it."""
+    third = np.diff(positions, n=3, axis=0)
     return float(MAD * np.median(np.abs(third)) / THIRD_DIFFERENCE) if len(third) else 0.0
 
 

@@ -55,7 +55,7 @@ def rates_of_a_vehicle(stamps: Array, force: Array, rate: Array) -> Finding:
 
 
 def in_degrees() -> tuple[str, str]:
-    """The usual mistake, and what mends it."""
+    """The usual mistake, and what corrects it."""
     return "the gyroscope is in deg/s", "set rate_unit: deg/s"
 
 

@@ -190,7 +190,7 @@ def test_the_search_of_another_run_is_not_used(drive: Drive, tmp_path: Path) -> 
     poses = drive.trajectory.T_map_imu.copy()
     poses[0, 0, 3] += 1e-9
     others = [
-        replace(drive, matched=True),
+        replace(drive, from_lidar_odometry=True),
         replace(drive, trajectory=replace(drive.trajectory, T_map_imu=poses)),
         replace(drive, log=replace(drive.log, scans=drive.log.scans[1:])),
         with_settings(drive, dynamics={"gate_m": 1.4}),

@@ -81,7 +81,7 @@ def test_what_was_hit_often_stays_whoever_looks_through() -> None:
 
 def test_too_few_witnesses_clear_nothing_and_nothing_low_is_cleared(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = street_map(GHOST)
-    assert not cleared(voxels, FreeSpaceSettings(least_through=len(STREET) + 1)).any()
+    assert not cleared(voxels, FreeSpaceSettings(least_misses=len(STREET) + 1)).any()
     monkeypatch.setattr(free_space, "OVER_M", (1.6, 3.0))
     assert not cleared(voxels).any()
 

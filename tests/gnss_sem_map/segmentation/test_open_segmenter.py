@@ -43,7 +43,7 @@ def test_nothing_heavy_is_imported_before_it_is_needed_and_a_missing_extra_is_na
 ) -> None:
     code = WITHOUT.format(spec=spec, absent=absent)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert f"{absent[0]} is not installed; pip install 'gnss-sem-map[{extra}]'" in done.stdout
+    assert f"{absent[0]} is not installed; in the clone: pip install -e '.[{extra}]'" in done.stdout
 
 
 def test_an_unknown_kind_is_answered_with_all_there_are() -> None:

@@ -68,16 +68,16 @@ CASES: dict[str, tuple[Array, Array, str, SensorConventions]] = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_wrong_convention_is_named_and_its_setting_mends_it(name: str, right: SensorLog) -> None:
-    force, rate, says, mend = CASES[name]
+    force, rate, says, correction = CASES[name]
     broken = reporting(right, force, rate)
     found = findings(broken)
     assert any(says in str(f).replace('"', "") for f in found if f.level is Level.RED), found
-    assert wrong(findings(broken, mend)) == []
-    mended = broken.in_our_conventions(mend).imu
-    assert mended is not None
+    assert wrong(findings(broken, correction)) == []
+    corrected = broken.in_our_conventions(correction).imu
+    assert corrected is not None
     assert right.imu is not None
-    np.testing.assert_allclose(mended.specific_force, right.imu.specific_force, atol=1e-12)
-    np.testing.assert_allclose(mended.angular_rate, right.imu.angular_rate, atol=1e-12)
+    np.testing.assert_allclose(corrected.specific_force, right.imu.specific_force, atol=1e-12)
+    np.testing.assert_allclose(corrected.angular_rate, right.imu.angular_rate, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_a_unit_that_is_mounted_askew_is_found_with_its_angles(
     assert len(said) == 1
     told = [float(word) for word in said[0].remedy.split("[")[1].rstrip("]").split(",")]
     np.testing.assert_allclose(told, angles, atol=4.0)
-    mended = SensorConventions(imu_rotation_deg=(told[0], told[1], told[2]))
-    assert wrong(findings(askew, mended)) == []
+    corrected = SensorConventions(imu_rotation_deg=(told[0], told[1], told[2]))
+    assert wrong(findings(askew, corrected)) == []
 
 
 def test_two_mistakes_are_named_together(right: SensorLog) -> None:
@@ -102,8 +102,8 @@ def test_two_mistakes_are_named_together(right: SensorLog) -> None:
     broken = reporting(right, frd / 9.80665, np.degrees(frd))
     said = " ".join(wrong(findings(broken)))
     assert all(words in said for words in ("force_unit: g", "rate_unit: deg/s", "imu_axes: frd"))
-    mend = SensorConventions(imu_axes="frd", force_unit="g", rate_unit="deg/s")
-    assert wrong(findings(broken, mend)) == []
+    correction = SensorConventions(imu_axes="frd", force_unit="g", rate_unit="deg/s")
+    assert wrong(findings(broken, correction)) == []
 
 
 def test_ten_samples_a_second_are_told_of_and_no_fault(right: SensorLog) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Literal
 
@@ -14,7 +15,6 @@ from pydantic import Field
 from scipy.special import gammaln
 
 from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings, classes_of
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
@@ -95,8 +95,8 @@ def count_grid(
             keys[part], labels.view(np.uint8)[part], pairs[0], cell_voxels, layer_voxels, reach_layers, pairs[1][part]
         )  # fmt: skip
 
-    for _ in prefetch(count, _slabs(keys, cell_voxels), THREADS):
-        pass
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(count, _slabs(keys, cell_voxels)))  # a list: raises what a slab raised
     return counts
 
 

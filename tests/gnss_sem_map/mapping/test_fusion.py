@@ -16,6 +16,7 @@ import numpy as np
 import numpy_chain
 import pytest
 import street
+from damage import flipped, halved
 from numpy.typing import NDArray
 from street import Street
 
@@ -289,16 +290,6 @@ def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> Non
     with pytest.raises(DataError, match="holds no interrupted run"):
         build_maps(drive, RunStats(), work=tmp_path / "mine")
     assert (tmp_path / "mine/thesis.txt").exists()
-
-
-def flipped(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
-def halved(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def doubled(path: Path) -> None:

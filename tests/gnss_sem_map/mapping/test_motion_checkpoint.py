@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damage import flipped, halved
 from street import Street
 
 from gnss_sem_map import Settings, run
@@ -102,16 +103,6 @@ def test_without_resume_it_searches_again(small_drive: Street, tmp_path: Path) -
     stages = Stages()
     run_street(small_drive, tmp_path / "out", stages)
     assert "motion" in stages.seen
-
-
-def flipped(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
-def halved(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 @pytest.mark.integration

@@ -12,6 +12,7 @@ from street import Street
 
 from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.runs.merged_run import merge_run_folders
 
@@ -156,3 +157,10 @@ def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, sm
         _ = merged.trajectory
     with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for relabelling"):
         merged.relabel(f"labels:{small_drive.labels}")
+
+
+def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run) -> None:
+    log, maps = finished.drive(), [finished.map(refined=False), finished.map()]
+    moving = {log.scans[0].number: np.array([10**6])}
+    with pytest.raises(DataError, match="make the run again"):
+        list(label_points(log, finished.trajectory, maps, finished.settings, moving))

@@ -16,7 +16,7 @@ from gnss_sem_map.export.report import write_report
 from gnss_sem_map.files.output_folder import claimed, new_folder, real_path
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.run_stats import Progress, RunStats, silent
-from gnss_sem_map.runs.finished_run import run_log
+from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.run_folder import claimed_run
 from gnss_sem_map.segmentation import DEMO_CALIBRATION, open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
@@ -79,8 +79,7 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
                 )
 
     drive, spec = world / drive.relative_to(folder), f"labels:{world / PROBABILITIES}"
-    log = open_drive(drive)
-    about = run_log(log, drive, out, spec, settings, write_labels=True, progress=progress).about
+    about = finished_run.run(drive, out, spec, settings, write_labels=True, progress=progress).about
     metrics = score_run(out, drive / "truth")
     write_report(out, about, metrics)
     return Demo(

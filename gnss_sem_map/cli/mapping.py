@@ -43,7 +43,7 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Make trajectory, semantic map, refined map and all exports of one drive."""
-    from gnss_sem_map.runs.finished_run import run_log
+    from gnss_sem_map.runs import finished_run
     from gnss_sem_map.runs.run_folder import claimed_run, places_read
     from gnss_sem_map.segmentation import no_segmenter_message
 
@@ -54,9 +54,9 @@ def run(
             typer.echo(no_segmenter_message(str(drive)), err=True)
             raise typer.Exit(1)
         with progress_bars() as progress:
-            finished = run_log(
-                log, drive, out, segmenter, settings,
-                frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
+            finished = finished_run.run(
+                drive, out, segmenter, settings,
+                log=log, frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
                 force=force, progress=progress,
             )  # fmt: skip
     about = finished.about

@@ -39,9 +39,10 @@ __all__ = ["Run", "Settings", "open_drive", "run"]
 def run(
     drive: Path | str,
     out: Path | str,
-    segmenter: str = "none",
+    segmenter: str | None = "none",
     settings: Settings | None = None,
     *,
+    log: SensorLog | None = None,
     frames: str | None = None,
     drive_format: str | None = None,
     device: str = "auto",
@@ -53,36 +54,13 @@ def run(
 ) -> Run:
     """Map one drive into a run folder, as `gnss-sem-map run` does.
 
-    `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only; `frames` is `A:B`. Raises
-    PreflightError where the drive looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
+    `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only; `frames` is `A:B`; `log` is what
+    these open, if it is open already. Raises PreflightError where the drive looks wrong (see `force`), DataError,
+    ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
-    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)):
-        log = open_drive(drive, drive_format).between(frames)
-        return run_log(
-            log, drive, out, segmenter, settings,
-            frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
-            force=force, progress=progress,
-        )  # fmt: skip
-
-
-def run_log(
-    log: SensorLog,
-    drive: Path,
-    out: Path,
-    segmenter: str | None,
-    settings: Settings,
-    *,
-    frames: str | None = None,
-    device: str = "auto",
-    workers: int = 1,
-    resume: bool = False,
-    write_labels: bool = False,
-    force: bool = False,
-    progress: Progress = silent,
-) -> Run:
-    """Map a drive that is open already; `log` was opened from `drive` and `frames`. See `run`."""
     with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
+        log = log or open_drive(drive, drive_format).between(frames)
         refuse_inputs(claim.out, sorted(log.folders))
         network = None
         if segmenter not in (None, "none"):

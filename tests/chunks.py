@@ -1,0 +1,22 @@
+"""Drives that are mapped in chunks, and whether two maps are the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.voxels.voxel_map import VoxelMap
+
+
+def by_chunks(drive: Drive, scans: int) -> Drive:
+    """The drive, with so many scans in a chunk."""
+    mapping = drive.settings.mapping.model_copy(update={"scans_per_chunk": scans})
+    return replace(drive, settings=drive.settings.model_copy(update={"mapping": mapping}))
+
+
+def assert_same(a: VoxelMap, b: VoxelMap) -> None:
+    """Fail where two maps differ."""
+    for name in ("keys", "evidence", "hits"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)

@@ -1,0 +1,30 @@
+"""The small street as a drive to map, and its map made at once."""
+
+from __future__ import annotations
+
+import pytest
+from street import Street
+
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.fusion import Maps, build_maps
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.segmentation import open_segmenter
+
+
+@pytest.fixture(scope="module")
+def drive(small_drive: Street) -> Drive:
+    log = open_drive(small_drive.drive)
+    segmenter = open_segmenter(
+        f"labels:{small_drive.labels}", open_label_set(), expected_size=log.calibration.image_size
+    )
+    assert log.reference is not None
+    return Drive(log, log.reference, segmenter, Settings())
+
+
+@pytest.fixture(scope="module")
+def at_once(drive: Drive) -> tuple[Maps, RunStats]:
+    stats = RunStats()
+    return build_maps(drive, stats), stats

@@ -1,0 +1,271 @@
+"""However a drive is mapped, at once, in chunks, in processes or after being killed, the map has the same bytes."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chunks import assert_same, by_chunks
+from damage import flipped, halved
+from street import Street
+
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.files.ownership import MARKER
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.fusion import STATIC, Drive, Maps, build_maps, fingerprint, map_chunks
+from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+
+URBAN = open_label_set()
+
+
+@pytest.mark.parametrize(
+    ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
+)
+def test_chunks_and_processes_give_the_same_map_and_stats(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, chunk: int, workers: int
+) -> None:
+    stats = RunStats()
+    maps = build_maps(by_chunks(drive, chunk), stats, work=tmp_path / "work", workers=workers)
+    assert_same(maps.static, at_once[0].static)
+    assert len(maps.removed) == 0
+    assert stats.counts == at_once[1].counts
+    assert stats.skips == at_once[1].skips
+
+
+def test_tiles_come_from_the_chunks_one_by_one(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
+) -> None:
+    """The folder written tile by tile, never holding the map, has the bytes of the one written at once."""
+    store = map_chunks(by_chunks(drive, 3), tmp_path / "work", RunStats())
+    pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
+    tiles.write_tiles(pieces, tmp_path / "a", drive.log.frame, store.voxel_size_m, URBAN)
+    tiles.write(SemanticMap.of(at_once[0].static), tmp_path / "b", drive.log.frame)
+    names = sorted(path.name for path in (tmp_path / "a").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "b").iterdir())
+    for name in names:
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+MAP = """
+import sys
+from pathlib import Path
+from gnss_sem_map.mapping import fusion
+from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.segmentation import open_segmenter
+
+if __name__ == "__main__":
+    drive, probabilities, work = map(Path, sys.argv[1:])
+    log = open_drive(drive)
+    segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
+    job = Drive(log, log.reference, segmenter, Settings(mapping={"scans_per_chunk": 1}))
+    fusion.fuse_scans(job, log.scans[:1], RunStats())  # compiled code is loaded: the kills fall into the mapping
+    print("ready", flush=True)
+    fusion.map_chunks(job, work, RunStats(), resume=True)
+    print("done", flush=True)
+"""
+
+
+def start(small_drive: Street, work: Path) -> subprocess.Popen[bytes]:
+    """Map into a folder in a process of its own, which is about to begin."""
+    script = work.with_suffix(".py")
+    script.write_text(MAP)
+    command = [sys.executable, str(script), str(small_drive.drive), str(small_drive.labels), str(work)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+def kill_at_random(small_drive: Street, work: Path, times: int, seed: int) -> list[int]:
+    """Start mapping, kill -9 at a random moment, start again ...; how many chunks were there after each kill."""
+    chance, done = random.Random(seed), []
+    with start(small_drive, work.with_name(f"whole{seed}")) as process:
+        begun = time.monotonic()
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"done\n"
+        whole_s = time.monotonic() - begun
+    for _ in range(times):
+        with start(small_drive, work) as process:
+            time.sleep(chance.uniform(0.0, whole_s))
+            process.send_signal(signal.SIGKILL)
+        done.append(sum(path.name.isdecimal() for path in work.iterdir()) if work.is_dir() else 0)
+    return done
+
+
+def resumed_after_kills(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], work: Path, times: int, seed: int
+) -> list[int]:
+    done = kill_at_random(small_drive, work, times, seed)
+    stats = RunStats()
+    maps = build_maps(by_chunks(drive, 1), stats, work=work, resume=True)
+    assert_same(maps.static, at_once[0].static)
+    assert stats.counts == at_once[1].counts
+    assert not list(work.glob(".*.part"))
+    return done
+
+
+@pytest.mark.integration
+def test_a_killed_run_goes_on_to_the_same_map(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
+) -> None:
+    resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 2, 1)
+
+
+@pytest.mark.slow
+def test_a_run_killed_many_times_goes_on_to_the_same_map(
+    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
+) -> None:
+    partly = 0
+    for seed in range(8):
+        done = resumed_after_kills(drive, small_drive, at_once, tmp_path / f"work{seed}", 4, seed)
+        partly += sum(0 < n < len(drive.log.scans) for n in done)
+    assert partly > 0, "no kill fell into the mapping: this test showed nothing"
+
+
+def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> None:
+    work, drive = tmp_path / "work", by_chunks(drive, 4)
+    build_maps(drive, RunStats(), work=work)
+    other = Settings.model_validate({"mapping": {"voxel_size_m": 0.3}})
+    for changed in (
+        replace(drive, settings=other),
+        replace(drive, log=replace(drive.log, scans=drive.log.scans[2:])),
+        replace(drive, moving={3: np.array([5])}),
+    ):
+        with pytest.raises(DataError, match="another drive, trajectory, labels or settings"):
+            build_maps(changed, RunStats(), work=work, resume=True)
+    with pytest.raises(DataError, match="another drive"):
+        build_maps(drive, RunStats(), work=work, resume=True, labels_from="labels:elsewhere")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/thesis.txt").write_text("important")
+    with pytest.raises(DataError, match="holds no interrupted run"):
+        build_maps(drive, RunStats(), work=tmp_path / "mine")
+    assert (tmp_path / "mine/thesis.txt").exists()
+
+
+def doubled(path: Path) -> None:
+    tile = next(path.parent.rglob("*.npy"))
+    tile.with_name("77_77.npy").write_bytes(tile.read_bytes())
+
+
+@pytest.mark.parametrize("damage", [flipped, halved, doubled, Path.unlink])
+@pytest.mark.parametrize("what", ["static/*.npy", "record.json"])
+def test_a_damaged_chunk_is_mapped_again(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, damage: Callable[[Path], None], what: str
+) -> None:
+    drive = by_chunks(drive, 4)
+    build_maps(drive, RunStats(), work=tmp_path / "work")
+    others = {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
+    damage(sorted((tmp_path / "work/1").glob(what))[0])
+    stats = RunStats()
+    maps = build_maps(drive, stats, work=tmp_path / "work", resume=True)
+    assert_same(maps.static, at_once[0].static)
+    assert stats.counts == at_once[1].counts
+    assert others == {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
+
+
+def test_a_chunk_that_is_damaged_under_way_is_named_and_never_used(drive: Drive, tmp_path: Path) -> None:
+    store = map_chunks(by_chunks(drive, 4), tmp_path / "work", RunStats())
+    part = sorted((tmp_path / "work/1").glob("static/*.npy"))[0]
+    flipped(part)
+    with pytest.raises(DataError, match=rf"{part.name}: damaged voxels .*--resume maps them again"):
+        store.whole(STATIC)
+    shutil.rmtree(tmp_path / "work/2")
+    with pytest.raises(DataError, match="damaged chunk"):
+        replace(store).records()
+
+
+def test_an_input_that_was_changed_since_is_noticed(
+    small_drive: Street, drive: Drive, tmp_path: Path
+) -> None:
+    """Every file that a reader gives a scan or an image, and every label file, counts with its size and time."""
+    street_copy = tmp_path / "street"
+    shutil.copytree(small_drive.drive.parents[1], street_copy)
+    opened = open_drive(next(street_copy.glob("*/*_sync")))
+    labels_from = f"labels:{street_copy / 'probabilities'}"
+    copied = by_chunks(replace(drive, log=opened), 4)
+    before = fingerprint(copied, labels_from)
+    assert fingerprint(copied, labels_from) == before
+    for changed in (
+        "*/*_sync/velodyne_points/data/*4.bin",
+        "*/*_sync/image_02/data/*5.png",
+        "probabilities/*6.npz",
+    ):
+        (path,) = (p for p in street_copy.glob(changed) if "1" not in p.stem)
+        halved(path)
+        assert fingerprint(copied, labels_from) != before, changed
+        before = fingerprint(copied, labels_from)
+
+
+class Unsendable:
+    """A segmenter that holds something that no other process can have."""
+
+    class_names = ("road", "other")
+    lock = property(lambda self: None)
+
+    def __init__(self) -> None:
+        self.here = lambda: None
+
+    def __call__(self, image: object) -> np.ndarray:
+        return np.zeros((48, 150, 2), np.uint8)
+
+
+def test_a_segmenter_that_cannot_be_shared_is_refused_before_any_work(drive: Drive, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot work in several processes"):
+        build_maps(
+            by_chunks(replace(drive, segmenter=Unsendable()), 2), RunStats(), work=tmp_path / "w", workers=2
+        )
+
+
+FILL = """
+import resource, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from gnss_sem_map.errors import DataError
+from test_tiles import random_map, FRAME
+from gnss_sem_map.mapping import checkpoints
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.labels.label_set import open_label_set
+
+folder, written = Path(sys.argv[2]), random_map(count=200_000)
+store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_set())
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+for attempt in (
+    lambda: tiles.write(written, folder / "map", FRAME),
+    lambda: store.write(0, {"static": written.voxels}, {}),
+):
+    try:
+        attempt()
+    except DataError as error:
+        print(error)
+"""
+
+
+@pytest.mark.integration
+def test_a_full_disk_is_an_error_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    """No file may grow beyond 20 kB, as if the disk were full there."""
+    done = subprocess.run(
+        [sys.executable, "-c", FILL, str(Path(__file__).parents[1] / "voxels"), str(tmp_path)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    first, second = done.stdout.splitlines()
+    assert "cannot write the map" in first
+    assert "cannot save voxels" in second
+    assert [path.name for path in tmp_path.iterdir()] == ["work"]
+    assert {path.name for path in (tmp_path / "work").iterdir()} == {"chunks.json", MARKER}

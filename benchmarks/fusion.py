@@ -32,11 +32,13 @@ from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
 from gnss_sem_map.evaluation.metrics import Tables
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
+from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.cache import write_cache
 from gnss_sem_map.simulation import simulate
+from gnss_sem_map.voxels import tiles
 
 URBAN = open_label_set("urban")
 TABLES = Tables.of(URBAN)
@@ -116,17 +118,17 @@ def score(predicted: Labels, confidence: dict[str, NDArray[np.float32]], truth: 
 
 def mapped(excerpt: Excerpt, drive: Drive, settings: Settings, only: Labels) -> tuple[Score, Score]:
     """The map before and after refinement."""
-    result = pipeline.run(drive.log, drive.segmenter, settings)
-    names: list[str] = []
     both: tuple[Labels, Labels] = ({}, {})
     sure: tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[np.float32]]] = ({}, {})
-    maps = (result.raw, result.refined)
-    for scan, found in label_points(
-        drive.log, result.trajectory, maps, settings, result.moving, result.kerbs
-    ):
-        names.append(scan.name)
-        for stage, of_map in enumerate(found):
-            both[stage][scan.name], sure[stage][scan.name] = IDS[of_map.labels], of_map.confidence
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        done = pipeline.run(drive.log, drive.segmenter, settings, folder, folder / "work")
+        kerbs = pipeline.refine(folder, settings, done.stats).kerbs
+        maps = [tiles.open_map(folder / name, URBAN) for name in ("map", "refined")]
+        moving = evidence.read(folder, URBAN).moving_points
+        for scan, found in label_points(done.log, done.trajectory, maps, settings, moving, kerbs):
+            for stage, of_map in enumerate(found):
+                both[stage][scan.name], sure[stage][scan.name] = IDS[of_map.labels], of_map.confidence
     raw, refined = (score(both[i], sure[i], excerpt.truth, only) for i in range(2))
     return raw, refined
 
@@ -135,7 +137,9 @@ def learn(drives: list[tuple[Excerpt, Drive]]) -> LabelCalibration:
     """A calibration file from labelled excerpts."""
     counted = []
     for excerpt, drive in drives:
-        raw = pipeline.run(drive.log, drive.segmenter, drive.settings).raw
+        with tempfile.TemporaryDirectory() as folder:
+            pipeline.run(drive.log, drive.segmenter, drive.settings, Path(folder), Path(folder) / "work")
+            raw = tiles.read(Path(folder) / "map", URBAN)
         counted.append(measure(drive, raw.voxels, label_files(excerpt.truth)))
     points = zip(*(points for _, points in counted), strict=True)
     temperature = fit_temperature(*(np.concatenate(parts) for parts in points))

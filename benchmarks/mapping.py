@@ -38,8 +38,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.probabilities import KeepsLabels
 from gnss_sem_map.mapping import labelled_scans
-from gnss_sem_map.mapping.fusion import STATIC, Drive, fuse_scans, map_chunks
-from gnss_sem_map.mapping.labelled_scans import LabelledScan
+from gnss_sem_map.mapping.fusion import map_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan
+from gnss_sem_map.mapping.raw_map import write_raw
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.projection import ClassImage, class_image
 from gnss_sem_map.segmentation import open_segmenter
@@ -49,7 +50,8 @@ from gnss_sem_map.voxels.kernels import _prefetch
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelTable
 
-SETTINGS = Settings()
+SETTINGS = Settings.model_validate({"dynamics": {"enabled": False}})
+"""What moves is the matter of refinement.py."""
 SIZE = SETTINGS.mapping.voxel_size_m
 URBAN = open_label_set()
 Figures = dict[str, Any]
@@ -110,7 +112,7 @@ def whole_chain(job: Drive) -> Figures:
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
         seen = labelled_scans._see(job, scan, scan.read(), (image, classes), views, RunStats())
         assert seen is not None
-        table.add(seen.keys, seen.pixels, seen.classes)
+        table.add(seen.keys, seen.pixels, seen.classes, seen.heights)
 
     def in_numpy(scan: Scan, image: Image, classes: ClassImage, rows: NDArray[np.uint8]) -> None:
         p_map = numpy_chain.points_in_map(
@@ -119,7 +121,7 @@ def whole_chain(job: Drive) -> Figures:
         pixels = numpy_chain.pixels_seen(
             p_map, image, job.trajectory, log.calibration, classes, SETTINGS.labelling
         )
-        plain.add(numpy_chain.keys_of(p_map, SIZE), pixels, rows)
+        plain.add(numpy_chain.keys_of(p_map, SIZE), pixels, rows, numpy_chain.heights_of(p_map, SIZE))
 
     for scan in log.scans:
         image, classes = race.run("decode", lambda scan=scan: image_of(job, scan))
@@ -127,7 +129,9 @@ def whole_chain(job: Drive) -> Figures:
         race.run("numpy", lambda a=(scan, image, classes, classes.rows): in_numpy(*a))
         points += len(scan.read().xyz)
     fused, oracle = table.to_map(), plain.to_map()
-    same = all(np.array_equal(getattr(fused, n), getattr(oracle, n)) for n in ("keys", "evidence", "hits"))
+    same = all(
+        np.array_equal(getattr(fused, n), getattr(oracle, n)) for n in ("keys", "evidence", "hits", "heights")
+    )
     s = race.medians()
     return {
         "scans": len(log.scans), "points_per_scan": points // len(log.scans), "voxels": len(fused),
@@ -137,12 +141,20 @@ def whole_chain(job: Drive) -> Figures:
     }  # fmt: skip
 
 
+def fused(job: Drive) -> VoxelTable:
+    """All scans of a drive in a table."""
+    table = VoxelTable(SIZE, URBAN)
+    for seen in labelled_scans.labelled_scans(job):
+        table.add(seen.keys, seen.pixels, seen.classes, seen.heights)
+    return table
+
+
 def real_time(job: Drive) -> Figures:
     """The pipeline's own loop, decoding included, all threads counted: CPU seconds against 0.1 s a scan."""
     best = np.inf
     for _ in range(3):
         start = time.process_time()
-        fuse_scans(job, job.log.scans, RunStats())
+        fused(job)
         best = min(best, (time.process_time() - start) / len(job.log.scans))
     return {"cpu_ms_per_scan": 1e3 * best, "real_time_factor": 0.1 / best}
 
@@ -262,7 +274,7 @@ def over_the_floor(seen: list[LabelledScan], voxels: int) -> Figures:
 
 def on_disk(job: Drive) -> Figures:
     """Bytes of the tiles of the drive's map, and what writing and reading them costs."""
-    table = fuse_scans(job, job.log.scans, RunStats())[0]
+    table = fused(job)
     raw, race = SemanticMap.of(table.to_map()), Race()
     with tempfile.TemporaryDirectory() as folder:
         race.run("write", lambda: tiles.write(raw, Path(folder) / "map", None))
@@ -298,9 +310,7 @@ def peak_of(scans: int) -> None:
     """In a process of its own: map the cheap drive to tiles on disk, and print the peak memory in MB."""
     with tempfile.TemporaryDirectory() as folder:
         job = cheap_drive(scans)
-        store = map_chunks(job, Path(folder) / "work", RunStats())
-        pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
-        tiles.write_tiles(pieces, Path(folder) / "map", None, SIZE, URBAN)
+        write_raw(map_scans(job, Path(folder) / "work", RunStats()), Path(folder), None)
         about = json.loads((Path(folder) / "map/map.json").read_text())
     status = Path("/proc/self/status").read_text()  # ru_maxrss would begin at the parent's
     peak = int(status.split("VmHWM:")[1].split()[0]) / 1024
@@ -311,7 +321,7 @@ def first_scan(drive: str, spec: str) -> None:
     """In a process of its own: seconds from the imports' end to the first fused scan, compiled code cached."""
     job = open_job(Path(drive), spec, 1)
     start, cpu = time.perf_counter(), time.process_time()
-    fuse_scans(job, job.log.scans, RunStats())
+    fused(job)
     print(json.dumps({"wall_s": time.perf_counter() - start, "cpu_s": time.process_time() - cpu}))
 
 
@@ -324,7 +334,7 @@ def _child(call: str) -> Figures:
 def measure(drive: Path, spec: str, scans: int) -> tuple[Figures, list[str]]:
     """Everything that one drive can say."""
     job = open_job(drive, spec, scans)
-    fuse_scans(job, job.log.scans[:2], RunStats())  # compile
+    fused(replace(job, log=_only(job.log, job.log.scans[:2])))  # compile
     figures: Figures = {"full chain": whole_chain(job), "real time": real_time(job), "map": on_disk(job)}
     seen = seen_of(replace(job, log=_only(job.log, job.log.scans[-40:])))
     figures["peers"], missing = against_peers(job, seen)

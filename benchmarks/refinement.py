@@ -1,7 +1,7 @@
 """What refinement does, on real and simulated drives, and how fast its kernels are beside what others use.
 
     python benchmarks/refinement.py [kernels] [raw] [semantics] [simulated]
-        [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large]
+        [--data ../shared/data] [--simulated DRIVE ...] [--seeds N --seconds S] [--large] [--run OUT]
 
 prints the figures and writes them into benchmarks/results/refinement.json; parts that were not asked for stay as they
 are there. Removal: share of moving vehicle points removed (DA), of static vehicle points kept (SA_vehicle) and of all
@@ -19,6 +19,8 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -28,17 +30,24 @@ import numpy as np
 import tracklets
 from numpy.typing import NDArray
 
+from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
 from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
-from gnss_sem_map.mapping.moving_points import MovingObjects, find_moving
+from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.pipeline import estimate_trajectory
+from gnss_sem_map.refinement import by_tile
+from gnss_sem_map.refinement.by_tile import refine
 from gnss_sem_map.refinement.count_grid import count_grid
+from gnss_sem_map.refinement.figures import Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence
-from gnss_sem_map.refinement.steps import RefinementSettings, refine
+from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.dbscan import dbscan
@@ -79,10 +88,13 @@ def main() -> None:
     parser.add_argument(
         "--large", action="store_true", help="a million voxels for DBSCAN, fifty for the count grid"
     )
+    parser.add_argument("--run", type=Path, help="a finished run whose map is refined tile by tile")
     options = parser.parse_args()
     parts = options.parts or PARTS
     if unknown := set(parts) - set(PARTS):
         parser.error(f"found parts {sorted(unknown)}, expected some of {PARTS}")
+    if options.run is not None:
+        keep(f"tiles, {options.run.name}", tile_by_tile(options.run))
     if "kernels" in parts:
         keep("dbscan", dbscan_beside_sklearn(options.large))
         keep("count_grid", count_grid_beside_bincount(options.large))
@@ -120,6 +132,33 @@ def clocked(work: Callable[[], Any]) -> tuple[float, float]:
     start = time.process_time(), time.perf_counter()
     work()
     return time.process_time() - start[0], time.perf_counter() - start[1]
+
+
+def tile_by_tile(run: Path) -> Figures:
+    """CPU time of the refinement per voxel of the map, halo included."""
+    settings = config.load(run / "config.yaml")
+    label_set = open_label_set(settings.classes)
+    raw = open_raw(run, label_set)
+    voxels, steps = raw.fused.whole().voxels, settings.refinement
+    beside = Evidence(
+        raw.evidence.moved.whole().voxels,
+        sensor_model.opened(settings.calibration, label_set),
+        raw.evidence.keyframes_near(voxels.centres, steps.free_space.farthest_m),
+    )
+    halo = by_tile.halo_m(steps, voxels.voxel_size_m)
+    tiles = {tile: raw.static(tile, halo) for tile in raw.fused.tiles}
+    of_sums, sums = cpu(lambda: [by_tile.sums_of(*part, beside, steps) for part in tiles.items()], REPEATS)
+    figures = figures_of(sum(sums, Sums()))
+    of_tiles, _ = cpu(
+        lambda: [by_tile.refine_tile(*part, beside, steps, figures) for part in tiles.items()], REPEATS
+    )
+    return {
+        "voxels": len(voxels),
+        "tiles": len(tiles),
+        "halo_m": halo,
+        "sums_us_per_voxel": 1e6 * of_sums / len(voxels),
+        "tiles_us_per_voxel": 1e6 * of_tiles / len(voxels),
+    }
 
 
 def dbscan_beside_sklearn(large: bool) -> Figures:
@@ -187,32 +226,43 @@ def by_the_paper(drive: Drive) -> Points:
     return points
 
 
-def removed_in_all(drive: Drive, found: MovingObjects) -> Points:
+def removed_in_all(drive: Drive, chunks: list[MappedChunk]) -> Points:
     """The points of what moved and, as in a run, those in voxels that witnesses look through."""
-    maps = build_maps(replace(drive, moving=found.points), RunStats())
-    refined, _ = refine(
-        maps.static, beside=Evidence(keyframes=found.keyframes if drive.from_lidar_odometry else None)
-    )
+    static = reduce(add, (chunk.static for chunk in chunks))
+    known = [chunk.keyframes for chunk in chunks if chunk.keyframes is not None]
+    keyframes = KeyframeScans(
+        np.concatenate([one.images for one in known]), np.concatenate([one.T_lidar_map for one in known])
+    ) if known else None  # fmt: skip
+    refined, _ = refine(static, beside=Evidence(keyframes=keyframes))
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last
+    moving = {number: points for chunk in chunks for number, points in chunk.moving.items()}
     points = {}
     for seen in labelled_scans(replace(drive, segmenter=None)):
-        places = maps.static.indices_of(keys_of(seen.p_map, maps.static.voxel_size_m))
-        moved = found.points.get(seen.scan.number, np.empty(0, np.int64))
+        places = static.indices_of(keys_of(seen.p_map, static.voxel_size_m))
+        moved = moving.get(seen.scan.number, np.empty(0, np.int64))
         points[seen.scan.number] = np.union1d(moved, np.flatnonzero(empty[places]))
     return points
 
 
-def timed_find_moving(drive: Drive) -> tuple[MovingObjects, dict[str, float]]:
-    """What moved, and what finding it costs per scan: beside reading and labelling, and waiting for all."""
-    find_moving(replace(drive, log=replace(drive.log, scans=drive.log.scans[:10])))  # compiles
-    found: list[MovingObjects] = []
-    reading, waiting_to_read = clocked(lambda: [None for _ in labelled_scans(drive)])
-    finding, waiting = clocked(lambda: found.append(find_moving(drive)))
+def mapped(drive: Drive) -> list[MappedChunk]:
+    """What every chunk of a drive says."""
+    with tempfile.TemporaryDirectory() as folder:
+        return list(map_chunks(drive, range(len(chunks_of(drive))), Path(folder)))
+
+
+def timed_mapping(drive: Drive) -> tuple[list[MappedChunk], dict[str, float]]:
+    """The chunks, and what finding what moved costs per scan: beside mapping alone, and with it."""
+    mapped(replace(drive, log=replace(drive.log, scans=drive.log.scans[:10])))  # compiles
+    found: list[MappedChunk] = []
+    nothing_sought = drive.settings.dynamics.model_copy(update={"enabled": False})
+    alone = replace(drive, settings=drive.settings.model_copy(update={"dynamics": nothing_sought}))
+    fusing, waiting_to_fuse = clocked(lambda: mapped(alone))
+    both, waiting = clocked(lambda: found.extend(mapped(drive)))
     per_scan = 1e3 / len(drive.log.scans)
-    return found[0], {
-        "cpu_ms_per_scan": per_scan * (finding - reading),
-        "wall_ms_per_scan": per_scan * (waiting - waiting_to_read),
-        "wall_ms_per_scan_with_reading": per_scan * waiting,
+    return found, {
+        "cpu_ms_per_scan": per_scan * (both - fusing),
+        "wall_ms_per_scan": per_scan * (waiting - waiting_to_fuse),
+        "wall_ms_per_scan_with_mapping": per_scan * waiting,
     }
 
 
@@ -231,7 +281,7 @@ def on_raw_drive(data: Path) -> Figures:
         ("GNSS and IMU alone", estimate_trajectory(log, alone, RunStats())[0]),
     ):
         drive = Drive(log, trajectory, segmenter, Settings(), from_lidar_odometry=name == AS_IT_RUNS)
-        found, cost = timed_find_moving(drive)
+        found, cost = timed_mapping(drive)
         figures[name] = tracklets.removal(drive, removed_in_all(drive, found), data / RAW_0005) | cost
         figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
     return figures
@@ -260,7 +310,7 @@ def perfectly_seen(folder: Path) -> Drive:
 def on_simulated_drive(folder: Path) -> Figures:
     """Removal all around, mover by mover."""
     drive = perfectly_seen(folder)
-    found, cost = timed_find_moving(drive)
+    found, cost = timed_mapping(drive)
     points = removed_in_all(drive, found)
     cases = what_they_do(folder)
     counts = np.zeros((3, 2), np.int64)
@@ -301,7 +351,7 @@ def semantics_of_simulated_drive(folder: Path) -> Figures:
     """Strict figures of every stage, and what the paper's rule removes."""
     drive = perfectly_seen(folder)
     truth, alone = folder / "truth" / "labels", folder / "truth" / "single_frame"
-    return before_and_after(drive, find_moving(drive).points, truth, alone)
+    return before_and_after(drive, truth, alone)
 
 
 def on_semantic_kitti(data: Path) -> Figures:
@@ -314,23 +364,18 @@ def on_semantic_kitti(data: Path) -> Figures:
             f"labels:{data / 'labels/semantic_kitti' / sequence / 'probabilities'}", URBAN
         )
         drive = Drive(log, log.given, segmenter, Settings())
-        counts = strict_counts(
-            drive, find_moving(drive).points, folder / "labels", data / "single_frame" / sequence
-        )
+        counts = strict_counts(drive, folder / "labels", data / "single_frame" / sequence)
         total = {name: total.get(name, 0) + part for name, part in counts.items()}
     return {name: compact(part) for name, part in total.items()}
 
 
-def before_and_after(drive: Drive, points: Points, truth: Path, single_frame: Path) -> Figures:
+def before_and_after(drive: Drive, truth: Path, single_frame: Path) -> Figures:
     """Strict figures of every stage."""
-    return {name: compact(part) for name, part in strict_counts(drive, points, truth, single_frame).items()}
+    return {name: compact(part) for name, part in strict_counts(drive, truth, single_frame).items()}
 
 
-def strict_counts(
-    drive: Drive, points: Points, truth: Path, single_frame: Path
-) -> dict[str, NDArray[np.int64]]:
+def strict_counts(drive: Drive, truth: Path, single_frame: Path) -> dict[str, NDArray[np.int64]]:
     """Confusion of single image, fused map, refined map and the paper's refinement, on the points of the first."""
-    drive = replace(drive, moving=points)
     maps = build_maps(drive, RunStats())
     raw = maps.static + maps.removed
     stages = {

@@ -13,26 +13,15 @@ import sys
 from pathlib import Path
 
 from factor_graphs.errors import FactorGraphError
-from gnss_sem_map import config, pipeline
-from gnss_sem_map.datasets import open_drive
+from gnss_sem_map import run
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.runs.run_folder import write_run
-from gnss_sem_map.segmentation import open_segmenter
 
 
 def map_drive(drive: Path, probabilities: Path, out: Path) -> str:
     """Map one drive into `out`; returns what there is to say about it."""
-    settings = config.load()
-    log = open_drive(drive)
-    size = log.calibration.image_size
-    segmenter = open_segmenter(
-        f"labels:{probabilities}", open_label_set(settings.classes), expected_size=size
-    )
-    result = pipeline.run(log, segmenter, settings)
-    about = write_run(out, drive, log, result, settings, write_labels=False)
-    driven = result.trajectory.end - result.trajectory.start
-    return f"{about['counts']['scans']} scans, {len(result.refined)} voxels, {driven:.0f} s driven"
+    done = run(drive, out, f"labels:{probabilities}")
+    about, driven = done.about, done.trajectory.end - done.trajectory.start
+    return f"{about['counts']['scans']} scans, {about['map']['voxels']} voxels, {driven:.0f} s driven"
 
 
 def main() -> int:

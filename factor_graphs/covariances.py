@@ -14,6 +14,8 @@ from scipy.linalg.lapack import dtrtri
 
 Array = NDArray[np.float64]
 
+# Numbers of a keyframe: tangent of its pose, velocity, biases.
+SIZE = 15
 # A key of GTSAM holds its letter above so many bits of its index.
 INDEX_BITS = 56
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe.
@@ -34,26 +36,29 @@ def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = 
 def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array:
     """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15)."""
     net = eliminate(graph.linearize(values), k)
-    joint: dict[tuple[int, int], Array] = {}
+    covariances = np.empty((k, SIZE, SIZE))
+    # The joint covariance of a keyframe and of those it depends on. The IMU binds each keyframe to the next, so those
+    # of the one before it are among them, and memory does not grow with the drive.
+    known: list[int] = []
+    joint = np.empty((0, 0))
     for i in reversed(range(k)):
         R, later, S = _conditional(net, i)
         own, _ = dtrtri(R)
-        covariance = own @ own.T
-        if later:
-            W = own @ S
-            cross = -W @ _joined(joint, later)
-            covariance = covariance - cross @ W.T
-            for n, j in enumerate(later):
-                joint[i, j] = cross[:, 15 * n : 15 * n + 15]
-                joint[j, i] = joint[i, j].T
-        joint[i, i] = (covariance + covariance.T) / 2
-    return np.array([joint[i, i] for i in range(k)])
+        W = own @ S
+        joint = _of(later, known, joint)
+        cross = -W @ joint
+        covariance = own @ own.T - cross @ W.T
+        covariances[i] = (covariance + covariance.T) / 2
+        joint = np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
+        known = [i, *later]
+    return covariances
 
 
-def _joined(joint: dict[tuple[int, int], Array], keyframes: list[int]) -> Array:
-    if len(keyframes) == 1:
-        return joint[keyframes[0], keyframes[0]]
-    return np.block([[joint[a, b] for b in keyframes] for a in keyframes])
+def _of(keyframes: list[int], known: list[int], joint: Array) -> Array:
+    """The joint covariance of some of the keyframes."""
+    first = SIZE * np.array([known.index(i) for i in keyframes], np.intp)
+    rows = (first[:, None] + np.arange(SIZE)).ravel()
+    return np.asarray(joint[np.ix_(rows, rows)], np.float64)
 
 
 def _conditional(net: gtsam.GaussianBayesNet, i: int) -> tuple[Array, list[int], Array]:
@@ -61,8 +66,8 @@ def _conditional(net: gtsam.GaussianBayesNet, i: int) -> tuple[Array, list[int],
     parts = [net.at(3 * i + n) for n in range(3)]
     keys = [[(key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1) for key in part.keys()] for part in parts]  # noqa: SIM118
     later = sorted({index for row in keys for _, index in row} - {i})
-    start = {index: 15 * (1 + n) for n, index in enumerate(later)} | {i: 0}
-    columns = np.zeros((15, 15 * (1 + len(later))))
+    start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
+    columns = np.zeros((SIZE, SIZE * (1 + len(later))))
     for rows, part, row in zip(PLACES.values(), parts, keys, strict=True):
         matrix, column = np.hstack([part.R(), part.S()]), 0
         for letter, index in row:
@@ -70,4 +75,4 @@ def _conditional(net: gtsam.GaussianBayesNet, i: int) -> tuple[Array, list[int],
             width = place.stop - place.start
             columns[rows, first + place.start : first + place.stop] = matrix[:, column : column + width]
             column += width
-    return columns[:, :15], later, columns[:, 15:]
+    return columns[:, :SIZE], later, columns[:, SIZE:]

@@ -19,6 +19,8 @@ EARTH_RATE = 7.292115e-5
 # Somigliana's formula: normal gravity at the equator m/s², and its growth towards the pole
 EQUATORIAL_GRAVITY = 9.7803253359
 SOMIGLIANA_K = 0.00193185265241
+ARM_M = 10_000.0
+"""Rotations between frames are taken from points this far away: coordinates are known to 0.1 um."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,13 @@ class LocalFrame:
         east, north, up = np.moveaxis(np.asarray(points, np.float64), -1, 0)
         lon, lat, alt = _to_map(self).transform(east, north, up, direction="INVERSE")
         return lat, lon, alt
+
+    def pose_of(self, other: "LocalFrame") -> Array:
+        """T_self_other (4, 4): both are frames of one ellipsoid, so the transform between them is rigid."""
+        corners = self.to_map(*other.to_geodetic(np.vstack([np.zeros(3), ARM_M * np.eye(3)])))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = (corners[1:] - corners[0]).T / ARM_M, corners[0]
+        return T
 
     @property
     def gravity(self) -> float:

@@ -98,6 +98,11 @@ class Trajectory:
         variances: Array = np.einsum("kij,kjl,kil->ki", R, self.covariances[:, 3:, 3:], R)
         return np.sqrt(variances)
 
+    def moved(self, T: Array) -> "Trajectory":
+        """The same trajectory in another map frame, T = T_other_map (4, 4); covariances are in imu axes and stay."""
+        velocities = None if self.velocities is None else self.velocities @ T[:3, :3].T
+        return Trajectory(self.stamps, T @ self.T_map_imu, velocities, self.covariances)
+
     def at(self, stamps: ArrayLike, extrapolate_s: float = 0.0) -> Array:
         """Poses at any stamps (j,) s -> T_map_imu (j, 4, 4), exact at the knots.
 

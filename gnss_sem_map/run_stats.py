@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 from gnss_sem_map.sensor_log import Skip
@@ -17,6 +18,12 @@ Progress = Callable[[str, int, int], None]
 
 def silent(stage: str, done: int, total: int) -> None:
     """Progress that is not shown."""
+
+
+def _release_memory() -> None:
+    """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @dataclass
@@ -35,4 +42,5 @@ class RunStats:
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+        _release_memory()
         self.peak_memory_mb[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -10,13 +10,13 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
-def by_chunks(drive: Drive, scans: int) -> Drive:
-    """The drive, with so many scans in a chunk."""
-    mapping = drive.settings.mapping.model_copy(update={"scans_per_chunk": scans})
-    return replace(drive, settings=drive.settings.model_copy(update={"mapping": mapping}))
+def by_chunks(drive: Drive, window_scans: int) -> Drive:
+    """The drive, with two windows of so many scans in a chunk."""
+    dynamics = drive.settings.dynamics.model_copy(update={"window_scans": window_scans})
+    return replace(drive, settings=drive.settings.model_copy(update={"dynamics": dynamics}))
 
 
 def assert_same(a: VoxelMap, b: VoxelMap) -> None:
     """Fail where two maps differ."""
-    for name in ("keys", "evidence", "hits"):
+    for name in ("keys", "evidence", "hits", "heights"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)

@@ -47,6 +47,12 @@ def keys_of(p_map: Array, voxel_size_m: float) -> NDArray[np.int64]:
     return pack(np.floor(p_map / voxel_size_m).astype(np.int64))
 
 
+def heights_of(p_map: Array, voxel_size_m: float) -> NDArray[np.int64]:
+    """Heights of points over the bottom of their voxels, in 256 steps."""
+    z = p_map[:, 2] / voxel_size_m
+    return np.floor(256 * (z - np.floor(z))).astype(np.int64)
+
+
 def pixels_seen(
     p_map: Array,
     image: Image,
@@ -116,16 +122,22 @@ class NumpyMap:
     keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
-        self.sums = np.empty((0, len(self.label_set.names) + 1), np.int64)
+        self.sums = np.empty((0, len(self.label_set.names) + 2), np.int64)
         share = 1.0 if self.answers is None else 0.5
         self._logs = log_table(len(self.label_set.names), self.floor_percent, share)
 
-    def add(self, keys: NDArray[np.int64], pixels: NDArray[np.int32], classes: NDArray[np.uint8]) -> None:
+    def add(
+        self,
+        keys: NDArray[np.int64],
+        pixels: NDArray[np.int32],
+        classes: NDArray[np.uint8],
+        heights: NDArray[np.integer],
+    ) -> None:
         """Add one scan, as `VoxelTable.add`."""
         seen = pixels >= 0
         looks = np.zeros((len(keys), self.sums.shape[1]), np.int64)
-        looks[:, -1] = 1
-        looks[seen, :-1] = self._looks(classes[pixels[seen]])
+        looks[:, -2], looks[:, -1] = 1, heights
+        looks[seen, :-2] = self._looks(classes[pixels[seen]])
         order = np.argsort(keys)
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
         new_keys, sums = keys[order][starts], np.add.reduceat(looks[order], starts)
@@ -150,5 +162,6 @@ class NumpyMap:
         """The same value as `VoxelTable.to_map`."""
         return VoxelMap(
             self.voxel_size_m, self.label_set, self.keys,
-            np.ascontiguousarray(self.sums[:, :-1], np.int32), self.sums[:, -1].astype(np.uint32),
+            np.ascontiguousarray(self.sums[:, :-2], np.int32), self.sums[:, -2].astype(np.uint32),
+            self.sums[:, -1].copy(),
         )  # fmt: skip

@@ -12,6 +12,7 @@ import laspy
 import numpy as np
 import pytest
 import street
+import street_drives
 from evo.tools import file_interface
 from plyfile import PlyData
 from street import Street
@@ -140,6 +141,31 @@ def test_two_runs_give_the_same_map_and_a_subset_of_frames_a_smaller_one(
     ]
 
 
+def test_a_drive_is_added_to_a_map_and_the_first_is_taken_out(tmp_path: Path) -> None:
+    drives = street_drives.write(tmp_path, ("monday", "tuesday"))
+    first, second = drives.by_name.values()
+    out, segmenter = tmp_path / "out", ("--segmenter", drives.labels, "--force")
+    done = gnss_sem_map("run", first, "-o", out, *segmenter)
+    assert done.returncode == 0, done.stderr
+    alone = json.loads((out / "run.json").read_text())["map"]["voxels"]
+    done = gnss_sem_map("add", out, second)
+    assert done.returncode == 1
+    assert done.stderr.count("--segmenter hf:") == 3
+    done = gnss_sem_map("add", out, second, *segmenter)
+    assert done.returncode == 0, done.stderr
+    of_both = json.loads((out / "run.json").read_text())["map"]
+    assert f"2 drives, {of_both['voxels']} voxels; results in {out}" in done.stdout
+    assert of_both["voxels"] > alone
+    assert of_both["labelled"]["refined"]["building"] > 500
+    assert len(laspy.read(out / "map.laz").points) > 1000
+    done = gnss_sem_map("remove", out, "monday", "--json")
+    assert done.returncode == 0, done.stderr
+    about = json.loads(done.stdout)
+    assert about["merged"] == ["tuesday"]
+    assert about["map"]["points"] < of_both["points"]
+    assert [path.name for path in (out / "drives").iterdir()] == ["tuesday"]
+
+
 def test_a_drive_without_images_gives_a_map_without_labels_and_a_warning(
     small_drive: Street, tmp_path: Path
 ) -> None:
@@ -186,7 +212,7 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
     ("arguments", "code", "says"),
     [
         (("run", "nowhere", "-o", "out"), 1, "nowhere: no such folder; expected a drive"),
-        (("run",), 2, "Missing argument 'drive'; see gnss-sem-map run --help"),
+        (("run",), 2, "Missing argument 'DRIVE...'; see gnss-sem-map run --help"),
         (("rnu",), 2, "Did you mean 'run'?; see gnss-sem-map --help"),
         (("run", "DRIVE", "-o", "out", "--segmneter", "none"), 2, "--segmneter (Possible options: --segmenter"),
         (("run", "DRIVE", "-o", "out", "--workers", "0"), 2, "Invalid value for '--workers'"),
@@ -199,12 +225,22 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
         (("run", "DRIVE", "-o", "out", "--segmenter", "labels:nowhere"), 1, "nowhere"),
         (("run", "DRIVE", "-o", "out", "--segmenter", "none", "--frames", "100:200"), 1, "none of 0 scans can be used"),
         (("run", "DRIVE", "-o", "DRIVE"), 1, "which is read; choose another -o"),
+        (("run", "DRIVE", "other", "-o", "out", "--write-labels"), 2, "works for one drive at a time"),
+        (("run", "DRIVE", "-o", "out", "--origin", "49.0,8.4"), 2, "found '49.0,8.4' (not enough values"),
+        (("run", "DRIVE", "-o", "out", "--origin", "91,8.4,0"), 2, "expected |lat| <= 90"),
+        (("run", "DRIVE", "-o", "out", "--scheduler", "x:1"), 2, "a cluster maps several drives; found one"),
+        (("run", "A", "B", "-o", "out", "--segmenter", "none", "--scheduler", "x", "--workers", "2"), 2, "own workers"),
+        (("run", "@EMPTY", "-o", "out"), 2, "found no drive in @"),
+        (("run", "@nowhere.txt", "-o", "out"), 1, "nowhere.txt: cannot read it"),
+        (("add", "out", "DRIVE"), 1, "no run folder here; expected the -o of an earlier `gnss-sem-map run`"),
+        (("remove", "out", "DRIVE"), 1, "no run folder here; expected the -o of an earlier `gnss-sem-map run`"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_answered_in_one_line(
     arguments: tuple[str, ...], code: int, says: str, small_drive: Street, tmp_path: Path
 ) -> None:
-    places = {"DRIVE": small_drive.drive, "out": tmp_path / "out"}
+    (tmp_path / "empty.txt").write_text("# no drive yet\n\n")
+    places = {"DRIVE": small_drive.drive, "out": tmp_path / "out", "@EMPTY": f"@{tmp_path / 'empty.txt'}"}
     done = gnss_sem_map(*(places.get(a, a) for a in arguments))
     assert done.returncode == code
     assert says in " ".join(done.stderr.split())

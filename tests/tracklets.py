@@ -112,7 +112,7 @@ def in_image(p_lidar: NDArray[np.float64], calibration: Calibration) -> NDArray[
 
 
 def removal(drive: Drive, moving: Mapping[int, NDArray[np.int64]], folder: Path) -> dict[str, float | None]:
-    """How much of what moved was removed and of what stands kept; `moving` as `MovingObjects.points`."""
+    """How much of what moved was removed and of what stands kept; `moving` as `MappedChunk.moving`."""
     tables, boxes = Tables.of(open_label_set(drive.settings.classes)), read(folder)
     calibration = drive.log.calibration
     stamps = np.array([scan.stamp for scan in drive.log.scans])

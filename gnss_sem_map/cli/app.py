@@ -14,6 +14,8 @@ from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
 
 COMMANDS = (
     mapping.run,
+    mapping.add,
+    mapping.remove,
     mapping.merge,
     mapping.trajectory,
     finished.refine,

@@ -20,9 +20,25 @@ if TYPE_CHECKING:
 def progress_bars() -> Iterator[Progress]:
     """A progress bar per stage on stderr; nothing when that is not a terminal."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
 
-    columns = (TextColumn("{task.description:>12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    class Throughput(ProgressColumn):
+        """Finished steps per second."""
+
+        def render(self, task: Task) -> Text:
+            return Text(f"{task.finished_speed or task.speed or 0.0:.2g}/s")
+
+    stage = TextColumn("{task.description:>12}")
+    columns = (stage, BarColumn(), MofNCompleteColumn(), Throughput(), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
         tasks: dict[str, Any] = {}
@@ -53,6 +69,15 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
     )
     typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
     typer.echo(f"results in {out}")
+
+
+def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
+    """Drives and size of a map of several drives; those that failed on stderr."""
+    if as_json:
+        typer.echo(json.dumps(about))
+    else:
+        typer.echo(f"{len(about['merged'])} drives, {about['map']['voxels']} voxels; results in {out}")
+    warn(f"{name} is left out: {reason}" for name, reason in about["failed"].items())
 
 
 def print_merged(about: dict[str, Any], out: Path) -> None:

@@ -1,14 +1,14 @@
-"""Commands that make a map or a trajectory: `run`, `merge`, `trajectory`."""
+"""Commands that make a map or a trajectory: `run`, `add`, `remove`, `merge`, `trajectory`."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_merged, print_run, progress_bars, warn
+from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
 from gnss_sem_map.cli.options import (
     Config,
     Device,
@@ -20,13 +20,39 @@ from gnss_sem_map.cli.options import (
     Out,
     Segmenter,
     Set,
+    default_workers,
+    drives_of,
+    frame_of,
     open_log,
     settings_of,
 )
 
+if TYPE_CHECKING:
+    from factor_graphs.geodesy import LocalFrame
+    from gnss_sem_map.config import Settings
+    from gnss_sem_map.runs.many_drives import HowMapped
+
+
+Workers = Annotated[
+    int | None,
+    typer.Option(min=1, help="Processes that map; the result is the same. Default: all cores but one."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(help="Address of a Dask scheduler whose workers map the drives (docs/cluster.md)."),
+]
+Resume = Annotated[bool, typer.Option(help="Continue an interrupted run of the same drives and settings.")]
+
 
 def run(
-    drive: Drive,
+    drives: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DRIVE...",
+            help="Folder of a drive: KITTI raw, KITTI odometry, or a CSV log; several become one map. @FILE stands for"
+            " the drives in a file, one per line.",
+        ),
+    ],
     out: Out,
     segmenter: Segmenter = None,
     device: Device = "auto",
@@ -34,20 +60,38 @@ def run(
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that map; the result is the same.")] = 1,
-    resume: Annotated[
-        bool, typer.Option(help="Continue an interrupted run of the same drive and settings.")
-    ] = False,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            help="Origin of the map as LAT,LON,ALT in degrees and m; default: that of the first drive."
+        ),
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    resume: Resume = False,
     write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make trajectory, semantic map, refined map and all exports of one drive."""
+    """Make trajectory, semantic map, refined map and all exports of one drive, or one map of several."""
     from gnss_sem_map.runs import finished_run
+    from gnss_sem_map.runs.many_drives import HowMapped
     from gnss_sem_map.runs.run_folder import claimed_run, places_read
     from gnss_sem_map.segmentation import no_segmenter_message
 
-    settings = settings_of(config, set_)
+    settings, frame, found = settings_of(config, set_), frame_of(origin), drives_of(drives)
+    if len(found) > 1:
+        if write_labels:
+            raise typer.BadParameter("works for one drive at a time", param_hint="--write-labels")
+        if segmenter is None:
+            typer.echo(no_segmenter_message(str(found[0])), err=True)
+            raise typer.Exit(1)
+        how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+        _run_many(found, out, settings, how, frame, workers, scheduler, as_json)
+        return
+    if scheduler is not None:
+        raise typer.BadParameter("a cluster maps several drives; found one", param_hint="--scheduler")
+    [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config)):
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.images:
@@ -56,12 +100,75 @@ def run(
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
-                log=log, frames=frames, device=device, workers=workers, resume=resume, write_labels=write_labels,
-                force=force, progress=progress,
+                log=log, frames=frames, device=device, origin=frame, workers=workers or default_workers(),
+                resume=resume, write_labels=write_labels, force=force, progress=progress,
             )  # fmt: skip
     about = finished.about
     warn(about["warnings"])
     print_run(about, out, as_json)
+
+
+def _run_many(
+    drives: list[Path],
+    out: Path,
+    settings: Settings,
+    how: HowMapped,
+    origin: LocalFrame | None,
+    workers: int | None,
+    scheduler: str | None,
+    as_json: bool,
+) -> None:
+    from gnss_sem_map.runs.many_drives import run_drives
+
+    if scheduler is not None and workers is not None:
+        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
+    with progress_bars() as progress:
+        made = run_drives(
+            drives, out, settings, how,
+            origin=origin, workers=workers or default_workers(), scheduler=scheduler, progress=progress,
+        )  # fmt: skip
+    print_many(made.about, out, as_json)
+    if made.failed:
+        raise typer.Exit(1)
+
+
+def add(
+    out: Annotated[Path, typer.Argument(help="Folder of a finished map.")],
+    drive: Drive,
+    segmenter: Segmenter = None,
+    device: Device = "auto",
+    frames: Frames = None,
+    drive_format: Format = None,
+    resume: Resume = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Add a drive to a finished map, with the map's settings: the same bytes as a run of all drives at once."""
+    from gnss_sem_map.runs.finished_run import Run
+    from gnss_sem_map.runs.many_drives import HowMapped, add_drive
+    from gnss_sem_map.segmentation import no_segmenter_message
+
+    Run.open(out)
+    if segmenter is None:
+        typer.echo(no_segmenter_message(str(drive)), err=True)
+        raise typer.Exit(1)
+    how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+    with progress_bars() as progress:
+        made = add_drive(out, drive, how, progress=progress)
+    print_many(made.about, out, as_json)
+
+
+def remove(
+    out: Annotated[Path, typer.Argument(help="Folder of a finished map of several drives.")],
+    name: Annotated[str, typer.Argument(help="Name of the drive, as in OUT/drives/.")],
+    as_json: Json = False,
+) -> None:
+    """Take a drive out of a finished map: the same bytes as a run of the others."""
+    from gnss_sem_map.runs.many_drives import remove_drive
+
+    with progress_bars() as progress:
+        made = remove_drive(out, name, progress)
+    print_many(made.about, out, as_json)
 
 
 def merge(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from factor_graphs.geodesy import LocalFrame
     from gnss_sem_map.config import Settings
     from gnss_sem_map.sensor_log import SensorLog
 
@@ -62,3 +64,40 @@ def open_log(drive: Path, drive_format: str | None, frames: str | None) -> Senso
         return log.between(frames)
     except ConfigError as error:
         raise typer.BadParameter(str(error), param_hint="--frames") from None
+
+
+def drives_of(words: list[str]) -> list[Path]:
+    """The drives that are named, those of a file for @FILE; raises BadParameter."""
+    from gnss_sem_map.files.untrusted import read_lines
+
+    found: list[Path] = []
+    for word in words:
+        if not word.startswith("@"):
+            found.append(Path(word))
+            continue
+        lines = [line.strip() for line in read_lines(Path(word[1:]))]
+        found += [Path(word[1:]).parent / line for line in lines if line and not line.startswith("#")]
+    if not found:
+        raise typer.BadParameter(f"found no drive in {' '.join(words)}", param_hint="DRIVE")
+    return found
+
+
+def frame_of(origin: str | None) -> LocalFrame | None:
+    """The frame with this origin, LAT,LON,ALT; raises BadParameter."""
+    from factor_graphs.errors import MeasurementError
+    from factor_graphs.geodesy import LocalFrame
+
+    if origin is None:
+        return None
+    try:
+        lat_deg, lon_deg, alt_m = map(float, origin.split(","))
+        return LocalFrame(lat_deg, lon_deg, alt_m)
+    except (ValueError, MeasurementError) as error:
+        raise typer.BadParameter(
+            f"found {origin!r} ({error}); expected LAT,LON,ALT", param_hint="--origin"
+        ) from None
+
+
+def default_workers() -> int:
+    """All cores but one."""
+    return max((os.cpu_count() or 1) - 1, 1)

@@ -275,7 +275,8 @@ def _read_sweep(path: Path, start: float, end: float, state: frames.State | None
     from gnss_sem_map.scans.angles import azimuths_deg  # compiled: only those who read scans need it
 
     rows = frames.read_points(path, state=state)
-    stamps = azimuths_deg(rows) * ((start - end) / 360)
+    stamps = azimuths_deg(rows)
+    stamps *= (start - end) / 360
     stamps += (start + end) / 2
     return Points(rows[:, :3], rows[:, 3], stamps)
 

@@ -1,1 +1,1 @@
-"""Moving objects: found in the scans by free-space evidence, before the map is built."""
+"""Moving objects: found in the scans by free-space evidence, while they are mapped."""

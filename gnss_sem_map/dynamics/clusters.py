@@ -88,8 +88,6 @@ def _merge(
 class Segments:
     """The segments of one scan, stored by voxel."""
 
-    voxel: NDArray[np.int32]
-    """(n,) index of the voxel of every point, -1 for a point in no segment."""
     keys: NDArray[np.int64]
     """(v,) keys of the voxels, in ascending order; each voxel belongs to one segment."""
     parts: PointSets
@@ -99,19 +97,14 @@ class Segments:
     truncated: NDArray[np.bool_]
     """(s,) segments that are cut off by the edge of the image or hidden in part by something nearer."""
 
-    @property
-    def of_points(self) -> NDArray[np.int32]:
-        """Segment of every point (n,), -1 for none."""
-        return np.append(self.number, np.int32(-1)).take(self.voxel)
+    def of_points(self, voxel: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Segment of every point (n,), -1 for none; `voxel` (n,) is the index of the voxel of each, -1 for none."""
+        return np.append(self.number, np.int32(-1)).take(voxel)
 
     @property
     def whole(self) -> PointSets:
         """Statistics of every segment (s,)."""
         return self.parts.merged(self.number, len(self.truncated))
-
-    def points_of(self, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask of the points (n,) that belong to the chosen segments (s,)."""
-        return np.append(which[self.number], False).take(self.voxel)
 
     def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
         """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
@@ -140,9 +133,12 @@ def _enclosing_clusters(low, high):
     return np.searchsorted(np.unique(owners), owners)
 
 
-def find_segments(p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float) -> Segments:
+def find_segments(
+    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float
+) -> tuple[Segments, NDArray[np.int32]]:
     """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
+    Returns them, and for every point (n,) the index of its voxel, -1 for a point in no segment.
     `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image. A
     vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
     its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
@@ -167,9 +163,8 @@ def find_segments(p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_
     row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
     row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
     parts = PointSets.of(p_map, is_object, row, int(kept.sum()))
-    return Segments(
-        row, keys[kept], parts, number[kept], np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
-    )
+    all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
+    return Segments(keys[kept], parts, number[kept], all_truncated), row
 
 
 def _is_vehicle_sized(whole: PointSets) -> NDArray[np.bool_]:

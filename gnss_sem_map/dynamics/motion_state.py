@@ -41,7 +41,9 @@ class MotionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    enabled: bool = Field(default=True, description="Whether moving objects are sought before mapping.")
+    enabled: bool = Field(
+        default=True, description="Whether moving objects are sought and left out of the map."
+    )
     segment_eps_m: float = Field(default=0.7, gt=0, le=3, description="DBSCAN distance of segments, m.")
     gate_m: float = Field(
         default=1.5, gt=0, description="Tracking gate: largest distance to the prediction, m."
@@ -64,8 +66,9 @@ class MotionSettings(BaseModel):
     farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
     window_scans: int = Field(
         default=150,
-        ge=10,
-        description="A scan is decided after so many later scans, or at the end of the drive.",
+        ge=1,
+        description="A scan is decided with so many scans before and after it; two such windows are mapped, and"
+        " saved for --resume, at a time.",
     )
     farthest_object_m: float = Field(default=60.0, gt=0, description="Largest range of objects, m.")
     grow_m: float = Field(

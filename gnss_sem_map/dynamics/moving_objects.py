@@ -1,13 +1,14 @@
 """Search for moving objects: a segment of one scan has moved if other scans see through its volume.
 
-`observe` segments one scan and draws its range image. The detector collects these in time order. `settle` and `decide`
-track the segments, count hits and misses of their voxels in all scans, and return the points of moving objects.
+`observe` segments one scan and draws its range image. `decide` tracks the segments of consecutive scans, counts hits
+and misses of their voxels in all of them, and tells which have moved. `moved_points` are the points that this means.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,8 @@ from gnss_sem_map.dynamics.clusters import Segments, find_segments, split_segmen
 from gnss_sem_map.dynamics.ground_grid import closer_than, height_over_ground, in_cells_near, within_radius
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
-from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, hits_and_misses
+from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.voxels.hash_unique import distinct
 
 FOOT_HEIGHT_M, BODY_HEIGHT_M = 0.05, 0.2
@@ -27,121 +27,99 @@ FOOT_HEIGHT_M, BODY_HEIGHT_M = 0.05, 0.2
 FOOT_REACH_M = 0.2
 HIDING_M = 0.5
 """Something nearer by this hides the side of an object."""
-WINDOWS_HELD = 3
-"""Windows of undecided scans in memory: with more, fewer scans are processed twice, and more memory is needed."""
-
-
-@dataclass(frozen=True, eq=False)
-class MovingObjects:
-    """The points of moving objects in every scan, and the tracked objects with their motion states."""
-
-    points: Mapping[int, NDArray[np.int64]]
-    """Frame number -> indices of the moving points in the array given to `observe`."""
-    objects: tuple[TrackedObject, ...]
-    keyframes: KeyframeScans | None = None
-    """Scans from the whole drive, for free-space evidence; None if they were not collected."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One scan as the detector keeps it: h of its points, those in or near a segment."""
+    """One scan as evidence for motion: its range image and its segments."""
 
     number: int
     stamp: float
-    T_lidar_map: NDArray[np.float64]
-    image: NDArray[np.uint16]
+    seen: RangeImage
+    segments: Segments
+
+
+@dataclass(frozen=True, eq=False)
+class NearPoints:
+    """The points of a scan in or near a segment (h of n): those that may turn out to have moved."""
+
     indices: NDArray[np.int32]
     """(h,) indices of these points in the scan."""
     p_near: NDArray[np.float32]
     """(h, 3) m, relative to the LiDAR, along the axes of the map."""
     is_body: NDArray[np.bool_]
     """(h,) whether the point is higher than the foot of an object."""
-    segments: Segments
-    """Segments of these points; some points are only near one."""
+    voxel: NDArray[np.int32]
+    """(h,) index of its voxel in the segments of the scan, -1 for a point that is only near one."""
 
 
-class MovingObjectDetector:
-    """Collects scans in time order. Memory: a few windows of scans, with the range image and some points of each."""
+@dataclass(frozen=True, eq=False)
+class Decision:
+    """What has moved in consecutive scans."""
 
-    def __init__(self, settings: MotionSettings | None = None, from_lidar_odometry: bool = False) -> None:
-        """`from_lidar_odometry`: the poses come from LiDAR odometry, so that static objects are not blurred."""
-        self._settings, self._from_lidar_odometry = settings or MotionSettings(), from_lidar_odometry
-        self._observations: list[Observation] = []
-        self._past: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
-        """Range images and poses of decided scans, which still count as evidence."""
-        self._last_stamp = -np.inf
+    moved: list[NDArray[np.bool_]]
+    """For each scan, which of the voxels (v,) of its segments."""
+    objects: tuple[TrackedObject, ...]
+    """Those that are first seen in one of these scans."""
 
-    def add(self, seen: Observation) -> None:
-        """Add one scan; raises DataError when the stamps do not increase."""
-        if seen.stamp <= self._last_stamp:
+
+def decide(
+    observations: Sequence[Observation],
+    count: int,
+    before: Sequence[RangeImage],
+    settings: MotionSettings,
+    from_lidar_odometry: bool = False,
+) -> Decision:
+    """Decide what moved in the first `count` of the observations, in time order, by the evidence of all.
+
+    The scans `before` count as evidence too. `from_lidar_odometry`: the poses come from LiDAR odometry, so that static
+    objects are not blurred. Raises DataError when the stamps do not increase.
+    """
+    _check_order(observations)
+    if not observations:
+        return Decision([], ())
+    counts = _observations_by_others(observations, before, settings.farthest_m)
+    segments = [
+        split_segments(
+            seen.segments, counted[0], counted[1], settings.segment_eps_m, settings.displaced_misses_per_hit
+        )
+        for seen, counted in zip(observations, counts, strict=True)
+    ]
+    hits, misses = np.concatenate(
+        [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
+    )
+    listed = _all_segments(observations, segments)
+    objects = classify_motion(listed, hits, misses, settings, from_lidar_odometry)
+    gone = np.zeros(len(listed), np.bool_)
+    for one in objects:
+        gone[list(one.segments)] = one.motion in GONE
+    gone_of = np.split(gone, np.cumsum([len(of_scan.truncated) for of_scan in segments]))
+    moved = [gone_of[scan][segments[scan].number] for scan in range(count)]
+    return Decision(moved, tuple(one for one in objects if listed[one.segments[0]].scan < count))
+
+
+def _check_order(observations: Sequence[Observation]) -> None:
+    for one, after in pairwise(observations):
+        if after.stamp <= one.stamp:
             raise DataError(
-                f"scan {seen.number} at {seen.stamp:.3f} s follows one at {self._last_stamp:.3f} s;"
+                f"scan {after.number} at {after.stamp:.3f} s follows one at {one.stamp:.3f} s;"
                 " give scans in time order, each once"
             )
-        self._last_stamp = seen.stamp
-        self._observations.append(seen)
 
-    def settle(self) -> MovingObjects:
-        """Decide the scans that have a whole window of later scans: on most calls none, then many at once.
 
-        Undecided scans are processed again on the next call.
-        """
-        window, count = self._settings.window_scans, len(self._observations)
-        return self._decide(count - window) if count >= WINDOWS_HELD * window else MovingObjects({}, ())
-
-    def decide(self) -> MovingObjects:
-        """Decide all remaining scans."""
-        return self._decide(len(self._observations))
-
-    def _decide(self, count: int) -> MovingObjects:
-        """Decide the oldest `count` scans by the evidence of all, and drop their points."""
-        if count == 0:
-            return MovingObjects({}, ())
-        settings = self._settings
-        counts = self._observations_by_others()
-        segments = [
-            split_segments(
-                seen.segments,
-                counted[0],
-                counted[1],
-                settings.segment_eps_m,
-                settings.displaced_misses_per_hit,
-            )
-            for seen, counted in zip(self._observations, counts, strict=True)
-        ]
-        hits, misses = np.concatenate(
-            [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
-        )
-        listed = _all_segments(self._observations, segments)
-        objects = classify_motion(listed, hits, misses, settings, self._from_lidar_odometry)
-        gone = np.zeros(len(listed), np.bool_)
-        for one in objects:
-            gone[list(one.segments)] = one.motion in GONE
-        gone_of = np.split(gone, np.cumsum([len(of_scan.truncated) for of_scan in segments]))
-        settled, self._observations = self._observations[:count], self._observations[count:]
-
-        def moved(scan: int) -> NDArray[np.int64]:
-            seen, of_gone = settled[scan], segments[scan].points_of(gone_of[scan])
-            return seen.indices[_with_points_around(seen, of_gone, settings.grow_m)].astype(np.int64)
-
-        points = {settled[scan].number: indices for scan, indices in prefetch(moved, range(count), THREADS)}
-        self._past += [(seen.image, seen.T_lidar_map) for seen in settled]
-        del self._past[: -self._settings.window_scans]
-        begun = tuple(one for one in objects if listed[one.segments[0]].scan < count)
-        return MovingObjects(points, begun)
-
-    def _observations_by_others(self) -> list[NDArray[np.int32]]:
-        """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
-        observations = self._observations
-        parts = [seen.segments.parts for seen in observations]
-        _, row = distinct(np.concatenate([seen.segments.keys for seen in observations]))
-        points = np.bincount(row, np.concatenate([part.points for part in parts]))
-        sums = np.concatenate([part.sums for part in parts])
-        centroids = np.stack([np.bincount(row, sums[:, axis]) / points for axis in range(3)], axis=1)
-        here = [(seen.image, seen.T_lidar_map) for seen in observations]
-        counts = hits_and_misses(centroids, KeyframeScans.of(self._past + here), self._settings.farthest_m)
-        counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
-        return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
+def _observations_by_others(
+    observations: Sequence[Observation], before: Sequence[RangeImage], farthest_m: float
+) -> list[NDArray[np.int32]]:
+    """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
+    parts = [seen.segments.parts for seen in observations]
+    _, row = distinct(np.concatenate([seen.segments.keys for seen in observations]))
+    points = np.bincount(row, np.concatenate([part.points for part in parts]))
+    sums = np.concatenate([part.sums for part in parts])
+    centroids = np.stack([np.bincount(row, sums[:, axis]) / points for axis in range(3)], axis=1)
+    images = KeyframeScans.of([*before, *(seen.seen for seen in observations)])
+    counts = hits_and_misses(centroids, images, farthest_m)
+    counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
+    return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
 
 
 def observe(
@@ -152,15 +130,13 @@ def observe(
     is_object: NDArray[np.bool_],
     is_known: NDArray[np.bool_],
     settings: MotionSettings,
-) -> Observation:
-    """Segments and range image of one scan, for `MovingObjectDetector.add`.
+) -> tuple[Observation, NearPoints]:
+    """Segments and range image of one scan, and its points in or near a segment.
 
     `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) marks the
     points that the image labels as movable, `is_known` (n,) those with any label.
     """
-    T_lidar_map = np.asarray(np.linalg.inv(T_map_lidar), np.float64)
-    image = range_images.empty_image()
-    range_images.draw(p_map, T_lidar_map, image)
+    seen = RangeImage.of(p_map, T_map_lidar)
     heights, centre = height_over_ground(p_map), T_map_lidar[:2, 3]
     above = (heights > FOOT_HEIGHT_M) & within_radius(p_map, centre, settings.farthest_object_m)
     is_body = heights > BODY_HEIGHT_M
@@ -168,26 +144,25 @@ def observe(
     unknown = ~is_known & within_radius(p_map, centre, settings.farthest_m)
     candidates = np.flatnonzero(above & is_body & (is_object | unknown))
     points = p_map.take(candidates, axis=0)
-    segments = find_segments(points, is_object.take(candidates), settings.segment_eps_m)
+    segments, voxel_of_candidates = find_segments(points, is_object.take(candidates), settings.segment_eps_m)
     hidden = range_images.hidden_sides(
-        points, segments.of_points, T_lidar_map, image, len(segments.truncated), HIDING_M
-    )
+        points, segments.of_points(voxel_of_candidates), seen.T_lidar_map, seen.image, len(segments.truncated),
+        HIDING_M,
+    )  # fmt: skip
     voxel = np.full(len(p_map), -1, np.int32)
-    voxel[candidates] = segments.voxel
+    voxel[candidates] = voxel_of_candidates
     keep = np.flatnonzero(above & in_cells_near(p_map, voxel >= 0, settings.grow_m))
-    return Observation(
-        number=number,
-        stamp=stamp,
-        T_lidar_map=T_lidar_map,
-        image=image,
+    near = NearPoints(
         indices=keep.astype(np.int32),
         p_near=(p_map.take(keep, axis=0) - T_map_lidar[:3, 3]).astype(np.float32),
         is_body=is_body.take(keep),
-        segments=replace(segments, voxel=voxel.take(keep), truncated=segments.truncated | hidden),
+        voxel=voxel.take(keep),
     )
+    segments = replace(segments, truncated=segments.truncated | hidden)
+    return Observation(number, stamp, seen, segments), near
 
 
-def _all_segments(observations: list[Observation], segments: list[Segments]) -> list[Segment]:
+def _all_segments(observations: Sequence[Observation], segments: list[Segments]) -> list[Segment]:
     """The segments of all scans in time order."""
     listed: list[Segment] = []
     for scan, (seen, of_scan) in enumerate(zip(observations, segments, strict=True)):
@@ -209,11 +184,11 @@ def _all_segments(observations: list[Observation], segments: list[Segments]) -> 
     return listed
 
 
-def _with_points_around(seen: Observation, gone: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
-    """Mask (h,) of the points of moved segments, of the body points near them, and of the foot points below."""
-    grown = gone.copy()
+def moved_points(near: NearPoints, moved: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
+    """Which of the points (h,) have moved: those of `moved` voxels (v,), body points near them, foot points below."""
+    gone = np.append(moved, False).take(near.voxel)
     if not gone.any() or reach_m == 0:
-        return grown
-    beside = seen.is_body & (seen.segments.voxel < 0)
-    grown |= closer_than(seen.p_near, gone, beside, reach_m)
-    return grown | closer_than(seen.p_near[:, :2], grown, ~seen.is_body, FOOT_REACH_M)
+        return gone
+    beside = near.is_body & (near.voxel < 0)
+    grown = gone | closer_than(near.p_near, gone, beside, reach_m)
+    return grown | closer_than(near.p_near[:, :2], grown, ~near.is_body, FOOT_REACH_M)

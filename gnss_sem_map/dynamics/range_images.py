@@ -134,18 +134,18 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_hits_and_misses(
-    positions, images, T_lidar_map, nearest_m, farthest_m, margin_m, margin_ratio, hits, misses
+    positions, images, T_lidar_map, chosen, nearest_m, farthest_m, margin_m, margin_ratio, hits, misses
 ):
     """Count for every position (m, 3) m the scans that hit it and those that saw through it; adds to `hits`, `misses`.
 
-    `images` (k, 70, 902) cm, `T_lidar_map` (k, 4, 4). Only scans with the position in range count. A return is a hit
-    within a margin that grows with range.
+    `images` (k, 70, 902) cm, `T_lidar_map` (k, 4, 4), of which those at the places `chosen` are asked. Only scans with
+    the position in range count. A return is a hit within a margin that grows with range.
     """
     p_lidar, index = np.empty((3, BLOCK)), np.empty(BLOCK, np.int32)
     corners, lows, highs = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.uint16), np.empty(BLOCK, np.uint16)
     for start in range(0, len(positions), BLOCK):
         here = positions[start : start + BLOCK]
-        for k in range(len(images)):
+        for k in chosen:
             count = _in_range(here, T_lidar_map[k], nearest_m, farthest_m, p_lidar, index)
             xs, ys, zs, drawn = p_lidar[0], p_lidar[1], p_lidar[2], images[k].reshape(-1)
             for i in range(count):

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.scans.prefetch import prefetch, threads
 
-THREADS = min(os.cpu_count() or 1, 4)
+THREADS = min(threads(), 4)
 """More threads would wait for the one that reads, each with two scans in memory."""
 POINTS_PER_BLOCK = 1 << 14
 """Positions that one thread works on at a time."""
-APART_M, APART_S = 1.0, 1.0
+APART_M, APART_S = 2.0, 2.0
 """Distance and time between keyframe scans, whichever comes first: the scans take no more memory than the map."""
 NEAREST_M = 3.0
 """A scan nearer to a position than this is no evidence: the vehicle itself is in the way."""
 MARGIN_M, MARGIN_RATIO = 0.3, 0.01
 """A range within this, plus this share of the range, of a position is a hit: noise of ranges and poses."""
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Range image and pose of one scan."""
+
+    image: NDArray[np.uint16]
+    """(h, w) cm."""
+    T_lidar_map: NDArray[np.float64]
+    """(4, 4)."""
+
+    @classmethod
+    def of(cls, p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64]) -> RangeImage:
+        """The range image of the points (n, 3) m of a scan, seen from its pose (4, 4)."""
+        seen = cls(range_images.empty_image(), np.asarray(np.linalg.inv(T_map_lidar), np.float64))
+        range_images.draw(p_map, seen.T_lidar_map, seen.image)
+        return seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,31 +50,37 @@ class KeyframeScans:
     """(k, 4, 4): poses."""
 
     @classmethod
-    def of(cls, scans: list[tuple[NDArray[np.uint16], NDArray[np.float64]]]) -> KeyframeScans:
+    def of(cls, scans: Sequence[RangeImage]) -> KeyframeScans:
         """Range images with their poses, at least one."""
-        images, poses = zip(*scans, strict=True)
-        return cls(np.stack(images), np.stack(poses))
+        return cls(np.stack([one.image for one in scans]), np.stack([one.T_lidar_map for one in scans]))
 
     def near(self, positions: NDArray[np.float64], reach_m: float) -> KeyframeScans:
         """The scans at most `reach_m` from the bounding box of positions (m, 3) m: few scans of a long drive."""
-        origins = -np.einsum("kji,kj->ki", self.T_lidar_map[:, :3, :3], self.T_lidar_map[:, :3, 3])
-        outside = np.maximum(positions.min(axis=0) - origins, origins - positions.max(axis=0)).max(axis=1)
-        close = outside <= reach_m
+        close = are_near(self.T_lidar_map, positions, reach_m)
         return self if close.all() else KeyframeScans(self.images[close], self.T_lidar_map[close])
+
+
+def are_near(
+    T_lidar_map: NDArray[np.float64], positions: NDArray[np.float64], reach_m: float
+) -> NDArray[np.bool_]:
+    """Which poses (k, 4, 4) are at most `reach_m` from the bounding box of positions (m, 3) m: (k,)."""
+    origins = -np.einsum("kji,kj->ki", T_lidar_map[:, :3, :3], T_lidar_map[:, :3, 3])
+    outside = np.maximum(positions.min(axis=0) - origins, origins - positions.max(axis=0)).max(axis=1)
+    return np.asarray(outside <= reach_m)
 
 
 class KeyframeSelector:
     """Selects keyframe scans at regular distances along a drive."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[NDArray[np.uint16], NDArray[np.float64]]] = []
+        self._kept: list[RangeImage] = []
         self._stamp, self._origin = -np.inf, np.full(3, np.inf)
 
-    def add(self, stamp: float, image: NDArray[np.uint16], T_lidar_map: NDArray[np.float64]) -> None:
+    def add(self, stamp: float, seen: RangeImage) -> None:
         """Keep a scan that is APART_S or APART_M from the last one that was kept."""
-        origin = np.linalg.inv(T_lidar_map)[:3, 3]
+        origin = np.linalg.inv(seen.T_lidar_map)[:3, 3]
         if stamp - self._stamp >= APART_S or np.linalg.norm(origin - self._origin) >= APART_M:
-            self._kept.append((image, T_lidar_map))
+            self._kept.append(seen)
             self._stamp, self._origin = stamp, origin
 
     def keyframes(self) -> KeyframeScans | None:
@@ -76,9 +99,9 @@ def hits_and_misses(
     counts = np.zeros((2, len(positions)), np.int32)
 
     def count(part: slice) -> None:
-        close = keyframes.near(positions[part], farthest_m)
+        close = np.flatnonzero(are_near(keyframes.T_lidar_map, positions[part], farthest_m))
         range_images.count_hits_and_misses(
-            positions[part], close.images, close.T_lidar_map,
+            positions[part], keyframes.images, keyframes.T_lidar_map, close,
             NEAREST_M, farthest_m, MARGIN_M, MARGIN_RATIO, *counts[:, part],
         )  # fmt: skip
 

@@ -20,10 +20,9 @@ from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import CELLS, CalibrationDrive, LabelCalibration, cells_of
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
-from gnss_sem_map.refinement.height_above_ground import height_over_ground
+from gnss_sem_map.refinement.by_tile import run_steps
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.potts_mrf import LEAST_PROBABILITY
-from gnss_sem_map.refinement.steps import run_steps
 from gnss_sem_map.refinement.systematic_error import doubted
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import open_segmenter
@@ -76,7 +75,7 @@ def measure(
     """
     tables, c = Tables.of(voxels.label_set), len(voxels.label_set.names)
     state, _ = run_steps(voxels, drive.settings.refinement)
-    cells = cells_of(height_over_ground(voxels.centres), flatness(voxels.keys))
+    cells = cells_of(state.heights, flatness(voxels.keys))
     answers, found = np.zeros((c, c + 1), np.int64), np.zeros((c, CELLS[0] * CELLS[1]), np.int64)
     true_classes, rows = [], []
     for done, seen in enumerate(labelled_scans(drive, RunStats())):

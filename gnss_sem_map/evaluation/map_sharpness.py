@@ -8,7 +8,8 @@ sharp.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -48,13 +49,13 @@ class SharpnessSettings(BaseModel):
 
     nearest_m: float = Field(3.5, ge=0, description="Nearer returns are left out.")
     farthest_m: float = Field(50.0, gt=0, description="Farther returns are left out.")
-    every_nth_point: int = Field(3, gt=0, description="Of every sweep, this part of the points is used.")
+    every_nth_point: int = Field(5, gt=0, description="Of every sweep, this part of the points is used.")
     cell_size_m: float = Field(0.5, gt=0, description="Edge of the cubes whose thickness is measured.")
     min_points: int = Field(30, ge=4, description="Cubes with fewer points do not count.")
     min_scans: int = Field(10, gt=0, description="Nor do cubes with points of fewer sweeps.")
     voxel_size_m: float = Field(0.2, gt=0, description="Edge of the voxels that are counted.")
     max_scans: int = Field(
-        400, gt=0, description="A longer drive is sampled in stretches that sum up to this."
+        200, gt=0, description="A longer drive is sampled in stretches that sum up to this."
     )
     stretch_scans: int = Field(40, gt=0, description="Sweeps in a row of every stretch.")
 
@@ -91,25 +92,67 @@ def of_clouds(
     return _sharpness([stretch], length_m)
 
 
+class SweepSample:
+    """The sweeps of a drive with which sharpness is measured, thinned; a sweep that another stage reads is kept.
+
+    Memory is bounded by the settings: 200 sweeps of 100,000 points take 100 MB.
+    """
+
+    def __init__(self, log: SensorLog, settings: SharpnessSettings | None = None) -> None:
+        self.log, self.settings = log, settings or SharpnessSettings()
+        self.stretches = _stretches(log.scans, self.settings)
+        self._kept: dict[float, Points] = {}
+
+    def listening(self) -> SensorLog:
+        """The same log, of which the sweeps of the sample are kept when they are read."""
+        sampled = {scan.stamp for stretch in self.stretches for scan in stretch}
+        scans = (
+            replace(scan, read=partial(self._read, scan)) if scan.stamp in sampled else scan
+            for scan in self.log.scans
+        )
+        return replace(self.log, scans=tuple(scans))
+
+    def take(self, scan: Scan) -> Points:
+        """The thinned points of a sweep, which are no longer kept; raises DataError where they have to be read."""
+        kept = self._kept.pop(scan.stamp, None)
+        return self._thinned(scan.read()) if kept is None else kept
+
+    def _read(self, scan: Scan) -> Points:
+        points = scan.read()
+        self._kept[scan.stamp] = self._thinned(points)
+        return points
+
+    def _thinned(self, points: Points) -> Points:
+        every = self.settings.every_nth_point
+        rows = points.rows.reshape(-1, 4)[::every].copy()
+        stamps = None if points.stamps is None else points.stamps[::every].copy()
+        return Points(rows[:, :3], rows[:, 3], stamps)
+
+
 def of_drive(
     log: SensorLog,
     trajectories: Sequence[Trajectory],
     settings: SharpnessSettings | None = None,
     progress: Progress = silent,
 ) -> list[Sharpness]:
-    """Sharpness of one drive by each of several trajectories; every sweep is read once.
+    """Sharpness of one drive by each of several trajectories; see `of_sample`."""
+    return of_sample(SweepSample(log, settings), trajectories, progress)
+
+
+def of_sample(
+    sample: SweepSample, trajectories: Sequence[Trajectory], progress: Progress = silent
+) -> list[Sharpness]:
+    """Sharpness of a drive by each of several trajectories; a sweep that is not kept is read once.
 
     Sweeps that cannot be read, or that are outside of a trajectory, are left out for all of them. Moving objects are
     included: they blur the map in the same way for every trajectory.
     """
-    settings = settings or SharpnessSettings()
-    stretches = _stretches(log.scans, settings)
-    gathered = [[_Stretch(settings) for _ in stretches] for _ in trajectories]
-    stamps: list[list[float]] = [[] for _ in stretches]
-    numbered = [(n, scan) for n, stretch in enumerate(stretches) for scan in stretch]
+    gathered = [[_Stretch(sample.settings) for _ in sample.stretches] for _ in trajectories]
+    stamps: list[list[float]] = [[] for _ in sample.stretches]
+    numbered = [(n, scan) for n, stretch in enumerate(sample.stretches) for scan in stretch]
 
     def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
-        return _clouds(numbered_scan[1], trajectories, log.calibration.T_imu_lidar, settings)
+        return _clouds(numbered_scan[1], sample, trajectories)
 
     for done, ((n, scan), clouds) in enumerate(prefetch(clouds_of, numbered), 1):
         if clouds is not None:
@@ -130,17 +173,15 @@ def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tup
     return [scans[start : start + settings.stretch_scans] for start in starts.tolist()]
 
 
-def _clouds(
-    scan: Scan, trajectories: Sequence[Trajectory], T_imu_lidar: Array, settings: SharpnessSettings
-) -> list[_Cloud] | None:
+def _clouds(scan: Scan, sample: SweepSample, trajectories: Sequence[Trajectory]) -> list[_Cloud] | None:
     """A sweep in the map by each trajectory; None if it cannot be read, or is outside of a trajectory or the map."""
-    every, (nearest_m, farthest_m) = settings.every_nth_point, (settings.nearest_m, settings.farthest_m)
+    settings, T_imu_lidar = sample.settings, sample.log.calibration.T_imu_lidar
     try:
-        points = scan.read()
-        stamps = None if points.stamps is None else points.stamps[::every]
-        some = Points(points.xyz[::every], points.intensity[::every], stamps)
+        points = sample.take(scan)
         placed = [
-            usable_points_in_map(some, scan.stamp, t, T_imu_lidar, nearest_m, farthest_m)[0]
+            usable_points_in_map(points, scan.stamp, t, T_imu_lidar, settings.nearest_m, settings.farthest_m)[
+                0
+            ]
             for t in trajectories
         ]
         return [_Cloud.of(p_map, settings) for p_map in placed]

@@ -13,12 +13,12 @@ from PIL import Image
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.point_cloud import drawable, visible
-from gnss_sem_map.export.raster import NO_VOXELS, NOTHING, TopView, top_view
-from gnss_sem_map.export.render import Camera, draw_cubes, hollows, lit
+from gnss_sem_map.export.exported import NO_VOXELS, Exported
+from gnss_sem_map.export.raster import NOTHING, TopView, top_view
+from gnss_sem_map.export.render import Camera, Picture, draw_cubes, hollows, lit
 from gnss_sem_map.files.atomic import replacing
-from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels.tiles import TILE_BITS, Tile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +40,8 @@ BEHIND_M, ABOVE_M = 13.0, 10.0
 """Vector from the vehicle to the virtual camera."""
 AHEAD_M, BELOW_M = 24.0, 2.0
 """Vector from the vehicle to the point on the road ahead that the virtual camera looks at."""
+SKETCHED_M = 2 * (AHEAD_M + BEHIND_M)
+"""How far around its target a camera is judged by what it sees."""
 BEAD_M = 0.12
 TRACK_COLOUR = (255, 214, 10)
 SKY = np.array([[13, 17, 28], [38, 48, 66]], np.float32)
@@ -57,88 +59,90 @@ _MATPLOTLIB = Lock()
 """Its figures may not be drawn by two threads at once."""
 
 
-def write_topview(
-    semantic_map: SemanticMap,
-    path: Path | str,
-    trajectory: Trajectory | None = None,
-    title: str | None = None,
-) -> None:
+def write_topview(exported: Exported, path: Path | str) -> None:
     """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the track.
 
     North is up; of every column the highest labelled voxel is seen, light grey where no camera saw any; what is
     high darkens what lies beside it. Small maps get several pixels per voxel, large ones several voxels per pixel.
     Raises DataError for an empty map or when the file cannot be written.
     """
-    view = top_view(semantic_map, LONGEST_SIDE_PX)
-    label_set = semantic_map.voxels.label_set
+    view = top_view(exported, LONGEST_SIDE_PX)
+    label_set, trajectory = exported.map.label_set, exported.driven
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
-    entries = _legend_entries(view.labels, label_set, _unlabelled(view.labels, UNLABELLED_BY_DAY))
+    counts = np.bincount(view.labels[view.labels != NOTHING] + 1, minlength=1 + len(label_set.names))
+    entries = _legend_entries(np.roll(counts, -1), label_set, UNLABELLED_BY_DAY)
     if trajectory is not None:
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
     strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // columns)
     with _MATPLOTLIB:
-        figure, axes = _frame(view, image, zoom, strip_px)
+        figure, axes, page = _frame(view, image, zoom, strip_px)
         strip = _strip(figure, strip_px)
         _draw_entries(strip, entries, columns, "black")
         _draw_scale_and_north(strip, view.cell_m / zoom)
         if trajectory is not None:
             _draw_track(axes, trajectory)
-        if title is not None:
-            axes.set_title(title, fontsize=11, loc="left", parse_math=False)
-        pixels = _drawn(figure)
+        if exported.title is not None:
+            axes.set_title(exported.title, fontsize=11, loc="left", parse_math=False)
+        pixels = _drawn(figure, page)
     _write_png(pixels, path)
 
 
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     """(rows, columns, 3) RGB: the class colours, lighter with height, darker beside something higher."""
     # labels -2 (nothing) and -1 (unlabelled) count from the end
-    unlabelled = _unlabelled(view.labels, UNLABELLED_BY_DAY)
+    unlabelled = UNLABELLED_BY_DAY if (view.labels >= 0).any() else UNLABELLED_ALONE
     palette = np.vstack([label_set.colours, (255, 255, 255), unlabelled]) / 255
-    empty = view.labels == NOTHING
     low, high = np.nanpercentile(view.heights, [2, 98])
     lightness = np.clip((view.heights - low) / max(high - low, 1.0), 0, 1)
     shade = (0.85 + 0.2 * lightness) * np.exp(-0.25 * hollows(-view.heights, reach=1, most=3.0))
-    image = palette[view.labels] * np.where(empty, 1.0, shade)[..., None]
-    return np.asarray(np.rint(255 * np.clip(image, 0, 1)), np.uint8)
+    shade[view.labels == NOTHING] = 1.0
+    image = np.empty((*view.labels.shape, 3), np.uint8)
+    for channel, colours in enumerate(palette.T):  # all at once would take hundreds of MB
+        image[..., channel] = np.rint(255 * np.clip(colours[view.labels] * shade, 0, 1))
+    return image
 
 
 def _legend_entries(
-    labels: NDArray[np.int8], label_set: LabelSet, unlabelled: Colour
+    counts: NDArray[np.int64], label_set: LabelSet, unlabelled: Colour
 ) -> list[tuple[str, Colour]]:
-    """Name and colour of the classes among these labels."""
+    """Name and colour of the classes of which there are any; `counts` (c + 1,), the last of what has no label."""
     entries: list[tuple[str, Colour]] = [
         (name, colour)
-        for i, (name, colour) in enumerate(zip(label_set.names, label_set.colours, strict=True))
-        if (labels == i).any()
+        for name, colour, count in zip(label_set.names, label_set.colours, counts[:-1], strict=True)
+        if count
     ]
-    what = "no camera saw it" if entries else "no labels"
-    return entries + [(what, unlabelled)] * bool((labels == UNLABELLED).any())
+    if counts[-1]:
+        entries.append(("no camera saw it", unlabelled) if entries else ("no labels", UNLABELLED_ALONE))
+    return entries
 
 
-def _unlabelled(labels: NDArray[np.int8], beside_others: Colour) -> Colour:
-    """Colour of unlabelled voxels."""
-    return beside_others if (labels >= 0).any() else UNLABELLED_ALONE
+def _frame(
+    view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int
+) -> tuple[Figure, Any, NDArray[np.uint8]]:
+    """The image on a page, with room for the title above and a strip of `strip_px` below; a figure and axes over it.
 
-
-def _frame(view: TopView, image: NDArray[np.uint8], zoom: int, strip_px: int) -> tuple[Figure, Any]:
-    """A figure whose pixels are the image's, with room for the title above and a strip of `strip_px` below."""
+    matplotlib draws over the page: its own images would take ten times the memory.
+    """
     height, width = image.shape[:2]
     tall, wide = max(height, LOWEST_PX), max(width, NARROWEST_PX)
     full = (wide + 2 * MARGIN_PX, tall + TITLE_PX + strip_px)
-    figure = _figure(*full, "white")
-    axes = figure.add_axes((MARGIN_PX / full[0], strip_px / full[1], wide / full[0], tall / full[1]))
+    page = np.full((full[1], full[0], 3), 255, np.uint8)
+    top, left = TITLE_PX + (tall - height) // 2, MARGIN_PX + (wide - width) // 2
+    page[top : top + height, left : left + width] = image
+    figure = _figure(*full)
+    place = (MARGIN_PX / full[0], strip_px / full[1], wide / full[0], tall / full[1])
+    axes = figure.add_axes(place, facecolor="none")
     pixel_m = view.cell_m / zoom
     east, south = view.west + width * pixel_m, view.north - height * pixel_m
-    axes.imshow(image, extent=(view.west, east, south, view.north), interpolation="nearest")
     beside_m, above_m = (wide - width) / 2 * pixel_m, (tall - height) / 2 * pixel_m
     axes.set_xlim(view.west - beside_m, east + beside_m)
     axes.set_ylim(south - above_m, view.north + above_m)
     axes.set(xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_color("#b0b0b0")
-    return figure, axes
+    return figure, axes, page
 
 
 def _draw_track(axes: Any, trajectory: Trajectory) -> None:
@@ -190,73 +194,65 @@ def _round_length(longest_m: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= longest_m))
 
 
-def write_perspective(
-    semantic_map: SemanticMap,
-    path: Path | str,
-    trajectory: Trajectory | None = None,
-    at_s: float | None = None,
-    camera: Camera | None = None,
-) -> None:
+def write_perspective(exported: Exported, path: Path | str, camera: Camera | None = None) -> None:
     """Draw the map as PNG, as seen by a virtual camera behind and above the vehicle, with legend and track.
 
-    The vehicle is where it was at the stamp `at_s`, by default where the camera sees most of the map; without a
-    trajectory the camera looks at the whole map from the south. Or give a `camera`. Raises DataError for an empty
-    map or when the file cannot be written, and MeasurementError when `at_s` lies outside the trajectory.
+    The vehicle is where the camera sees most of the map; without a track the camera looks at the whole map from the
+    south. Or give a `camera`. Raises DataError for an empty map or when the file cannot be written.
     """
-    kept = drawable(semantic_map)
-    if not kept.any():
+    extent, label_set, track = exported.extent, exported.map.label_set, exported.driven
+    if not extent.count:
         raise DataError(NO_VOXELS)
-    centres, labels = semantic_map.voxels.centres[kept], semantic_map.labels[kept]
     if camera is None:
-        framed, voxel_m = visible(semantic_map)[kept], semantic_map.voxels.voxel_size_m
-        if trajectory is None:
-            camera = _from_the_south(centres[framed])
-        else:
-            at_s = _best_stamp(trajectory, centres, framed, voxel_m) if at_s is None else at_s
-            camera = _behind(trajectory, at_s)
-    track = np.empty((0, 3)) if trajectory is None else _beads(trajectory)
-    half_m = np.repeat([semantic_map.voxels.voxel_size_m / 2, BEAD_M / 2], [len(centres), len(track)])
-    unlabelled = _unlabelled(labels, UNLABELLED_BY_NIGHT)
-    palette = np.vstack([semantic_map.voxels.label_set.colours, unlabelled])  # -1 is the last
-    rgb = np.vstack([palette[labels], np.tile(TRACK_COLOUR, (len(track), 1))])
-    image = _lit(np.vstack([centres, track]), half_m, rgb, camera)
-    entries = _legend_entries(labels, semantic_map.voxels.label_set, unlabelled)
-    if trajectory is not None:
+        camera = _from_the_south(exported) if track is None else _best_behind(track, exported)
+    unlabelled = UNLABELLED_BY_NIGHT if extent.labels[:-1].any() else UNLABELLED_ALONE
+    image = _lit(exported, np.vstack([label_set.colours, unlabelled, TRACK_COLOUR]), camera)
+    entries = _legend_entries(extent.labels, label_set, unlabelled)
+    if track is not None:
         entries.append(("track", TRACK_COLOUR))
     _write_png(np.vstack([image, _legend(image.shape[1], entries)]), path)
 
 
-def _behind(trajectory: Trajectory, at_s: float) -> Camera:
+def _behind(T_map_imu: NDArray[np.float64]) -> Camera:
     """Virtual camera behind and above the vehicle, in driving direction."""
-    T_map_imu = trajectory.at([at_s])[0]
     vehicle, forward = T_map_imu[:3, 3], T_map_imu[:3, 0] * (1, 1, 0)
     forward /= np.linalg.norm(forward)
     up = np.array([0.0, 0.0, 1.0])
     return _camera(vehicle - BEHIND_M * forward + ABOVE_M * up, vehicle + AHEAD_M * forward - BELOW_M * up)
 
 
-def _best_stamp(
-    trajectory: Trajectory, centres: NDArray[np.float64], framed: NDArray[np.bool_], voxel_m: float
-) -> float:
-    """The stamp, of a few candidates before the end of the track, with most voxels in view."""
-    along = _along(trajectory)
-    stamps = trajectory.stamps[along <= max(0.0, along[-1] - AHEAD_M / 2)]
-    stamps = stamps[:: 1 + len(stamps) // 20]
-    seen = []
-    for at_s in stamps:
-        camera = _behind(trajectory, at_s)
-        near = np.flatnonzero(np.linalg.norm(centres - camera.target, axis=1) < 2 * (AHEAD_M + BEHIND_M))
-        sketch = replace(camera, width_px=camera.width_px // 6, height_px=camera.height_px // 6)
-        cubes = draw_cubes(centres[near], np.full(len(near), voxel_m / 2), sketch).cube
-        in_view = np.zeros(len(near), np.bool_)
-        in_view[cubes[cubes >= 0]] = True
-        seen.append(np.count_nonzero(in_view & framed[near]))
-    return float(stamps[np.argmax(seen)])
+def _best_behind(track: Trajectory, exported: Exported) -> Camera:
+    """The camera behind the vehicle, of a few before the end of the track, with most voxels in view.
+
+    These are compared in small pictures, in which one column of voxels stands for four.
+    """
+    along, voxel_m = _along(track), exported.map.voxel_size_m
+    poses = track.T_map_imu[along <= max(0.0, along[-1] - AHEAD_M / 2)]
+    cameras = [_behind(pose) for pose in poses[:: 1 + len(poses) // 20]]
+    sketches = [replace(each, width_px=each.width_px // 6, height_px=each.height_px // 6) for each in cameras]
+    pictures = [Picture.empty(sketch) for sketch in sketches]
+    drawn = 0
+    for tile in exported.map.tiles:
+        near = [i for i, each in enumerate(cameras) if _distance(tile, voxel_m, each.target) < SKETCHED_M]
+        if not near:
+            continue
+        piece = exported.map.read_tile(tile)
+        chosen = exported.extent.drawable(piece) & (piece.voxels.indices[:, :2] % 2 == 0).all(axis=1)
+        centres, numbers = piece.voxels.centres[chosen], np.arange(drawn, drawn + len(piece), dtype=np.int32)
+        numbers[~exported.extent.visible(piece)] = -1  # hides others and does not count
+        drawn += len(piece)
+        for i in near:
+            sketch = sketches[i]
+            draw_cubes(pictures[i], sketch, centres, voxel_m, numbers[chosen], sketch.target, SKETCHED_M)
+    seen = [len(np.unique(picture.cube[picture.cube >= 0])) for picture in pictures]
+    return cameras[int(np.argmax(seen))]
 
 
-def _from_the_south(centres: NDArray[np.float64]) -> Camera:
-    middle = (centres.min(axis=0) + centres.max(axis=0)) / 2
-    distance = max(20.0, 0.8 * float(np.ptp(centres[:, :2], axis=0).max()))
+def _from_the_south(exported: Exported) -> Camera:
+    low, high = (
+        (0.5 + edge) * exported.map.voxel_size_m for edge in (exported.extent.low, exported.extent.high)
+    )
+    middle, distance = (low + high) / 2, max(20.0, 0.8 * float((high - low)[:2].max()))
     return _camera(middle + distance * np.array([0, -1, 0.6]), middle)
 
 
@@ -277,19 +273,48 @@ def _along(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)))
 
 
-def _lit(
-    centres: NDArray[np.float64], half_m: NDArray[np.float64], rgb: NDArray[np.uint8], camera: Camera
-) -> NDArray[np.uint8]:
-    """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog."""
+def _lit(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog, nearest tiles first.
+
+    The palette holds the colours of the classes, of no label, and of the track.
+    """
     distance = float(np.linalg.norm(camera.target - camera.eye))
-    near = np.linalg.norm(centres - camera.eye, axis=1) < 10 * distance
-    colours = np.vstack([rgb[near], [[0, 0, 0]]]).astype(np.float32)  # the sky is cube -1, the last
     fine = replace(
         camera, width_px=SUPERSAMPLING * camera.width_px, height_px=SUPERSAMPLING * camera.height_px
     )
-    picture = draw_cubes(centres[near], half_m[near], fine)
+    picture, tiled_map, reach_m = Picture.empty(fine), exported.map, 10 * distance
+    unlabelled, track = len(palette) - 2, len(palette) - 1
+    if exported.driven is not None:
+        beads = _beads(exported.driven)
+        draw_cubes(
+            picture, fine, beads, BEAD_M / 2, np.full(len(beads), track, np.int32), camera.eye, reach_m
+        )
+    distances = {tile: _distance(tile, tiled_map.voxel_size_m, camera.eye) for tile in tiled_map.tiles}
+    for tile in sorted((tile for tile in distances if distances[tile] < reach_m), key=distances.__getitem__):
+        piece = tiled_map.read_tile(tile)
+        chosen = exported.extent.drawable(piece)
+        numbers = np.where(piece.labels < 0, unlabelled, piece.labels)[chosen].astype(np.int32)
+        centres, half_m = piece.voxels.centres[chosen], tiled_map.voxel_size_m / 2
+        order = _nearest_first(centres, camera.eye, reach_m)
+        draw_cubes(picture, fine, centres[order], half_m, numbers[order], camera.eye, reach_m)
     sky = np.linspace(SKY[0], SKY[1], fine.height_px, dtype=np.float32)
-    return np.rint(lit(picture, colours, sky, distance, HOLLOWS, SUPERSAMPLING)).astype(np.uint8)
+    image = lit(picture, palette.astype(np.float32), sky, distance, HOLLOWS, SUPERSAMPLING)
+    return np.rint(image).astype(np.uint8)
+
+
+def _nearest_first(
+    centres: NDArray[np.float64], eye: NDArray[np.float64], reach_m: float
+) -> NDArray[np.int64]:
+    """The order by distance from the eye, to some thousandths of the reach: what is hidden then costs little."""
+    squares = sum(((axis - at) / reach_m) ** 2 for axis, at in zip(centres.T, eye, strict=True))
+    return np.argsort(np.minimum(4000 * np.sqrt(squares), 4001).astype(np.int16), kind="stable")
+
+
+def _distance(tile: Tile, voxel_m: float, point: NDArray[np.float64]) -> float:
+    """Horizontal distance of a point from a tile, m; 0 inside."""
+    low = np.array(tile) * (voxel_m * (1 << TILE_BITS))
+    outside = np.maximum(low - point[:2], point[:2] - (low + voxel_m * (1 << TILE_BITS)))
+    return float(np.linalg.norm(np.maximum(outside, 0)))
 
 
 def _legend(width: int, entries: list[tuple[str, Colour]]) -> NDArray[np.uint8]:
@@ -297,26 +322,28 @@ def _legend(width: int, entries: list[tuple[str, Colour]]) -> NDArray[np.uint8]:
     columns = max(1, (width - 2 * MARGIN_PX) // ENTRY_PX[0])
     strip_px = 28 + ENTRY_PX[1] * -(-len(entries) // columns)
     with _MATPLOTLIB:
-        figure = _figure(width, strip_px, SKY[0] / 255)
+        figure = _figure(width, strip_px)
         _draw_entries(_strip(figure, strip_px), entries, columns, "white")
-        return _drawn(figure)
+        return _drawn(figure, np.tile(SKY[0].astype(np.uint8), (strip_px, width, 1)))
 
 
-def _figure(width: int, height: int, colour: Any) -> Figure:
-    """An empty figure of so many pixels."""
+def _figure(width: int, height: int) -> Figure:
+    """An empty figure of so many pixels, without background."""
     from matplotlib.figure import Figure
 
     beyond = 1e-6  # matplotlib truncates: 54.999... would be 54
-    return Figure(figsize=((width + beyond) / DPI, (height + beyond) / DPI), dpi=DPI, facecolor=colour)
+    return Figure(figsize=((width + beyond) / DPI, (height + beyond) / DPI), dpi=DPI, facecolor="none")
 
 
-def _drawn(figure: Figure) -> NDArray[np.uint8]:
-    """The pixels of a figure, (h, w, 3) RGB."""
+def _drawn(figure: Figure, page: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The pixels of a page (h, w, 3) RGB with a figure drawn over them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3]
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    pixels = np.asarray(renderer.buffer_rgba())
+    pixels[..., :3], pixels[..., 3] = page, 255
+    figure.draw(renderer)
+    return pixels[..., :3]
 
 
 def _write_png(pixels: NDArray[np.uint8], path: Path | str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.utm import to_utm
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import unpack
+from gnss_sem_map.voxels.tiles import TiledMap
 
 if TYPE_CHECKING:
     import laspy
@@ -28,8 +28,8 @@ PLY_TYPES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
 PLY_UNLABELLED = 255
 UNLABELLED_COLOUR = (150, 150, 150)
 LAZ_SCALE_M = 0.001
-LAZ_CHUNK = 1_000_000
-"""Points converted at a time, so that memory does not grow with the map."""
+LAZ_CHUNK = 250_000
+"""Points converted at a time."""
 NEVER_CLASSIFIED, UNCLASSIFIED = 0, 1  # ASPRS codes: nobody looked, and looked without a result
 EXTRA_BYTES = (
     ("sem_label", "uint16", "SemanticKITTI raw id, 0: none"),
@@ -45,46 +45,36 @@ def colours(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
     return palette[labels]  # -1 is the last row
 
 
-def drawable(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Voxels that a picture may show: all but the removed ones, or the removed ones if there are no others."""
-    stands = semantic_map.states != State.REMOVED
-    return np.asarray(stands if stands.any() else ~stands)
-
-
-def visible(semantic_map: SemanticMap) -> NDArray[np.bool_]:
-    """Voxels that define the extent of a picture: `shown`, or all `drawable` ones in a map without labels."""
-    return semantic_map.shown if semantic_map.shown.any() else drawable(semantic_map)
-
-
-def write_ply(semantic_map: SemanticMap, path: Path | str, frame: LocalFrame | None = None) -> None:
+def write_ply(exported: Exported, path: Path | str) -> None:
     """Write the visible voxels as a binary PLY: centre, colour, class, confidence, hits and state.
 
     Coordinates are float32 metres of the map frame (east, north, up), rounded by less than 1 mm within 8 km
-    of the origin; the comments say where `frame` puts that origin and which class each `label` is (255:
+    of the origin; the comments say where that origin is on Earth, if known, and which class each `label` is (255:
     none). Raises DataError when the file cannot be written.
     """
-    chosen = visible(semantic_map)
-    voxels = semantic_map.voxels[chosen]
+    with replacing(path) as file:
+        file.write(_ply_header(exported.map, exported.extent.count))
+        for piece in exported.map:
+            file.write(_ply_vertices(piece[exported.extent.visible(piece)]).data)
+
+
+def _ply_vertices(piece: SemanticMap) -> NDArray[np.void]:
+    voxels, labels = piece.voxels, piece.labels
     vertices = np.empty(len(voxels), PLY_VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = voxels.centres.T
-    labels = semantic_map.labels[chosen]
     vertices["red"], vertices["green"], vertices["blue"] = colours(labels, voxels.label_set).T
     vertices["label"] = np.where(labels < 0, PLY_UNLABELLED, labels)
-    vertices["confidence"] = semantic_map.confidence[chosen]
-    vertices["hits"] = voxels.hits
-    vertices["state"] = semantic_map.states[chosen]
-    with replacing(path) as file:
-        file.write(_ply_header(semantic_map, len(vertices), frame))
-        file.write(vertices.data)
+    vertices["confidence"], vertices["hits"], vertices["state"] = piece.confidence, voxels.hits, piece.states
+    return vertices
 
 
-def _ply_header(semantic_map: SemanticMap, count: int, frame: LocalFrame | None) -> bytes:
-    label_set = semantic_map.voxels.label_set
+def _ply_header(tiled_map: TiledMap, count: int) -> bytes:
+    label_set, frame = tiled_map.label_set, tiled_map.frame
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         f"comment gnss-sem-map {version('gnss-sem-map')}",
-        f"comment map frame: x east, y north, z up, metres; voxel {semantic_map.voxels.voxel_size_m} m",
+        f"comment map frame: x east, y north, z up, metres; voxel {tiled_map.voxel_size_m} m",
     ]
     if frame is not None:
         lines.append(
@@ -102,10 +92,10 @@ def _plain(name: str) -> str:
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in name)
 
 
-def write_laz(semantic_map: SemanticMap, frame: LocalFrame | None, path: Path | str) -> None:
+def write_laz(exported: Exported, path: Path | str) -> None:
     """Write every voxel as LAZ (LAS 1.4, point format 7) in the UTM zone of the map's origin.
 
-    Heights are above the WGS 84 ellipsoid; a map without a `frame` stays in its own metres, without a CRS.
+    Heights are above the WGS 84 ellipsoid; a map without a frame stays in its own metres, without a CRS.
     `classification` holds the class set's ASPRS codes, 0 where no camera looked and 1 where looking gave no class;
     removed voxels keep their class and are flagged `withheld`. Extra bytes: `sem_label` (SemanticKITTI raw id),
     `confidence`, `hits`, `state`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15
@@ -113,14 +103,16 @@ def write_laz(semantic_map: SemanticMap, frame: LocalFrame | None, path: Path | 
     """
     import laspy
 
-    header = _las_header(semantic_map.voxels.label_set, frame)
-    edges = [*range(0, len(semantic_map), LAZ_CHUNK), len(semantic_map)]
+    frame = exported.map.frame
+    header = _las_header(exported.map.label_set, frame)
     with (
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
     ):
-        for start, end in pairwise(edges):
-            writer.write_points(_las_points(semantic_map, frame, header, slice(start, end)))
+        for piece in exported.map:
+            for start in range(0, len(piece), LAZ_CHUNK):
+                part = piece[np.arange(start, min(start + LAZ_CHUNK, len(piece)))]
+                writer.write_points(_las_points(part, frame, header))
 
 
 def _las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader:
@@ -150,15 +142,13 @@ def _placed(p_map: NDArray[np.float64], frame: LocalFrame | None) -> NDArray[np.
 
 
 def _las_points(
-    semantic_map: SemanticMap, frame: LocalFrame | None, header: laspy.LasHeader, part: slice
+    piece: SemanticMap, frame: LocalFrame | None, header: laspy.LasHeader
 ) -> laspy.ScaleAwarePointRecord:
     import laspy
 
-    voxels, label_set = semantic_map.voxels, semantic_map.voxels.label_set
-    labels, states = semantic_map.labels[part], semantic_map.states[part]
+    labels, states, label_set = piece.labels, piece.states, piece.voxels.label_set
     points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
-    centres = (unpack(voxels.keys[part]).astype(np.float64) + 0.5) * voxels.voxel_size_m
-    points.x, points.y, points.z = _placed(centres, frame).T
+    points.x, points.y, points.z = _placed(piece.voxels.centres, frame).T
     points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
     points.return_number[:] = 1
     points.number_of_returns[:] = 1
@@ -166,5 +156,5 @@ def _las_points(
     points.classification = np.where(labels < 0, unlabelled, label_set.asprs_codes[labels])
     points.withheld = states == State.REMOVED
     points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
-    points.confidence, points.hits, points.state = semantic_map.confidence[part], voxels.hits[part], states
+    points.confidence, points.hits, points.state = piece.confidence, piece.voxels.hits, states
     return points

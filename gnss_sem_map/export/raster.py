@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,23 @@ from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR, drawable, visible
+from gnss_sem_map.export.exported import NO_VOXELS, Exported, Extent
+from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.files.atomic import replacing
-from gnss_sem_map.labels.label_set import UNLABELLED
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.voxels.tiles import TILE_BITS
 
 NOTHING = -2
 """Label of a cell without any voxel."""
-NO_VOXELS = "the map has no voxels to draw; run.json lists what was skipped"
 GEOTIFF_UNLABELLED, GEOTIFF_NODATA = 254, 255
 GEOTIFF_LONGEST_SIDE = 10_000
 BLOCK = 256
+BLOCKS_AT_ONCE = 2
+"""Rows of blocks for which the map is looked at together: more read a tile less often, fewer take less memory."""
+GDAL_CACHE_BYTES = 16 << 20
+ABOVE_ALL = 1 << 24
+"""Above every index of a voxel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,61 +46,98 @@ class TopView:
     """(rows, columns) m, map frame: top of the voxel that is seen; NaN where there is none."""
 
 
-def top_view(semantic_map: SemanticMap, longest_side: int) -> TopView:
+def top_view(exported: Exported, longest_side: int) -> TopView:
     """Look at the map from above: of every cell, the highest labelled voxel, else the highest unlabelled one.
 
     The view ends where the labelled voxels end; removed ones are not seen, unless all are. A cell is one voxel, or as
     many as keep the longer side within `longest_side` cells. Raises DataError for a map without voxels.
     """
-    kept = drawable(semantic_map)
-    framed = visible(semantic_map)[kept]
-    if not framed.any():
-        raise DataError(NO_VOXELS)
-    x, y, z = semantic_map.voxels.indices[kept].T
-    per_cell = max(1, -(-(1 + max(np.ptp(x[framed]), np.ptp(y[framed]))) // longest_side))
-    columns, rows = x // per_cell, -(y // per_cell)
-    west, north = columns[framed].min(), rows[framed].min()
-    shape = (int(rows[framed].max() - north) + 1, int(columns[framed].max() - west) + 1)
-    inside = (columns >= west) & (columns < west + shape[1]) & (rows >= north) & (rows < north + shape[0])
-    order = np.flatnonzero(inside)[np.lexsort((z[inside], framed[inside]))]
-    cells = np.ravel_multi_index((rows[order] - north, columns[order] - west), shape)
-    labels, heights = np.full(shape, NOTHING, np.int8), np.full(shape, np.nan, np.float32)
-    voxel_m = semantic_map.voxels.voxel_size_m
-    labels.ravel()[cells] = semantic_map.labels[kept][order]  # of repeated cells the last one stays
-    heights.ravel()[cells] = (z[order] + 1) * voxel_m
-    cell_m = float(per_cell * voxel_m)
-    return TopView(cell_m, west=west * cell_m, north=(1 - north) * cell_m, labels=labels, heights=heights)
+    cells, voxel_m = _Cells.of(exported.extent, longest_side), exported.map.voxel_size_m
+    labels, rank = _seen_in_rows(exported, cells, 0, cells.rows)
+    tops = np.where(rank > ABOVE_ALL // 2, rank - ABOVE_ALL, rank)
+    heights = np.where(labels == NOTHING, np.float32(np.nan), tops * np.float64(voxel_m)).astype(np.float32)
+    cell_m = cells.per_cell * voxel_m
+    return TopView(cell_m, cells.west * cell_m, cells.north * cell_m, labels, heights)
 
 
-def write_topview_geotiff(semantic_map: SemanticMap, frame: LocalFrame, path: Path | str) -> None:
+@dataclass(frozen=True)
+class _Cells:
+    """The cells of a view: how many voxels wide, the edges west and north in cells from the origin, and how many."""
+
+    per_cell: int
+    west: int
+    north: int
+    rows: int
+    columns: int
+
+    @classmethod
+    def of(cls, extent: Extent, longest_side: int) -> _Cells:
+        if not extent.count:
+            raise DataError(NO_VOXELS)
+        per_cell = max(1, -(-(1 + int((extent.high - extent.low)[:2].max())) // longest_side))
+        west, south, _ = (extent.low // per_cell).tolist()
+        east, north, _ = (extent.high // per_cell + 1).tolist()
+        return cls(per_cell, west, north, rows=north - south, columns=east - west)
+
+
+def _seen_in_rows(
+    exported: Exported, cells: _Cells, first: int, end: int
+) -> tuple[NDArray[np.int8], NDArray[np.int32]]:
+    """Rows [first, end) of a view: label and rank of the voxel that is seen; only the tiles of these rows are read.
+
+    The rank is the top of the voxel, in voxels, and more by `ABOVE_ALL` where it is visible: the highest rank is seen.
+    """
+    shape = (max(0, end - first), cells.columns)
+    labels, rank = np.full(shape, NOTHING, np.int8), np.full(shape, -ABOVE_ALL, np.int32)
+    low_y, high_y = (cells.north - end) * cells.per_cell, (cells.north - first) * cells.per_cell
+    for tile in exported.map.tiles:
+        if tile[1] << TILE_BITS >= high_y or (tile[1] + 1) << TILE_BITS <= low_y:
+            continue
+        piece = exported.map.read_tile(tile)
+        x, y, z = piece.voxels.indices.T
+        rows, columns = cells.north - 1 - first - y // cells.per_cell, x // cells.per_cell - cells.west
+        chosen = exported.extent.drawable(piece)
+        chosen &= (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+        here = (z + 1 + ABOVE_ALL * exported.extent.visible(piece))[chosen]
+        order = np.argsort(here, kind="stable")
+        here, cell = here[order], (rows[chosen] * shape[1] + columns[chosen])[order]
+        higher = here >= rank.ravel()[cell]
+        rank.ravel()[cell[higher]] = here[higher]  # of repeated cells the last one stays
+        labels.ravel()[cell[higher]] = piece.labels[chosen][order][higher]
+    return labels, rank
+
+
+def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
     """Write the top view as a GeoTIFF of class indices in the UTM zone of the map's origin.
 
     uint8 with a colour table: 254 is mapped but unlabelled, 255 no data; tags name the classes. Every pixel takes
     the cell under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide, or more
-    where the raster would exceed 10,000 on a side. Raises DataError for an empty map or when the file cannot be
-    written.
+    where the raster would exceed 10,000 on a side. Raises DataError for an empty map, for one without a georeference,
+    or when the file cannot be written.
     """
     import rasterio
     from rasterio.enums import Resampling
 
-    view = top_view(semantic_map, GEOTIFF_LONGEST_SIDE)
-    grid = _utm_grid(view, frame)
-    names = semantic_map.voxels.label_set.names
+    frame, label_set = exported.map.frame, exported.map.label_set
+    if frame is None:
+        raise DataError(
+            f"{exported.title}: a GeoTIFF needs a georeference; this map is in its drive's own poses"
+        )
+    cells = _Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
+    grid = _Grid.over(cells, exported, frame)
     profile = {
         "driver": "GTiff", "dtype": "uint8", "count": 1, "nodata": GEOTIFF_NODATA, "compress": "deflate",
         "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "width": grid.columns, "height": grid.rows,
         "crs": f"EPSG:{frame.utm_epsg}",
-        "transform": rasterio.Affine(view.cell_m, 0, grid.west, 0, -view.cell_m, grid.north),
+        "transform": rasterio.Affine(grid.cell_m, 0, grid.west, 0, -grid.cell_m, grid.north),
     }  # fmt: skip
-    with rasterio.MemoryFile() as memory:  # GDAL would notice a full disk too late
+    # GDAL would notice a full disk too late, and keep a twentieth of the memory full of blocks
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES), rasterio.MemoryFile() as memory:
         with memory.open(**profile) as tiff:
-            for row in range(0, grid.rows, BLOCK):
-                for column in range(0, grid.columns, BLOCK):
-                    block = _resampled(view, grid, frame, row, column)
-                    height, width = block.shape
-                    tiff.write(block, 1, window=((row, row + height), (column, column + width)))
-            tiff.write_colormap(1, _colour_table(semantic_map))
-            tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(names)})
+            for corner, block in _blocks(exported, cells, grid, frame):
+                tiff.write(block, 1, window=tuple(zip(corner, np.add(corner, block.shape), strict=True)))
+            tiff.write_colormap(1, _colour_table(label_set))
+            tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.names)})
             tiff.build_overviews(_overviews(grid), Resampling.mode)
         with replacing(path) as file:
             file.write(memory.getbuffer())
@@ -104,55 +147,74 @@ def write_topview_geotiff(semantic_map: SemanticMap, frame: LocalFrame, path: Pa
 class _Grid:
     """The pixels of the GeoTIFF: upper left corner in UTM m, size, and the height at which they are transformed."""
 
+    cell_m: float
     west: float
     north: float
     rows: int
     columns: int
     alt_m: float
 
+    @classmethod
+    def over(cls, cells: _Cells, exported: Exported, frame: LocalFrame) -> _Grid:
+        """Pixels as wide as the cells, over all of these."""
+        voxel_m = exported.map.voxel_size_m
+        cell_m, height = cells.per_cell * voxel_m, exported.extent.mean[2] * voxel_m
+        u, v = map(np.ravel, np.meshgrid(np.linspace(0, cells.columns, 9), np.linspace(0, cells.rows, 9)))
+        east, north = (cells.west + u) * cell_m, (cells.north - v) * cell_m
+        box = to_utm(frame, np.column_stack([east, north, np.full(len(u), height)]))
+        low = np.floor(box[:, :2].min(axis=0) / cell_m).astype(int)
+        high = np.ceil(box[:, :2].max(axis=0) / cell_m).astype(int)
+        columns, rows = (high - low).tolist()
+        return cls(cell_m, low[0] * cell_m, high[1] * cell_m, rows, columns, float(np.median(box[:, 2])))
 
-def _utm_grid(view: TopView, frame: LocalFrame) -> _Grid:
-    rows, columns = view.labels.shape
-    height = float(np.nanmedian(view.heights))
-    u, v = (np.ravel(part) for part in np.meshgrid(np.linspace(0, columns, 9), np.linspace(0, rows, 9)))
-    east, north = view.west + u * view.cell_m, view.north - v * view.cell_m
-    box = to_utm(frame, np.column_stack([east, north, np.full(len(u), height)]))
-    low = np.floor(box[:, :2].min(axis=0) / view.cell_m).astype(int)
-    high = np.ceil(box[:, :2].max(axis=0) / view.cell_m).astype(int)
-    columns, rows = (high - low).tolist()
-    return _Grid(low[0] * view.cell_m, high[1] * view.cell_m, rows, columns, float(np.median(box[:, 2])))
 
+def _blocks(
+    exported: Exported, cells: _Cells, grid: _Grid, frame: LocalFrame
+) -> Iterator[tuple[tuple[int, int], NDArray[np.uint8]]]:
+    """Row and column of the upper left pixel of every block of the GeoTIFF, and the block.
 
-def _resampled(view: TopView, grid: _Grid, frame: LocalFrame, row: int, column: int) -> NDArray[np.uint8]:
-    """One block of the GeoTIFF.
-
-    The way back to the map frame is exact at the block's corners and bilinear between them, which is wrong by 3 µm
-    over 256 pixels of 0.2 m. It is taken at one height; a point dh above it is displaced by dh times its distance
+    The way back to the map frame is exact at the corners of the blocks and bilinear between them, which is wrong by
+    3 µm over 256 pixels of 0.2 m. It is taken at one height; a point dh above it is displaced by dh times its distance
     over the Earth's radius: 2 cm for 20 m at 6 km.
     """
-    rows, columns = min(BLOCK, grid.rows - row), min(BLOCK, grid.columns - column)
-    u, v = np.arange(columns) + 0.5, np.arange(rows) + 0.5
-    easting = grid.west + (column + np.array([0, columns, 0, columns])) * view.cell_m
-    northing = grid.north - (row + np.array([0, 0, rows, rows])) * view.cell_m
-    corners = from_utm(frame, np.column_stack([easting, northing, np.full(4, grid.alt_m)]))[:, :2]
-    right, down = (u / columns)[None, :, None], (v / rows)[:, None, None]
-    upper = (1 - right) * corners[0] + right * corners[1]
-    lower = (1 - right) * corners[2] + right * corners[3]
-    east, north = np.moveaxis((1 - down) * upper + down * lower, -1, 0)
-    view_columns = np.floor((east - view.west) / view.cell_m).astype(np.int64)
-    view_rows = np.floor((view.north - north) / view.cell_m).astype(np.int64)
-    inside = (view_columns >= 0) & (view_columns < view.labels.shape[1])
-    inside &= (view_rows >= 0) & (view_rows < view.labels.shape[0])
-    block = np.full((rows, columns), NOTHING, np.int16)
-    block[inside] = view.labels[view_rows[inside], view_columns[inside]]
+    rows = np.append(np.arange(0, grid.rows, BLOCK), grid.rows)
+    columns = np.append(np.arange(0, grid.columns, BLOCK), grid.columns)
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    utm = np.stack(
+        [grid.west + u * grid.cell_m, grid.north - v * grid.cell_m, np.full(u.shape, grid.alt_m)], -1
+    )
+    east, north, _ = np.moveaxis(from_utm(frame, utm), -1, 0)
+    # corners of the blocks, in cells from the view's upper left corner
+    corners = np.stack([cells.north - north / grid.cell_m, east / grid.cell_m - cells.west], axis=-1)
+    for i in range(0, len(rows) - 1, BLOCKS_AT_ONCE):
+        end = min(i + BLOCKS_AT_ONCE, len(rows) - 1)
+        first = max(0, int(corners[i : end + 1, :, 0].min()) - 1)
+        last = min(cells.rows, int(corners[i : end + 1, :, 0].max()) + 2)
+        labels, _ = _seen_in_rows(exported, cells, first, last)
+        for k, j in np.ndindex(end - i, len(columns) - 1):
+            corner = int(rows[i + k]), int(columns[j])
+            shape = int(rows[i + k + 1]) - corner[0], int(columns[j + 1]) - corner[1]
+            yield corner, _resampled(labels, corners[i + k : i + k + 2, j : j + 2] - (first, 0), shape)
+
+
+def _resampled(
+    labels: NDArray[np.int8], corners: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """One block: its corners (2, 2, 2) are places in the array of labels, in cells."""
+    down = ((np.arange(shape[0]) + 0.5) / shape[0])[:, None, None]
+    right = ((np.arange(shape[1]) + 0.5) / shape[1])[None, :, None]
+    upper, lower = ((1 - right) * edge[0] + right * edge[1] for edge in corners)
+    rows, columns = np.moveaxis(np.floor((1 - down) * upper + down * lower).astype(np.int64), -1, 0)
+    inside = (rows >= 0) & (rows < labels.shape[0]) & (columns >= 0) & (columns < labels.shape[1])
+    block = np.full(shape, NOTHING, np.int16)
+    block[inside] = labels[rows[inside], columns[inside]]
     block[block == UNLABELLED] = GEOTIFF_UNLABELLED
     block[block == NOTHING] = GEOTIFF_NODATA
     return block.astype(np.uint8)
 
 
-def _colour_table(semantic_map: SemanticMap) -> dict[int, tuple[Any, ...]]:
-    colours = semantic_map.voxels.label_set.colours.tolist()
-    table = {i: (*rgb, 255) for i, rgb in enumerate(colours)}
+def _colour_table(label_set: LabelSet) -> dict[int, tuple[Any, ...]]:
+    table = {i: (*rgb, 255) for i, rgb in enumerate(label_set.colours.tolist())}
     return {**table, GEOTIFF_UNLABELLED: (*UNLABELLED_COLOUR, 255), GEOTIFF_NODATA: (0, 0, 0, 0)}
 
 

@@ -52,54 +52,91 @@ class Picture:
     face: NDArray[np.int8]
     """The axis across which the visible face lies: 0 x, 1 y, 2 z."""
 
+    @classmethod
+    def empty(cls, camera: Camera) -> Picture:
+        """The picture of a camera that sees nothing yet."""
+        shape = (camera.height_px, camera.width_px)
+        return cls(np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int32), np.zeros(shape, np.int8))
 
-def draw_cubes(centres: NDArray[np.float64], half_m: NDArray[np.float64], camera: Camera) -> Picture:
-    """Draw axis-aligned cubes: centres (n, 3) m, half edges (n,) m; the nearest wins every pixel."""
-    shape = (camera.height_px, camera.width_px)
-    picture = Picture(
-        np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int32), np.zeros(shape, np.int8)
-    )
-    seen = centres - camera.eye
-    near_first = np.argsort(seen @ camera.axes[2], kind="stable")  # what is hidden then costs little
+
+def draw_cubes(
+    picture: Picture,
+    camera: Camera,
+    centres: NDArray[np.float64],
+    half_m: float,
+    numbers: NDArray[np.int32],
+    middle: NDArray[np.float64],
+    reach_m: float,
+) -> None:
+    """Draw axis-aligned cubes into a picture of the camera; the nearest of all that are drawn wins every pixel.
+
+    `centres` (n, 3) m, half an edge, and `numbers` (n,) for the picture; centres as far as `reach_m` from `middle`,
+    (3,) m, are left out.
+    """
     buffers = (picture.depth, picture.cube, picture.face)
-    _draw(seen, half_m, near_first, camera.axes, camera.focal_px, *buffers)
-    return picture
+    _draw(
+        centres - camera.eye,
+        half_m,
+        numbers,
+        middle - camera.eye,
+        reach_m,
+        camera.axes,
+        camera.focal_px,
+        *buffers,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(centres, h, numbers, middle, reach_m, axes, focal, depth, cube, face):
+    """Ray against box (slabs) for all pixels that a cube may cover; rays have forward component 1."""
+    height, width = depth.shape
+    # half the extent of a cube to the right, down and forward
+    half_right, half_down, half_forward = h * np.abs(axes).sum(axis=1)
+    for i in range(len(centres)):
+        cx, cy, cz = centres[i]
+        forward = axes[2, 0] * cx + axes[2, 1] * cy + axes[2, 2] * cz
+        near, far = forward - half_forward, forward + half_forward
+        if near < NEAREST_M:
+            continue
+        if (cx - middle[0]) ** 2 + (cy - middle[1]) ** 2 + (cz - middle[2]) ** 2 >= reach_m**2:
+            continue
+        right = axes[0, 0] * cx + axes[0, 1] * cy + axes[0, 2] * cz
+        down = axes[1, 0] * cx + axes[1, 1] * cy + axes[1, 2] * cz
+        left_column, right_column = _pixels(right, half_right, near, far, focal, width)
+        upper_row, lower_row = _pixels(down, half_down, near, far, focal, height)
+        for row in range(upper_row, lower_row):
+            y = (row + 0.5 - 0.5 * height) / focal
+            for column in range(left_column, right_column):
+                if depth[row, column] <= near:
+                    continue
+                x = (column + 0.5 - 0.5 * width) / focal
+                enter_x, leave_x = _slab(cx, h, x * axes[0, 0] + y * axes[1, 0] + axes[2, 0])
+                enter_y, leave_y = _slab(cy, h, x * axes[0, 1] + y * axes[1, 1] + axes[2, 1])
+                enter_z, leave_z = _slab(cz, h, x * axes[0, 2] + y * axes[1, 2] + axes[2, 2])
+                enter, side = enter_x, 0
+                if enter_y > enter:
+                    enter, side = enter_y, 1
+                if enter_z > enter:
+                    enter, side = enter_z, 2
+                if enter <= min(leave_x, leave_y, leave_z) and enter < depth[row, column]:
+                    depth[row, column], cube[row, column], face[row, column] = enter, numbers[i], side
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slab(centre, h, ray):
+    """Where a ray enters and leaves the space between two faces; infinite for a ray along them."""
+    a, b = (centre - h) / ray, (centre + h) / ray
+    return min(a, b), max(a, b)
 
 
 @njit(cache=True, nogil=True)
-def _draw(centres, half, order, axes, focal, depth, cube, face):
-    """Ray against box (slabs) for all pixels of every cube's bounding square; rays have forward component 1."""
-    height, width = depth.shape
-    for i in order:
-        c, h = centres[i], half[i]
-        forward = axes[2, 0] * c[0] + axes[2, 1] * c[1] + axes[2, 2] * c[2]
-        reach = 1.7320508 * h
-        if forward < NEAREST_M + reach:
-            continue
-        right = axes[0, 0] * c[0] + axes[0, 1] * c[1] + axes[0, 2] * c[2]
-        down = axes[1, 0] * c[0] + axes[1, 1] * c[1] + axes[1, 2] * c[2]
-        scale, spread = focal / forward, reach * focal / (forward - reach)
-        u, v = 0.5 * width + scale * right, 0.5 * height + scale * down
-        for row in range(max(0, int(v - spread)), min(height, int(v + spread) + 1)):
-            for column in range(max(0, int(u - spread)), min(width, int(u + spread) + 1)):
-                if depth[row, column] <= forward - reach:
-                    continue
-                x, y = (column + 0.5 - 0.5 * width) / focal, (row + 0.5 - 0.5 * height) / focal
-                enter, leave, side = 0.0, np.inf, 0
-                for k in range(3):
-                    ray = x * axes[0, k] + y * axes[1, k] + axes[2, k]
-                    if ray == 0.0:
-                        if abs(c[k]) > h:
-                            leave = -1.0
-                        continue
-                    a, b = (c[k] - h) / ray, (c[k] + h) / ray
-                    if a > b:
-                        a, b = b, a
-                    if a > enter:
-                        enter, side = a, k
-                    leave = min(leave, b)
-                if enter <= leave and enter < depth[row, column]:
-                    depth[row, column], cube[row, column], face[row, column] = enter, i, side
+def _pixels(across, half, near, far, focal, count):
+    """First and end of the pixels whose rays may meet a cube that reaches `half` around `across`, from near to far."""
+    low, high = across - half, across + half
+    first = 0.5 * count - 0.5 + focal * low / (far if low > 0 else near)
+    last = 0.5 * count - 0.5 + focal * high / (near if high > 0 else far)
+    margin = 1e-6  # of rounding
+    return max(0, int(np.ceil(first - margin))), min(count, int(np.floor(last + margin)) + 1)
 
 
 def hollows(depth: NDArray[np.float32], reach: int, most: float) -> NDArray[np.float32]:
@@ -123,9 +160,9 @@ def lit(
 ) -> NDArray[np.float32]:
     """The picture in colour, (h / s, w / s, 3) from 0 to 255: every pixel the mean of s x s, s for `supersampling`.
 
-    `rgb` (n, 3) are the cubes' colours, lit by their faces and darker in hollows; `sky` (h, 3) is what every row fades
-    into from `distance` m on. Rows of `hollow` (k, 3): reach in pixels, strength, and the most that counts, all in log
-    depth.
+    `rgb` (n, 3) are the colours of the cubes' numbers, lit by their faces and darker in hollows; `sky` (h, 3) is what
+    every row fades into from `distance` m on. Rows of `hollow` (k, 3): reach in pixels, strength, and the most that
+    counts, all in log depth.
     """
     height, width = picture.depth.shape
     image = np.zeros((height // supersampling, width // supersampling, 3), np.float32)
@@ -161,6 +198,10 @@ def _light(depth, log_depth, cube, face, rgb, sky, distance, hollow, image):
     supersampling = depth.shape[0] // image.shape[0]
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
+            pixel = image[row // supersampling, column // supersampling]
+            if cube[row, column] < 0:
+                pixel += sky[row]
+                continue
             shadow = np.float32(0)
             for k in range(len(hollow)):
                 reach, strength, most = hollow[k]
@@ -169,5 +210,4 @@ def _light(depth, log_depth, cube, face, rgb, sky, distance, hollow, image):
             clear = np.exp(min(distance - depth[row, column], np.float32(0)) / (4 * distance))
             for channel in range(3):
                 colour = light * rgb[cube[row, column], channel]
-                seen = sky[row, channel] + clear * (colour - sky[row, channel])
-                image[row // supersampling, column // supersampling, channel] += seen
+                pixel[channel] += sky[row, channel] + clear * (colour - sky[row, channel])

@@ -21,6 +21,7 @@ PICTURES = {
 }
 FILES = {
     **{each.file: each.what for each in FORMATS},
+    "viewer": "the finer voxels of viewer.html, where the map is too large for one page",
     "trajectory.png": PICTURES["trajectory.png"],
     "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
     "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
@@ -28,6 +29,7 @@ FILES = {
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
     "map": "the map before refinement, with all evidence, as Parquet tiles",
     "refined": "the refined map as Parquet tiles",
+    "drives": "map, evidence, trajectory and report of each of several drives",
     "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",

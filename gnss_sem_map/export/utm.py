@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
@@ -24,5 +26,6 @@ def from_utm(frame: LocalFrame, p_utm: NDArray[np.float64]) -> NDArray[np.float6
     return frame.to_map(lat_deg, lon_deg, alt_m)
 
 
+@lru_cache(maxsize=16)
 def _utm(frame: LocalFrame) -> Transformer:
     return Transformer.from_crs(WGS84_EPSG, frame.utm_epsg, always_xy=True)

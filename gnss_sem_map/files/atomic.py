@@ -1,9 +1,10 @@
-"""Atomic files: written under another name beside the target, then renamed."""
+"""Atomic files and folders: written under another name beside the target, then renamed."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +33,35 @@ def replacing(path: Path | str) -> Iterator[BinaryIO]:
         raise DataError(_explained(path, error)) from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def adding_folder(path: Path) -> Iterator[Path]:
+    """Make a new folder for files; it is renamed to `path` when the block succeeds, and removed when it fails or when
+    it is empty.
+
+    Raises DataError when `path` exists, when its parent does not or may not be written to, and when the disk is full.
+    """
+    if path.exists():
+        raise DataError(f"{path}: exists; move it away or choose another folder")
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        beside.mkdir()
+        yield beside
+        if any(beside.iterdir()):
+            beside.rename(path)
+    except OSError as error:
+        raise DataError(_explained(path, error)) from error
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def link_or_copy(source: Path | str, target: Path | str) -> None:
+    """A second name for a file, or a copy where the file system has no links; raises OSError."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def _explained(path: Path, error: OSError) -> str:

@@ -10,10 +10,13 @@ import hashlib
 import json
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.atomic import replacing
 
 MARKER = ".gnss-sem-map.json"
 """Name of the list of files in every folder that we write."""
@@ -92,17 +95,42 @@ def amend(folder: Path, name: str, content: bytes) -> None:
 
     Raises DataError when a file lies there that we did not write, or the disk is full.
     """
-    path, listed = folder / name, read_list(folder)
+    with _amending(folder, {name: _state_of_bytes(content)}):
+        write_whole(folder / name, content)
+
+
+def amend_all(folder: Path, source: Path) -> None:
+    """Add or replace all files and folders that lie in `source`, as `amend` does."""
+    names = sorted(_content(source))
+    with _amending(folder, {name: state_of(source / name) for name in names}):
+        for name in names:
+            if name.endswith("/"):
+                (folder / name).mkdir(exist_ok=True)
+            else:
+                with (source / name).open("rb") as content, replacing(folder / name) as file:
+                    shutil.copyfileobj(content, file)
+
+
+@contextmanager
+def _amending(folder: Path, states: Mapping[str, str]) -> Iterator[None]:
+    """List files that are written next; raises DataError for what we did not write, and for OSErrors."""
+    listed = read_list(folder)
     try:
         if listed is not None:
-            if os.path.lexists(path) and state_of(path) not in listed.get(name, []):
-                raise DataError(f"{path}: was not written by us, or was changed since; move it away")
-            states = [*listed.get(name, []), _state_of_bytes(content)]
-            _write_marker(folder, {**listed, name: list(dict.fromkeys(states))[-3:]})
-        write_whole(path, content)
+            listed = dict(listed)
+            for name, state in states.items():
+                known = listed.get(name, [])
+                if os.path.lexists(folder / name) and state_of(folder / name) not in known:
+                    raise DataError(
+                        f"{folder / name}: was not written by us, or was changed since; move it away"
+                    )
+                listed[name] = list(dict.fromkeys([*known, state]))[-3:]
+            _write_marker(folder, listed)
+        yield
     except OSError as error:
+        place = folder / next(iter(states)) if len(states) == 1 else folder
         raise DataError(
-            f"{path}: cannot be written ({error.strerror}); free the disk or see to its rights"
+            f"{place}: cannot be written ({error.strerror}); free the disk or see to its rights"
         ) from None
 
 

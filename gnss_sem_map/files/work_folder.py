@@ -3,7 +3,8 @@
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
-          motion/                the moving objects that were found (`mapping.motion_checkpoint`)
+          drives/NAME/           the maps of single drives (`runs.many_drives`)
+          .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
 """
@@ -18,14 +19,14 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, ANSWERS, MOTION, PART, OLD = "chunks.json", "answers", "motion", "part", "old"
+CHUNKS, ANSWERS, DRIVES, PART, OLD = "chunks.json", "answers", "drives", "part", "old"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json"
-    r"|(\d+|\.\d+\.\d+\.part)/(record\.json|\w+/|\w+/-?\d+_-?\d+\.npy|(\w+/)?\.[^/]+\.\d+\.part)?"
+    r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
+    r"|\.\d+\.\d+\.waiting/(\d+\.npy)?"
 )
 OURS = re.compile(
-    r"\.gnss-sem-map\.json|part/.*|old/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
-    r"|motion/((about|objects)\.json|(moving_points|keyframes)\.npz|\.[^/]+\.\d+\.part)?"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -61,7 +62,7 @@ def refuse_foreign(folder: Path) -> None:
 def holds_work(folder: Path) -> bool:
     """Whether there are intermediate results for --resume."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
-    return done or any((folder / ANSWERS).glob("*.npz")) or (folder / MOTION / "about.json").is_file()
+    return done or any((folder / ANSWERS).glob("*.npz")) or any((folder / DRIVES).glob("*/run.json"))
 
 
 def clear(folder: Path) -> None:
@@ -71,28 +72,24 @@ def clear(folder: Path) -> None:
     """
     if not folder.is_dir() or folder.is_symlink():
         return
-    remove_intermediate(folder)
+    remove_chunks(folder)
+    remove_answers(folder)
+    remove_drives(folder)
     drop_results(folder)
     if {path.name for path in folder.iterdir()} <= {ownership.MARKER}:
         (folder / ownership.MARKER).unlink(missing_ok=True)
         folder.rmdir()
 
 
-def remove_intermediate(folder: Path) -> None:
-    """Remove all intermediate results; raises OSError."""
-    remove_chunks(folder)
-    remove_answers(folder)
-    remove_motion(folder)
+def remove_drives(folder: Path) -> None:
+    """Remove the maps of single drives, which we made in a folder of ours; raises OSError."""
+    if (folder / DRIVES).is_dir():
+        shutil.rmtree(folder / DRIVES)
 
 
 def remove_answers(folder: Path) -> None:
     """Remove cached probabilities; raises OSError."""
     _remove_known(folder, folder / ANSWERS)
-
-
-def remove_motion(folder: Path) -> None:
-    """Remove the moving objects that were found; raises OSError."""
-    _remove_known(folder, folder / MOTION)
 
 
 def remove_chunks(folder: Path) -> None:

@@ -91,7 +91,7 @@ class LabelCalibration:
         """
         counts = np.stack([drive.cells.reshape(len(self.names), -1) for drive in self.drives])
         logs = np.log(_mean_share(counts, CELL_PSEUDO_COUNTS)).T.astype(np.float32)
-        return np.asarray(logs[cells_of(heights, flatness)])
+        return logs.take(cells_of(heights, flatness), axis=0)
 
     def to_yaml(self) -> str:
         """The file that `read` reads back."""

@@ -1,9 +1,13 @@
 """Checkpoints of the mapping: one folder for every chunk of scans, with its voxels tile by tile.
 
-A chunk is the unit of memory, of work and of resuming: its scans are fused in their own table, which is then saved. The
-record of a chunk lists the checksum of every file; an incomplete or damaged chunk is mapped again. Evidence is integer
-sums, so the sum of the chunks has the same bytes for any division of the scans, any number of processes, and any
-interruptions.
+A chunk is the unit of memory and of resuming, see `mapping.chunks`. The record of a chunk lists the checksum of every
+file; an incomplete or damaged chunk is mapped again. Evidence is integer sums, so the sum of the chunks has the same
+bytes for any number of processes and any interruptions.
+
+NUMBER/record.json           counts, skips, moving objects, checksums
+       static/x_y.parquet    the voxels of a tile (`voxels.tiles`); removed/ likewise
+       moving_points.npz     the points that moved (`mapping.evidence`)
+       keyframes.npz         range images for free-space evidence, if they are of use
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property, reduce
 from operator import add
 from pathlib import Path
@@ -22,14 +26,20 @@ from typing import Any
 
 import numpy as np
 
+from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.tiles import Tile, by_tile
+from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.chunks import MappedChunk
+from gnss_sem_map.mapping.waiting_points import WAITING
+from gnss_sem_map.voxels.tiles import Tile, by_tile, decode_voxels, encode_voxels, joined_voxels
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 RECORD = "record.json"
+STATIC, REMOVED = "static", "removed"
+MOVING_POINTS, KEYFRAMES = "moving_points.npz", "keyframes.npz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,23 +58,27 @@ class ChunkStore:
         """Numbers of the saved chunks."""
         return {int(path.name) for path in self.folder.iterdir() if path.name.isdecimal()}
 
-    def write(self, number: int, layers: Mapping[str, VoxelMap], record: Mapping[str, Any]) -> None:
-        """Save a chunk: the voxels of each layer, and a record with counts and skips.
+    def write(self, chunk: MappedChunk) -> None:
+        """Save a chunk; raises DataError when the disk is full or the folder may not be written to.
 
-        Raises DataError when the disk is full or the folder may not be written to; unfinished files are removed.
+        Unfinished files are removed.
         """
-        beside = self.folder / f".{number}.{os.getpid()}.part"
+        beside = self.folder / f".{chunk.number}.{os.getpid()}.part"
         checksums: dict[str, str] = {}
         try:
-            for layer, voxels in layers.items():
-                (beside / layer).mkdir(parents=True)
-                for (x, y), part in by_tile(voxels):
-                    content = _encoded(part)
-                    write_whole(beside / layer / f"{x}_{y}.npy", content)
-                    checksums[f"{layer}/{x}_{y}.npy"] = hashlib.sha256(content).hexdigest()
-            body = {"fingerprint": self.fingerprint, "files": checksums, **record}
+            for name, content in _files(chunk):
+                (beside / name).parent.mkdir(parents=True, exist_ok=True)
+                write_whole(beside / name, content)
+                checksums[name] = hashlib.sha256(content).hexdigest()
+            body = {
+                "fingerprint": self.fingerprint,
+                "files": checksums,
+                "counts": dict(chunk.stats.counts),
+                "skips": [asdict(skip) for skip in chunk.stats.skips],
+                "objects": [asdict(one) | {"path": one.path.tolist()} for one in chunk.objects],
+            }
             write_whole(beside / RECORD, json.dumps({"sha256": _checksum(body), "record": body}).encode())
-            beside.rename(self.folder / str(number))
+            beside.rename(self.folder / str(chunk.number))
         except OSError as error:
             raise DataError(
                 f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then --resume"
@@ -89,27 +103,47 @@ class ChunkStore:
         """The record of every chunk, in order; raises DataError when one is missing or damaged."""
         return list(self._records)
 
-    def tiles(self, layer: str) -> Iterator[tuple[Tile, VoxelMap]]:
-        """The tiles of a layer in order, each summed over the chunks; one tile at a time is in memory."""
-        parts: dict[Tile, list[tuple[Path, str]]] = {}
-        for number, record in enumerate(self._records):
-            for name, checksum in record["files"].items():
-                path = self.folder / str(number) / name
-                if path.parent.name == layer:
-                    x, y = path.stem.split("_")
-                    parts.setdefault((int(x), int(y)), []).append((path, checksum))
-        for tile, files in sorted(parts.items()):
-            yield tile, reduce(add, (self._read(path, checksum) for path, checksum in files))
+    def objects(self) -> tuple[TrackedObject, ...]:
+        """The moving objects of all chunks."""
+        return tuple(_object(one) for record in self._records for one in record["objects"])
+
+    def tiles(self) -> list[Tile]:
+        """The tiles that any chunk has voxels in, in order."""
+        return sorted({tile for parts in self._parts.values() for tile in parts})
+
+    def tile(self, layer: str, tile: Tile) -> VoxelMap:
+        """The voxels of a tile of a layer, summed over the chunks."""
+        files = self._parts[layer].get(tile, [])
+        nothing = joined_voxels([], self.voxel_size_m, self.label_set)
+        return reduce(add, (self._read(path, tile, checksum) for path, checksum in files), nothing)
 
     def whole(self, layer: str) -> VoxelMap:
         """A whole layer in memory, sorted by key."""
-        rows = [part.to_rows() for _, part in self.tiles(layer)]
-        empty = np.empty((0, VoxelMap.words(self.label_set)), np.int64)
-        return VoxelMap.of_rows(np.concatenate([empty, *rows]), self.voxel_size_m, self.label_set)
+        parts = [self.tile(layer, tile) for tile in self.tiles()]
+        return joined_voxels(parts, self.voxel_size_m, self.label_set)
+
+    def contents(self, name: str) -> Iterator[bytes]:
+        """The content of the file of this name of every chunk that has it; raises DataError."""
+        for number, record in enumerate(self._records):
+            if name in record["files"]:
+                yield _content(self.folder / str(number) / name, record["files"][name])
 
     @cached_property
     def _records(self) -> list[dict[str, Any]]:
         return [self._record(number) for number in range(self.count)]
+
+    @cached_property
+    def _parts(self) -> dict[str, dict[Tile, list[tuple[Path, str]]]]:
+        """Layer -> tile -> files of the chunks, with their checksums."""
+        parts: dict[str, dict[Tile, list[tuple[Path, str]]]] = {STATIC: {}, REMOVED: {}}
+        for number, record in enumerate(self._records):
+            for name, checksum in record["files"].items():
+                layer, slash, file = name.partition("/")
+                if slash:
+                    x, y = Path(file).stem.split("_")
+                    place = self.folder / str(number) / name
+                    parts[layer].setdefault((int(x), int(y)), []).append((place, checksum))
+        return parts
 
     def _record(self, number: int) -> dict[str, Any]:
         path = self.folder / str(number) / RECORD
@@ -123,15 +157,42 @@ class ChunkStore:
             reason = error.strerror if isinstance(error, OSError) else "its checksum differs"
             raise DataError(f"{path}: damaged chunk ({reason}); --resume maps it again") from None
 
-    def _read(self, path: Path, checksum: str) -> VoxelMap:
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise DataError(f"{path}: damaged voxels ({error.strerror}); --resume maps them again") from None
-        if hashlib.sha256(content).hexdigest() != checksum:
-            raise DataError(f"{path}: damaged voxels (their checksum differs); --resume maps them again")
-        rows = np.load(io.BytesIO(content), allow_pickle=False)
-        return VoxelMap.of_rows(rows, self.voxel_size_m, self.label_set)
+    def _read(self, path: Path, tile: Tile, checksum: str) -> VoxelMap:
+        return decode_voxels(_content(path, checksum), tile, self.voxel_size_m, self.label_set)
+
+
+def _files(chunk: MappedChunk) -> Iterator[tuple[str, bytes]]:
+    """Name and content of every file of a chunk but its record."""
+    for layer, voxels in ((STATIC, chunk.static), (REMOVED, chunk.removed)):
+        for (x, y), part in by_tile(voxels):
+            yield f"{layer}/{x}_{y}.parquet", encode_voxels(part)
+    file = io.BytesIO()
+    evidence.write_moving_points(chunk.moving, file)
+    yield MOVING_POINTS, file.getvalue()
+    if chunk.keyframes is not None:
+        file = io.BytesIO()
+        evidence.write_keyframes(chunk.keyframes, file)
+        yield KEYFRAMES, file.getvalue()
+
+
+def _content(path: Path, checksum: str) -> bytes:
+    """The content of a file of a chunk; raises DataError where it is not what was written."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: damaged ({error.strerror}); --resume maps the chunk again") from None
+    if hashlib.sha256(content).hexdigest() != checksum:
+        raise DataError(f"{path}: damaged (its checksum differs); --resume maps the chunk again")
+    return content
+
+
+def _object(content: Mapping[str, Any]) -> TrackedObject:
+    given = {
+        "motion": Motion(content["motion"]),
+        "segments": tuple(content["segments"]),
+        "path": np.array(content["path"], np.float64).reshape(-1, 2),
+    }
+    return TrackedObject(**{**content, **given})
 
 
 def open_store(
@@ -155,7 +216,7 @@ def open_store(
         if known is None:
             work_folder.remove_chunks(folder)
             write_whole(about, json.dumps({"fingerprint": fingerprint, "chunks": count}).encode())
-        for path in folder.glob(".*.part"):
+        for path in (*folder.glob(".*.part"), *folder.glob(f".*{WAITING}")):
             _remove(path)
         for number in store.done():
             if number >= count or not store.is_whole(number):
@@ -178,12 +239,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink()
-
-
-def _encoded(voxels: VoxelMap) -> bytes:
-    file = io.BytesIO()
-    np.save(file, voxels.to_rows(), allow_pickle=False)
-    return file.getvalue()
 
 
 def _checksum(record: Mapping[str, Any]) -> str:

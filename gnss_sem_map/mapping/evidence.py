@@ -1,96 +1,125 @@
-"""Evidence of a run besides its map: with it, a finished run is refined again without its scans."""
+"""Evidence of a run besides its map: with it, a finished run is refined again without its scans.
+
+evidence/moved/               the voxels of moving points, tile by tile
+         moving_points/N.npz  the points that moved in the scans of chunk N
+         keyframes/N.npz      its range images for free-space evidence, if the poses come from LiDAR odometry
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.dynamics.range_images import IMAGE_SHAPE
-from gnss_sem_map.dynamics.visibility import KeyframeScans
+from gnss_sem_map.dynamics.visibility import KeyframeScans, are_near
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import Archive, open_archive
-from gnss_sem_map.files.untrusted import MOST_BYTES, is_file, shown
+from gnss_sem_map.files.untrusted import MOST_BYTES, is_folder, shown
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.voxel_map import VoxelMap
+from gnss_sem_map.voxels.tiles import TiledMap
 
 FOLDER = "evidence"
-MOVED, MOVING_POINTS, KEYFRAMES, HEIGHTS = (
-    "moved",
-    "moving_points.npz",
-    "keyframes.npz",
-    "surface_heights.npz",
-)
-MOST_KEYFRAME_BYTES = 100_000 * math.prod(IMAGE_SHAPE) * 2
-"""Images of keyframe scans that are read: a drive of a hundred kilometres."""
+MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
+MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
+"""Images of the keyframe scans of one chunk that are read: ten thousand."""
+FILES_HELD = 4
+"""Files of keyframes in memory at a time, some 40 MB each."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunEvidence:
-    """The evidence of a run that is not in its tiles."""
+    """The evidence of a run that is not in its tiles, on disk; `read` opens it."""
 
-    moved: VoxelMap
+    moved: TiledMap
     """The map of the moving points, which are not refined."""
-    moving: Mapping[int, NDArray[np.int64]] = field(default_factory=dict)
-    """Frame number -> indices of the moving points among the usable points of the scan."""
-    keyframes: KeyframeScans | None = None
-    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
-    surface_heights: SurfaceHeights | None = None
-    """None if no step needs them."""
+    moving_points: Sequence[Path]
+    """Files of the points that moved, see `read_moving_points`."""
+    keyframes: Sequence[Path]
+    """Files of keyframe scans; none unless the poses come from LiDAR odometry."""
+
+    def moving(self) -> dict[int, NDArray[np.int64]]:
+        """Frame number -> indices of the moving points among the usable points of the scan; raises DataError."""
+        return {
+            number: found for path in self.moving_points for number, found in read_moving_points(path).items()
+        }
+
+    @cached_property
+    def poses(self) -> dict[Path, NDArray[np.float64]]:
+        """T_lidar_map (k, 4, 4) of the keyframe scans of every file; raises DataError."""
+        return {path: read_poses(path) for path in self.keyframes}
+
+    def keyframes_near(self, positions: NDArray[np.float64], reach_m: float) -> KeyframeScans | None:
+        """The keyframe scans at most `reach_m` from the bounding box of positions (m, 3) m; None if there are none.
+
+        Raises DataError.
+        """
+        paths = [path for path, T in self.poses.items() if are_near(T, positions, reach_m).any()]
+        count = sum(int(are_near(self.poses[path], positions, reach_m).sum()) for path in paths)
+        if count == 0:
+            return None
+        found, start = KeyframeScans(np.empty((count, *IMAGE_SHAPE), np.uint16), np.empty((count, 4, 4))), 0
+        for path in paths:  # into place: the images of a tile take a hundred megabytes
+            near = self._read_keyframes(path).near(positions, reach_m)
+            found.images[start : start + len(near.images)] = near.images
+            found.T_lidar_map[start : start + len(near.images)] = near.T_lidar_map
+            start += len(near.images)
+        return found
+
+    @cached_property
+    def _read_keyframes(self) -> Callable[[Path], KeyframeScans]:
+        """Reads files, and holds some; another run may have files of the same names."""
+        return lru_cache(FILES_HELD)(read_keyframes)
 
 
-def write(evidence: RunEvidence, run: Path, frame: LocalFrame | None) -> None:
-    """Write the folder `evidence/` of a run folder."""
-    folder = run / FOLDER
-    folder.mkdir()
-    tiles.write(SemanticMap.of(evidence.moved), folder / MOVED, frame)
-    write_moving_points(evidence.moving, folder / MOVING_POINTS)
-    if evidence.keyframes is not None:
-        write_keyframes(evidence.keyframes, folder / KEYFRAMES)
-    if evidence.surface_heights is not None:
-        heights = evidence.surface_heights
-        np.savez_compressed(folder / HEIGHTS, keys=heights.keys, sums=heights.sums, counts=heights.counts)
+def write(moving_points: Iterable[bytes], keyframes: Iterable[bytes], run: Path) -> None:
+    """Write the files of chunks into the folder `evidence/` of a run, numbered in their order; raises OSError."""
+    for name, contents in ((MOVING_POINTS, moving_points), (KEYFRAMES, keyframes)):
+        for number, content in enumerate(contents):
+            (run / FOLDER / name).mkdir(parents=True, exist_ok=True)
+            (run / FOLDER / name / f"{number}.npz").write_bytes(content)
 
 
-def write_moving_points(moving: Mapping[int, NDArray[np.int64]], path: Path) -> None:
+def write_moving_points(moving: Mapping[int, NDArray[np.int64]], file: Path | BinaryIO) -> None:
     """Write the indices of the moving points of every frame; raises OSError."""
     frames = sorted(moving)
     indices = [moving[number] for number in frames]
     np.savez_compressed(
-        path,
+        file,
         frames=np.array(frames, np.int64),
         counts=np.array([len(some) for some in indices], np.int64),
         places=np.concatenate([*indices, np.empty(0, np.int64)]).astype(np.int32),
     )
 
 
-def write_keyframes(scans: KeyframeScans, path: Path) -> None:
+def write_keyframes(scans: KeyframeScans, file: Path | BinaryIO) -> None:
     """Write range images and poses of keyframe scans; raises OSError."""
-    np.savez_compressed(path, images=scans.images, T_lidar_map=scans.T_lidar_map)
+    np.savez_compressed(file, images=scans.images, T_lidar_map=scans.T_lidar_map)
 
 
 def read(run: Path, label_set: LabelSet) -> RunEvidence:
-    """Read the folder `evidence/` of a run folder; raises DataError if something is missing or damaged."""
+    """Open the folder `evidence/` of a run folder; raises DataError if something is missing or damaged."""
     folder = run / FOLDER
-    if not is_file(folder / MOVING_POINTS):
+    if not is_folder(folder / MOVED):
         raise DataError(
             f"{shown(run)}: found no {FOLDER}/ in it, which is needed to refine the map; make the run again"
         )
-    return RunEvidence(
-        tiles.read(folder / MOVED, label_set).voxels,
-        read_moving_points(folder / MOVING_POINTS),
-        read_keyframes(folder / KEYFRAMES) if is_file(folder / KEYFRAMES) else None,
-        _heights(folder / HEIGHTS) if is_file(folder / HEIGHTS) else None,
-    )
+    moved = tiles.open_map(folder / MOVED, label_set)
+    return RunEvidence(moved, _numbered(folder / MOVING_POINTS), _numbered(folder / KEYFRAMES))
+
+
+def _numbered(folder: Path) -> list[Path]:
+    if not is_folder(folder):
+        return []
+    paths = [path for path in folder.iterdir() if path.suffix == ".npz" and path.stem.isdecimal()]
+    return sorted(paths, key=lambda path: int(path.stem))
 
 
 def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:
@@ -121,13 +150,13 @@ def read_keyframes(path: Path) -> KeyframeScans:
     return KeyframeScans(images, T.astype(np.float64))
 
 
-def _heights(path: Path) -> SurfaceHeights:
+def read_poses(path: Path) -> NDArray[np.float64]:
+    """Poses of keyframe scans (k, 4, 4), without their images; raises DataError."""
     with open_archive(path) as archive:
-        keys, counts = (_array(archive, path, name, "i", 1) for name in ("keys", "counts"))
-        sums = _array(archive, path, "sums", "f", 1)
-    if not len(keys) == len(sums) == len(counts) or (np.diff(keys) <= 0).any() or (counts < 1).any():
-        raise DataError(f"{shown(path)}: found voxels out of order, or without points; make the run again")
-    return SurfaceHeights(keys.astype(np.int64), sums.astype(np.float64), counts.astype(np.int64))
+        T = _array(archive, path, "T_lidar_map", "f", 3)
+    if T.shape[1:] != (4, 4):
+        raise DataError(f"{shown(path)}: found poses {T.shape}, expected (k, 4, 4); make the run again")
+    return T.astype(np.float64)
 
 
 def _array(

@@ -1,38 +1,40 @@
 """From scans to voxels: every point at its own stamp, labelled by the image of its moment, fused (eq. 1 to 7).
 
-Without a work folder and with one process, scans are fused in memory. Else they are fused in chunks of scans, which are
-saved (`checkpoints`), so an interrupted run can be resumed. `build_maps` then loads the whole map; the memory of
-`map_chunks` alone does not grow with the drive. Sums are integers, so the result has the same bytes in all cases.
+The scans are mapped in chunks (`chunks`), which are saved (`checkpoints`), so an interrupted run can be resumed, and
+several processes can share the work. Memory does not grow with the drive. Sums are integers, so the result has the same
+bytes in all cases.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
+import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.labelled_scans import Drive, label_each_scan
+from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC, ChunkStore, open_store
+from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.mapping.worker_processes import in_processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
-from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.sensor_log import Image, Scan, SensorLog, Skip, file_of
-from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
+from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-STATIC, REMOVED = "static", "removed"
+RANGES_PER_WORKER = 2
+"""Chunks in a row go to one worker, which reads the scans between them once; shorter ranges end more evenly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,51 +45,14 @@ class Maps:
     removed: VoxelMap
 
 
-def build_map(
-    log: SensorLog,
-    trajectory: Trajectory,
-    segmenter: Segmenter | None,
-    settings: Settings,
-    stats: RunStats,
-    progress: Progress = silent,
-) -> VoxelMap:
-    """All points of all scans in one map, in memory; see `build_maps`."""
-    return build_maps(Drive(log, trajectory, segmenter, settings), stats, progress).static
+def build_maps(drive: Drive, stats: RunStats, progress: Progress = silent) -> Maps:
+    """Both maps of a drive in memory; see `map_scans`."""
+    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        store = map_scans(drive, Path(folder), stats, progress)
+        return Maps(store.whole(STATIC), store.whole(REMOVED))
 
 
-def build_maps(
-    drive: Drive,
-    stats: RunStats,
-    progress: Progress = silent,
-    *,
-    work: Path | None = None,
-    resume: bool = False,
-    workers: int = 1,
-    labels_from: str = "",
-) -> Maps:
-    """Map all points of all scans (eq. 1 to 7): each at its own stamp, labelled by the nearest image in time.
-
-    `work` is a folder for chunks of the map; with `resume`, the chunks of an interrupted run are used if drive,
-    settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. `workers`
-    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or holds
-    something else.
-    """
-    scans = drive.log.scans
-    _warn(drive, stats)
-    if work is None and workers == 1:
-        static, removed = fuse_scans(drive, scans, stats, progress)
-        maps = Maps(static.to_map(), removed.to_map())
-    else:
-        with _folder(work) as folder:
-            store = map_chunks(
-                drive, folder, stats, progress, resume=resume, workers=workers, labels_from=labels_from
-            )
-            maps = Maps(store.whole(STATIC), store.whole(REMOVED))
-    _check(drive, stats, maps)
-    return maps
-
-
-def map_chunks(
+def map_scans(
     drive: Drive,
     work: Path,
     stats: RunStats,
@@ -97,55 +62,66 @@ def map_chunks(
     workers: int = 1,
     labels_from: str = "",
 ) -> ChunkStore:
-    """Map a drive into a folder of chunks, whose tiles are read one by one: memory does not grow with the drive."""
-    scans, mapping = drive.log.scans, drive.settings.mapping
-    chunks = _chunks(drive)
+    """Map all points of all scans (eq. 1 to 7): each at its own stamp, labelled by the nearest image in time.
+
+    The chunks of the map are written into the folder `work`; with `resume`, those of an interrupted run are used if
+    drive, settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. `workers`
+    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or holds
+    something else.
+    """
+    _warn(drive, stats)
+    chunks, total = chunks_of(drive), len(drive.log.scans)
+    voxel_size_m = drive.settings.mapping.voxel_size_m
     store = open_store(
-        work, fingerprint(drive, labels_from), len(chunks), resume, mapping.voxel_size_m, drive.label_set
+        work, fingerprint(drive, labels_from), len(chunks), resume, voxel_size_m, drive.label_set
     )
     there = store.done()
     done = sum(len(chunks[number]) for number in there)
     pending = [number for number in range(len(chunks)) if number not in there]
-    for number in _map_all(drive, store, pending, workers, _shifted(progress, done, len(scans))):
-        done += len(chunks[number])
-        progress("mapping", done, len(scans))
+    ranges = _ranges(pending, workers)
+    if workers > 1 and len(ranges) > 1:
+        _check_sendable(drive)
+        for place in in_processes(_map_range, (drive, store, ranges), range(len(ranges)), workers):
+            done += sum(len(chunks[number]) for number in ranges[place])
+            progress("mapping", done, total)
+    else:
+        for place, numbers in enumerate(ranges):
+            _map_range(drive, store, ranges, place, _shifted(progress, done, total))
+            done += sum(len(chunks[number]) for number in numbers)
     for record in store.records():
         stats.counts.update(record["counts"])
         stats.skips.extend(Skip(**skip) for skip in record["skips"])
+    _check(drive, stats)
     return store
 
 
-def fuse_scans(
-    drive: Drive, scans: Sequence[Scan], stats: RunStats, progress: Progress = silent
-) -> tuple[VoxelTable, VoxelTable]:
-    """Fuse some scans of a drive: the static points, and the points of moving objects."""
-    settings = drive.settings
-    static, removed = _table(settings), _table(settings)
-    for done, seen in enumerate(label_each_scan(drive, scans, stats)):
-        if seen is not None:
-            keys = seen.keys
-            moved = np.zeros(len(keys), np.bool_)
-            if drive.moving is not None:
-                moved[drive.moving.get(seen.scan.number, [])] = True
-            if moved.any():
-                removed.add(keys[moved], seen.pixels[moved], seen.classes)
-                static.add(keys[~moved], seen.pixels[~moved], seen.classes)
-            else:
-                static.add(keys, seen.pixels, seen.classes)
-        progress("mapping", done + 1, len(scans))
-    return static, removed
+def _ranges(pending: Sequence[int], workers: int) -> list[range]:
+    """Consecutive chunks that one worker maps, about `RANGES_PER_WORKER` for each."""
+    most = len(pending) if workers == 1 else -(-len(pending) // (RANGES_PER_WORKER * workers))
+    ranges = []
+    for _, group in groupby(enumerate(pending), lambda pair: pair[1] - pair[0]):
+        numbers = [number for _, number in group]
+        for start in range(0, len(numbers), most):
+            ranges.append(range(numbers[start], numbers[min(start + most, len(numbers)) - 1] + 1))
+    return ranges
 
 
-def _table(settings: Settings) -> VoxelTable:
-    label_set = open_label_set(settings.classes)
-    calibration = sensor_model.opened(settings.calibration, label_set)
-    return VoxelTable(
-        settings.mapping.voxel_size_m,
-        label_set,
-        settings.labelling.probability_floor,
-        None if calibration is None else calibration.log_likelihoods,
-        settings.labelling.abstain,
-    )
+def _map_range(
+    drive: Drive, store: ChunkStore, ranges: Sequence[range], place: int, progress: Progress = silent
+) -> None:
+    """Map some chunks in a row and save each when it is done."""
+    waiting = store.folder / f".{ranges[place].start}.{os.getpid()}{WAITING}"
+    try:
+        waiting.mkdir()
+    except OSError as error:
+        raise DataError(
+            f"{waiting}: cannot be written ({error.strerror}); free the disk, then --resume"
+        ) from None
+    try:
+        for chunk in map_chunks(drive, ranges[place], waiting, progress):
+            store.write(chunk)
+    finally:
+        shutil.rmtree(waiting, ignore_errors=True)
 
 
 def _warn(drive: Drive, stats: RunStats) -> None:
@@ -155,12 +131,11 @@ def _warn(drive: Drive, stats: RunStats) -> None:
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
 
 
-def _check(drive: Drive, stats: RunStats, maps: Maps) -> None:
+def _check(drive: Drive, stats: RunStats) -> None:
     if not stats.counts["scans"]:
         why = _first_reason(stats, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
-    is_labelled = maps.static.observed.any() or maps.removed.observed.any()
-    if drive.segmenter is not None and _has_camera(drive) and not is_labelled:
+    if drive.segmenter is not None and _has_camera(drive) and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
         stats.warnings.append(f"no point got a label, and the map shows geometry only{why}")
 
@@ -174,44 +149,8 @@ def _first_reason(stats: RunStats, what: str) -> str:
     return next((f"; first reason: {s.where}: {s.reason}" for s in stats.skips if s.what == what), "")
 
 
-@contextmanager
-def _folder(work: Path | None) -> Iterator[Path]:
-    if work is not None:
-        yield work
-        return
-    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        yield Path(folder)
-
-
 def _shifted(progress: Progress, done: int, total: int) -> Progress:
     return lambda stage, more, _: progress(stage, done + more, total)
-
-
-def _chunks(drive: Drive) -> list[Sequence[Scan]]:
-    scans, count = drive.log.scans, drive.settings.mapping.scans_per_chunk
-    return [scans[i : i + count] for i in range(0, len(scans), count)]
-
-
-def _map_all(
-    drive: Drive, store: ChunkStore, numbers: Sequence[int], workers: int, progress: Progress
-) -> Iterator[int]:
-    """Map these chunks and save them; yields the number of each finished chunk."""
-    if workers > 1 and len(numbers) > 1:
-        _check_sendable(drive)
-        yield from in_processes(_map_chunk, (drive, store), numbers, workers)
-        return
-    done = 0
-    for number in numbers:
-        _map_chunk(drive, store, number, _shifted(progress, done, 0))
-        done += len(_chunks(drive)[number])
-        yield number
-
-
-def _map_chunk(drive: Drive, store: ChunkStore, number: int, progress: Progress = silent) -> None:
-    stats = RunStats()
-    static, removed = fuse_scans(drive, _chunks(drive)[number], stats, progress)
-    record = {"counts": dict(stats.counts), "skips": [asdict(skip) for skip in stats.skips]}
-    store.write(number, {STATIC: static.to_map(), REMOVED: removed.to_map()}, record)
 
 
 def _check_sendable(drive: Drive) -> None:
@@ -231,6 +170,7 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
     said = [
         log.name, labels_from, list(names), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
+        settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
         [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
         [(image.number, image.stamp, _state(image)) for image in log.images], _states(labels_from),
         log.calibration.image_size, log.calibration.camera_time_offset_s,
@@ -284,6 +224,3 @@ def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
     for array in (trajectory.velocities, calibration.T_camera_lidar, calibration.K):
         if array is not None:
             yield array
-    for number, places in sorted((drive.moving or {}).items()):
-        yield np.array([number])
-        yield places

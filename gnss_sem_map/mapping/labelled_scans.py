@@ -5,7 +5,7 @@ A thread reads and decodes files a few scans ahead.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -47,8 +47,6 @@ class Drive:
     trajectory: Trajectory
     segmenter: Segmenter | None
     settings: Settings
-    moving: Mapping[int, NDArray[np.int64]] | None = None
-    """Frame number -> indices of the moving points in what `map_points` returns."""
     from_lidar_odometry: bool = False
     """Whether the poses come from LiDAR odometry, so that static objects are not blurred."""
 
@@ -70,6 +68,8 @@ class LabelledScan:
     """(n,) mask of the usable ones."""
     keys: NDArray[np.int64]
     """(m,) the voxel of each."""
+    heights: NDArray[np.uint8]
+    """(m,) how high each lies in its voxel, see `VoxelMap.heights`."""
     pixels: NDArray[np.int32]
     """(m,) row of `classes` for each point, -1 if the image does not show it."""
     classes: NDArray[np.uint8]
@@ -124,7 +124,8 @@ def _see(
     """Deskew one scan, find its voxels and its labels, in one pass over its points."""
     log, n = drive.log, len(points.xyz)
     mapping, labelling = drive.settings.mapping, drive.settings.labelling
-    valid, keys, p_map = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(3 * n if keep_points else 0)
+    valid, keys, heights = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(n, np.uint8)
+    p_map = np.empty(3 * n if keep_points else 0)
     try:
         stamps, knots = knots_of(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
@@ -136,7 +137,7 @@ def _see(
     count, inside = kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
-        valid, keys, p_map, *view.inside, view.nearest,
+        valid, keys, heights, p_map, *view.inside, view.nearest,
     )  # fmt: skip
     if count == 0:
         stats.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
@@ -153,7 +154,7 @@ def _see(
     stats.counts["points labelled"] += len(classes)
     stats.counts["points unlabelled"] += count - len(classes)
     kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
-    seen_scan = LabelledScan(drive, scan, points, valid, keys[:count], pixels, classes, kept)
+    seen_scan = LabelledScan(drive, scan, points, valid, keys[:count], heights[:count], pixels, classes, kept)
     if not seen_scan.keys.all():
         keys_of(seen_scan.p_map, mapping.voxel_size_m)  # its error names the point
     return seen_scan

@@ -8,23 +8,22 @@ frame that is not registered is added exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
-from gnss_sem_map.refinement.surface_heights import SurfaceHeights
+from gnss_sem_map.mapping.raw_map import MAP, open_raw
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HITS_LIMIT
-from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
+from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HEIGHT_UNITS, HITS_LIMIT
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of, unpack
 
 PARKED = "vehicle"
 """Class that is left out of the registration: parked vehicles differ between drives."""
@@ -48,10 +47,23 @@ class MergedRuns:
 
     static: VoxelMap
     """The map without moving points."""
-    evidence: RunEvidence
+    moved: VoxelMap
+    """The map of the moving points."""
+    keyframes: list[tuple[Path, NDArray[np.float64]]]
+    """Files of keyframe scans of both runs, each with T_first_run (4, 4); none unless both runs have some."""
     frame: LocalFrame
     """Of the first run."""
     alignment: Alignment
+
+    def write_raw(self, run: Path) -> None:
+        """Write `map/` and `evidence/` of a run folder; moving points, which belong to one drive, are left out."""
+        tiles.write(SemanticMap.of(self.static + self.moved), run / MAP, self.frame)
+        (run / evidence.FOLDER / evidence.KEYFRAMES).mkdir(parents=True)
+        tiles.write(SemanticMap.of(self.moved), run / evidence.FOLDER / evidence.MOVED, self.frame)
+        for number, (path, T_first_run) in enumerate(self.keyframes):
+            scans = evidence.read_keyframes(path)
+            moved = replace(scans, T_lidar_map=scans.T_lidar_map @ np.linalg.inv(T_first_run))
+            evidence.write_keyframes(moved, run / evidence.FOLDER / evidence.KEYFRAMES / f"{number}.npz")
 
 
 def merge(
@@ -76,58 +88,32 @@ def merge_runs(
     With `match`, the second is registered to the first. Raises DataError for a folder without maps, a damaged one, and
     maps that do not fit together.
     """
-    label_set = label_set or tiles.read(first / "map").voxels.label_set
-    frames = [_known(tiles.read_frame(run / "map")) for run in (first, second)]
-    known = [evidence.read(run, label_set) for run in (first, second)]
-    static = [_without(run, label_set, one.moved) for run, one in zip((first, second), known, strict=True)]
+    label_set = label_set or tiles.open_map(first / MAP).label_set
+    frames = [_known(tiles.read_frame(run / MAP)) for run in (first, second)]
+    known = [open_raw(run, label_set).evidence for run in (first, second)]
+    moved = [one.moved.whole().voxels for one in known]
+    static = [_without(run, label_set, part) for run, part in zip((first, second), moved, strict=True)]
     alignment = align(static[0], static[1], frames[0], frames[1], match)
     T = alignment.match.T_target_source if alignment.match else None
-    evidence_of_both = _merged_evidence(known[0], known[1], frames[0], frames[1], T)
+    by_georeference = frames[0].pose_of(frames[1])
+    places = [np.eye(4), by_georeference if T is None else T @ by_georeference]
+    keyframes = [
+        (path, T_first) for one, T_first in zip(known, places, strict=True) for path in one.keyframes
+    ]
     return MergedRuns(
-        merge(static[0], static[1], frames[0], frames[1], T), evidence_of_both, frames[0], alignment
+        merge(static[0], static[1], frames[0], frames[1], T),
+        merge(moved[0], moved[1], frames[0], frames[1], T),
+        keyframes if all(one.keyframes for one in known) else [],
+        frames[0],
+        alignment,
     )
 
 
 def _without(run: Path, label_set: LabelSet, moved: VoxelMap) -> VoxelMap:
     try:
-        return tiles.read(run / "map", label_set).voxels - moved
+        return tiles.read(run / MAP, label_set).voxels - moved
     except DataError:
         raise DataError(f"{run}: map/ and evidence/ are not of one run; make the run again") from None
-
-
-def _merged_evidence(
-    first: RunEvidence,
-    second: RunEvidence,
-    first_frame: LocalFrame,
-    second_frame: LocalFrame,
-    T: NDArray[np.float64] | None,
-) -> RunEvidence:
-    """The evidence of both runs in the frame of the first; moving points, which belong to one drive, are left out."""
-    moved = merge(first.moved, second.moved, first_frame, second_frame, T)
-    T_first_second = _rigid(second_frame, first_frame, np.eye(4) if T is None else T)
-    keyframes = [one.keyframes for one in (first, second)]
-    both: KeyframeScans | None = None
-    if keyframes[0] is not None and keyframes[1] is not None:
-        later = keyframes[1].T_lidar_map @ np.linalg.inv(T_first_second)
-        both = KeyframeScans(
-            np.concatenate([keyframes[0].images, keyframes[1].images]),
-            np.concatenate([keyframes[0].T_lidar_map, later]),
-        )
-    heights = [one.surface_heights for one in (first, second)]
-    of_both: SurfaceHeights | None = None
-    if heights[0] is not None and heights[1] is not None:
-        of_both = heights[0] + heights[1].moved(T_first_second, first.moved.voxel_size_m)
-    return RunEvidence(moved, {}, both, of_both)
-
-
-def _rigid(source: LocalFrame, target: LocalFrame, T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`T` after T_target_source of two local frames, both tangent planes of one ellipsoid."""
-    if source == target:
-        return T
-    corners = target.to_map(*source.to_geodetic(np.vstack([np.zeros(3), np.eye(3)])))
-    T_target_source = np.eye(4)
-    T_target_source[:3, :3], T_target_source[:3, 3] = (corners[1:] - corners[0]).T, corners[0]
-    return np.asarray(T @ T_target_source)
 
 
 def align(
@@ -185,9 +171,29 @@ def into_frame(
     np.add.at(hits, places, voxels.hits)
     if (evidence < -EVIDENCE_LIMIT).any() or (hits > HITS_LIMIT).any():
         raise DataError("cannot merge these maps: a voxel's evidence would overflow 32 bits")
+    heights = None if voxels.heights is None else np.zeros(len(keys), np.int64)
+    if heights is not None:
+        np.add.at(heights, places, _moved_heights(voxels, p_target, keys[places]))
     return VoxelMap(
-        voxels.voxel_size_m, voxels.label_set, keys, evidence.astype(np.int32), hits.astype(np.uint32)
+        voxels.voxel_size_m,
+        voxels.label_set,
+        keys,
+        evidence.astype(np.int32),
+        hits.astype(np.uint32),
+        heights,
     )
+
+
+def _moved_heights(
+    voxels: VoxelMap, p_target: NDArray[np.float64], keys: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Sums of heights (v,) of voxels over the bottom of those (v,) that hold their moved centres.
+
+    Points stay as high over the centre as they were: frames lean against each other by less than a degree.
+    """
+    over_centre = voxels.surface_heights - voxels.centres[:, 2]
+    over_bottom = (p_target[:, 2] + over_centre) / voxels.voxel_size_m - unpack(keys)[:, 2]
+    return np.asarray(np.rint(voxels.hits * (HEIGHT_UNITS * over_bottom - 0.5)), np.int64)
 
 
 def _centres_in(voxels: VoxelMap, source: LocalFrame, target: LocalFrame) -> NDArray[np.float64]:

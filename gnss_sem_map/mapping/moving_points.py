@@ -1,45 +1,24 @@
-"""Search for the points of moving objects in all scans of a drive, before mapping."""
+"""Scans as evidence for motion: what `dynamics` needs to know of a scan with labels."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.dynamics.motion_state import TrackedObject
-from gnss_sem_map.dynamics.moving_objects import MovingObjectDetector, MovingObjects, Observation, observe
-from gnss_sem_map.dynamics.visibility import THREADS, KeyframeSelector
+from factor_graphs.errors import MeasurementError
+from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, observe
+from gnss_sem_map.dynamics.visibility import THREADS, RangeImage
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import OTHER
-from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
-from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, map_points
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.sensor_log import Scan
 
 MOVABLE = ("vehicle", "person", "pedestrian", "rider", "cyclist", "bicycle", "motorcycle")
 """Classes of objects that may move, if the class set has them."""
-
-
-def find_moving(drive: Drive, progress: Progress = silent) -> MovingObjects:
-    """The moving points among the usable points of all scans, and the moving objects; skips are counted when mapping.
-
-    Objects outside of all images are tracked too, but count as moving only if they were displaced.
-    """
-    detector = MovingObjectDetector(drive.settings.dynamics, drive.from_lidar_odometry)
-    along = KeyframeSelector()
-    points: dict[int, NDArray[np.int64]] = {}
-    objects: list[TrackedObject] = []
-    total = len(drive.log.scans)
-    for done, (_, observation) in enumerate(
-        prefetch(_observed, labelled_scans(drive, keep_points=True), THREADS), 1
-    ):
-        detector.add(observation)
-        along.add(observation.stamp, observation.image, observation.T_lidar_map)
-        settled = detector.settle()
-        points.update(settled.points)
-        objects += settled.objects
-        progress("motion", done, total)
-    rest = detector.decide()
-    progress("motion", total, total)
-    return MovingObjects(points | dict(rest.points), (*objects, *rest.objects), along.keyframes())
 
 
 def movable_and_known(
@@ -53,11 +32,32 @@ def movable_and_known(
     return is_movable.take(shown), (shown >= 0) & (shown < len(class_names))
 
 
-def _observed(seen: LabelledScan) -> Observation:
+def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
+    """A scan as evidence for motion.
+
+    Objects outside of all images are tracked too, but count as moving only if they were displaced.
+    """
     drive, scan = seen.drive, seen.scan
-    T_map_imu = drive.trajectory.at(np.array([scan.stamp]), EXTRAPOLATE_S)[0]
-    T_map_lidar = T_map_imu @ drive.log.calibration.T_imu_lidar
     return observe(
-        scan.number, scan.stamp, seen.p_map, T_map_lidar, *movable_and_known(seen.labels, drive.label_set.names),
-        drive.settings.dynamics,
+        scan.number, scan.stamp, seen.p_map, _lidar_pose(drive, scan),
+        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics,
     )  # fmt: skip
+
+
+def range_images(drive: Drive, scans: Sequence[Scan]) -> list[RangeImage]:
+    """Range images of all usable scans; the others are counted where they are mapped."""
+
+    def draw(scan: Scan) -> RangeImage | None:
+        try:
+            points = scan.read()
+            p_map, _ = map_points(points, scan, drive.trajectory, drive.log, drive.settings.mapping)
+        except (DataError, MeasurementError):
+            return None
+        return RangeImage.of(p_map, _lidar_pose(drive, scan)) if len(p_map) else None
+
+    return [image for _, image in prefetch(draw, scans, THREADS) if image is not None]
+
+
+def _lidar_pose(drive: Drive, scan: Scan) -> NDArray[np.float64]:
+    T_map_imu = drive.trajectory.at(np.array([scan.stamp]), EXTRAPOLATE_S)[0]
+    return np.asarray(T_map_imu @ drive.log.calibration.T_imu_lidar, np.float64)

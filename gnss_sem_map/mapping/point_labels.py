@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,20 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
+from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.labelled_scans import map_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
+from gnss_sem_map.scans.prefetch import prefetch, threads
 from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import TiledMap
 from gnss_sem_map.voxels.voxel_map import keys_of
+
+SCANS_AT_ONCE = 300
+"""The part of the map around so many scans is in memory at a time."""
+DRIVEN_IN_A_SWEEP_M = 60.0
+"""Points may be this much farther from the pose of their scan than from that of their own stamp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +45,54 @@ class PointLabels:
 def label_points(
     log: SensorLog,
     trajectory: Trajectory,
-    maps: Sequence[SemanticMap],
+    maps: Sequence[TiledMap],
     settings: Settings,
-    moving: Mapping[int, NDArray[np.int64]] | None = None,
+    moving_points: Sequence[Path] = (),
     kerbs: Kerbs | None = None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
-    """For every usable scan, the labels of its original points by each of the maps.
+    """For every usable scan, the labels of its original points by each of the maps, of which the last is refined.
 
-    Two rules apply to the last map, the refined one, only: the points `moving` (see `Drive`) are removed vehicles,
-    whatever the class of their voxel; and the points in its `kerbs` are classified one by one as road or sidewalk.
+    Two rules apply to the refined map only: the points in the files `moving_points` (see `mapping.evidence`) are
+    removed vehicles, whatever the class of their voxel; and the points in its `kerbs` are classified one by one as road
+    or sidewalk. Of the maps only the part around some scans is in memory. Raises DataError.
     """
+    files = list(moving_points)
+    moving: dict[int, NDArray[np.int64]] = {}
+    for start in range(0, len(log.scans), SCANS_AT_ONCE):
+        scans = log.scans[start : start + SCANS_AT_ONCE]
+        box = _box_of(scans, log, trajectory, settings.mapping.farthest_m)
+        if box is None:
+            continue
+        parts = [tiled.inside(box) for tiled in maps]
+        while files and not {scan.number for scan in scans} <= moving.keys():
+            moving |= read_moving_points(files.pop(0))
+        yield from _label_some(scans, log, trajectory, parts, settings, moving, kerbs)
+        for scan in scans:
+            moving.pop(scan.number, None)
+
+
+def _box_of(
+    scans: Sequence[Scan], log: SensorLog, trajectory: Trajectory, farthest_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Corners (3,) m of a box that holds all points of these scans; None where none is in the trajectory."""
+    stamps = np.array([scan.stamp for scan in scans])
+    known = (stamps >= trajectory.start - EXTRAPOLATE_S) & (stamps <= trajectory.end + EXTRAPOLATE_S)
+    if not known.any():
+        return None
+    p_map = (trajectory.at(stamps[known], EXTRAPOLATE_S) @ log.calibration.T_imu_lidar)[:, :3, 3]
+    reach_m = farthest_m + DRIVEN_IN_A_SWEEP_M
+    return p_map.min(axis=0) - reach_m, p_map.max(axis=0) + reach_m
+
+
+def _label_some(
+    scans: Sequence[Scan],
+    log: SensorLog,
+    trajectory: Trajectory,
+    maps: Sequence[SemanticMap],
+    settings: Settings,
+    moving: Mapping[int, NDArray[np.int64]],
+    kerbs: Kerbs | None,
+) -> Iterator[tuple[Scan, list[PointLabels]]]:
     one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
 
     def label(scan: Scan) -> list[PointLabels] | None:
@@ -62,11 +108,11 @@ def label_points(
         places *= len(maps) // len(places)
         found = [_look_up(m, there, valid) for m, there in zip(maps, places, strict=True)]
         if kerbs is not None:
-            inside, chosen, probability = kerbs.decide(places[-1], p_map)
+            inside, chosen, probability = kerbs.decide(keys, p_map)
             points_of_kerbs = np.flatnonzero(valid)[inside]
             found[-1].labels[points_of_kerbs] = chosen
             found[-1].confidence[points_of_kerbs] = probability
-        if moving is not None and scan.number in moving:
+        if scan.number in moving:
             usable, moved = np.flatnonzero(valid), moving[scan.number]
             if moved.max(initial=-1) >= len(usable):
                 raise DataError(
@@ -76,7 +122,7 @@ def label_points(
             _remove(found[-1], usable[moved], maps[-1])
         return found
 
-    for scan, found in prefetch(label, log.scans, threads=os.cpu_count() or 1):
+    for scan, found in prefetch(label, scans, threads=threads()):
         if found is not None:
             yield scan, found
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
@@ -65,6 +66,24 @@ def locate(
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
     stats.warnings.extend(found.notes)
     return DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
+
+
+def in_frame(
+    log: SensorLog, trajectory: Trajectory, origin: LocalFrame | None
+) -> tuple[SensorLog, Trajectory]:
+    """A log and its trajectory in the frame `origin`, or as they are where there is none."""
+    if origin is None or log.frame is None or origin == log.frame:
+        return log, trajectory
+    return replace(log, frame=origin), trajectory.moved(origin.pose_of(log.frame))
+
+
+def check_georeference(log: SensorLog, origin: LocalFrame | None) -> None:
+    """Raise DataError for a drive in its own poses, which fits into no frame."""
+    if origin is not None and log.frame is None:
+        raise DataError(
+            f"{log.name}: has no georeference, so its map has no origin; expected GNSS, or no --origin and no other"
+            " drive"
+        )
 
 
 def smooth_log(

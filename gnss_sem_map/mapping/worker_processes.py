@@ -1,24 +1,154 @@
-"""Work in several processes that end with the main process: when one is killed, no other waits or stays.
+"""Processes of our own: they end with the main process, and one that dies, grows or hangs is replaced.
 
-A worker receives its items through a pipe, and answers when each is done. Its end of the pipe closes when it dies, and
-ours when the main process dies. Large data are sent only after a worker has started: it may die before it reads them.
+A worker receives its work through a pipe, and answers when it is done. Its end of the pipe closes when it dies, and
+ours when the main process dies.
 """
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess, parent_process
+from pathlib import Path
 from typing import Any
 
 from factor_graphs.errors import FactorGraphError
 from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
+from gnss_sem_map.scans.prefetch import THREADS_VARIABLE, threads
+
+WATCH_S = 0.1
+"""Memory and time of the workers are looked at this often, whenever the next result is waited for."""
+THREADS_VARIABLES = (THREADS_VARIABLE, "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")
+"""Bytes that this container may use, or "max"."""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Calls tasks in worker processes of this machine; cores and memory are shared out evenly.
+
+    A worker ends after `tasks_per_worker` tasks, which frees whatever they left behind. One that holds more than
+    `memory_bytes` (None: the memory of the machine / (workers + 1), as the main process has a share too), or works on
+    one task for more than `timeout_s`, is killed; what a dead worker had under way is called again in a new one.
+    """
+
+    workers: int
+    memory_bytes: int | None = None
+    timeout_s: float = 3600.0
+    tasks_per_worker: int = 10
+    allowed: str = ALLOWED
+
+    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
+        """Call all tasks; yields each with its result when it is done."""
+        most_bytes = self.memory_bytes or machine_memory_bytes() // (self.workers + 1)
+        waiting, losses = deque(tasks), Losses()
+        team: list[_Worker] = []
+        try:
+            while waiting or any(worker.task for worker in team):
+                self._give(waiting, team)
+                wait([worker.connection for worker in team], WATCH_S)
+                for worker in list(team):
+                    task = worker.task
+                    try:
+                        answered = worker.answered(most_bytes, self.timeout_s)
+                        if task is not None and answered is not None:
+                            yield task, result_of(task, answered)
+                    except Lost as lost:
+                        worker.end()
+                        team.remove(worker)
+                        if task is not None:
+                            losses.add(task, lost)
+                            waiting.append(task)
+        finally:
+            for worker in team:
+                worker.end()
+
+    def _give(self, waiting: deque[Task], team: list[_Worker]) -> None:
+        """Give every idle worker a task; workers that have done their share are replaced."""
+        for worker in [worker for worker in team if worker.task is None]:
+            if worker.tasks_done >= self.tasks_per_worker:
+                worker.end()
+                team.remove(worker)
+            elif waiting:
+                worker.give(waiting.popleft(), self.allowed)
+        while waiting and len(team) < self.workers:
+            team.append(_Worker(max(threads() // self.workers, 1)))
+            team[-1].give(waiting.popleft(), self.allowed)
+
+
+class _Worker:
+    """One process, our end of its pipe, and the task that it has under way."""
+
+    def __init__(self, own_threads: int) -> None:
+        with _environment(dict.fromkeys(THREADS_VARIABLES, str(own_threads))):
+            self.connection, self._process = _start(_serve)
+        self.task: Task | None = None
+        self.tasks_done = 0
+
+    def give(self, task: Task, allowed: str) -> None:
+        self.task, self._since = task, time.monotonic()
+        with suppress(ConnectionError):  # it died; that is seen when its answer is waited for
+            self.connection.send_bytes(
+                json.dumps([task.function, json.dumps(task.arguments), allowed]).encode()
+            )
+
+    def answered(self, most_bytes: int, timeout_s: float) -> str | None:
+        """Its answer, None as long as there is none; raises Lost when there will be none."""
+        if self.connection.poll():
+            try:
+                answered = self.connection.recv_bytes().decode()
+            except (EOFError, ConnectionError):
+                raise Lost(self._death()) from None
+            self.task = None
+            self.tasks_done += 1
+            return answered
+        if self.task is not None and _resident_bytes(self._process.pid) > most_bytes:
+            raise Lost(f"it held more than {most_bytes / 1e9:.2f} GB of memory")
+        if self.task is not None and time.monotonic() - self._since > timeout_s:
+            raise Lost(f"it was not done after {timeout_s:g} s")
+        return None
+
+    def _death(self) -> str:
+        self._process.join(1.0)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            return f"a worker process died ({signal.Signals(-code).name}; lack of memory ends processes with SIGKILL)"
+        hint = "a script may call this only below `if __name__ == '__main__':`"
+        return f"a worker process died (exit code {code}; {hint})"
+
+    def end(self) -> None:
+        """End the process, whatever it does, and wait until it is gone."""
+        self.connection.close()
+        self._process.kill()
+        self._process.join()
+        self._process.close()
+
+
+def machine_memory_bytes() -> int:
+    """Memory of this machine, or of the container that this is."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return min(memory, int(CONTAINER_MEMORY.read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return memory
+
+
+def _resident_bytes(pid: int | None) -> int:
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except OSError:  # it has just died
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def in_processes(
@@ -26,13 +156,14 @@ def in_processes(
 ) -> Iterator[int]:
     """Call `function(*shared, item)` for every item in one of several processes; yields each item when it is done.
 
-    Raises what the function raises of our own errors, and DataError when a process dies.
+    Large data are sent only after a worker has started: it may die before it reads them. Raises what the function
+    raises of our own errors, and DataError when a process dies.
     """
     waiting = deque(items)
     team: dict[Connection, BaseProcess] = {}
     try:
         for _ in range(min(workers, len(items))):
-            ours, process = _start()
+            ours, process = _start(_work)
             team[ours] = process
         for ours in team:
             ours.send((function, shared))
@@ -67,13 +198,30 @@ def _first_of(connections: list[Connection]) -> Connection:
     return ready
 
 
-def _start() -> tuple[Connection, BaseProcess]:
+def _start(work: Callable[[Connection], None]) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs,))
+    process = context.Process(
+        target=work, args=(theirs,), daemon=True
+    )  # the main process never waits for it at exit
     with theirs, _signals_blocked():
         process.start()
     return ours, process
+
+
+@contextmanager
+def _environment(variables: dict[str, str]) -> Iterator[None]:
+    """Processes that start here have these environment variables; libraries read them when they are imported."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
@@ -84,6 +232,16 @@ def _signals_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _serve(parent: Connection) -> None:
+    """Answer tasks until the parent closes its end."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        while True:
+            parent.send_bytes(answer(*json.loads(parent.recv_bytes())).encode())
+    except (EOFError, ConnectionError):  # the parent has finished, or died
+        return
 
 
 def _work(parent: Connection) -> None:

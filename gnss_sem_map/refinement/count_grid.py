@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaln
 
-from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings, classes_of
+from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
+from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
@@ -22,13 +23,8 @@ WHOLE_COLUMN = 1 << 21
 THREADS = os.cpu_count() or 1
 LEAST_AT_ONCE = 1 << 18
 """Fewer voxels are not worth a thread."""
-LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
-"""Limits of the error rate that is estimated from the map: self-agreement is not accuracy."""
-
 OWN_LIMIT_NAT = 1.0
 """A voxel's own evidence counts at most this much: a column may then overrule it."""
-PSEUDO_COUNTS = 3.0
-"""Overdispersion: a column's share of right labels is Beta with so many pseudo-counts, since views err as a whole."""
 
 
 class CountGridSettings(StepSettings):
@@ -54,8 +50,8 @@ class CountGridSettings(StepSettings):
 
 
 def reach_m(settings: CountGridSettings, voxel_size_m: float) -> float:
-    """A cell wide; the paper's columns have no end in height, and evidence needs the map's own error rate."""
-    return WHOLE_MAP
+    """A cell wide; the paper's are one voxel."""
+    return settings.cell_m if settings.method == "evidence" else voxel_size_m
 
 
 def apply(state: MapState, settings: CountGridSettings) -> MapState:
@@ -63,12 +59,47 @@ def apply(state: MapState, settings: CountGridSettings) -> MapState:
     voxels, scores, labels = state.voxels, state.scores, state.labels
     first, second = classes_of(voxels.label_set, "building", "vegetation")
     if settings.method == "paper":
-        log_odds = paper_log_odds(voxels.keys, labels, (first, second), settings)
+        prior = state.figures.building_log_odds
+        log_odds = paper_log_odds(voxels.keys, labels, (first, second), settings, prior)
     else:
         own = scores[:, first] - scores[:, second]
-        log_odds = evidence_log_odds(voxels.keys, labels, own, (first, second), settings, voxels.voxel_size_m)
-    undecided = np.isin(labels, (first, second))
+        rate = state.figures.column_error_rate
+        log_odds = evidence_log_odds(
+            voxels.keys, labels, own, (first, second), _columns(state, settings), rate
+        )
+    undecided = (labels == first) | (labels == second)
     return replace(state, scores=decide(scores, undecided, (first, second), log_odds))
+
+
+def measure(state: MapState, settings: CountGridSettings, own: NDArray[np.bool_]) -> Sums:
+    """How often two voxels of one column disagree, at a map's `own` voxels (v,), and the number of either class."""
+    labels = state.labels
+    first, second = classes_of(state.voxels.label_set, "building", "vegetation")
+    is_first, is_second = own & (labels == first), own & (labels == second)
+    sums = Sums(buildings=int(is_first.sum()), vegetation=int(is_second.sum()))
+    if settings.method == "paper":
+        return sums
+    counts = count_grid(state.voxels.keys, labels, (first, second), *_columns(state, settings))
+    return sums + pairs(counts[is_first | is_second])
+
+
+def pairs(counts: NDArray[np.int32]) -> Sums:
+    """How many pairs of voxels disagree, where (v, 2) of two classes stand in the column of each of v voxels.
+
+    Every voxel of n counts once: n voxels with n1 n2 / n of the pairs that disagree.
+    """
+    first, second = counts.T.astype(np.int64)
+    both = first + second
+    disagreeing = np.rint(2 * FIXED_POINT * first * second / np.maximum(both, 1)).astype(np.int64)
+    return Sums(
+        column_pairs=int(np.maximum(both - 1, 0).sum()), disagreeing_pairs=int(disagreeing[both > 1].sum())
+    )
+
+
+def _columns(state: MapState, settings: CountGridSettings) -> tuple[int, int, int]:
+    """Edge and height of a cell of the grid, in voxels, and layers to each side that count."""
+    cell = max(round(settings.cell_m / state.voxels.voxel_size_m), 1)
+    return cell, cell, max(round(settings.reach_m / settings.cell_m), 0)
 
 
 def count_grid(
@@ -160,16 +191,18 @@ def _count_slab(keys, labels, votes, cell, layer, reach, ends, counts):
 
 
 def paper_log_odds(
-    keys: NDArray[np.int64], labels: NDArray[np.int8], classes: tuple[int, int], settings: CountGridSettings
+    keys: NDArray[np.int64],
+    labels: NDArray[np.int8],
+    classes: tuple[int, int],
+    settings: CountGridSettings,
+    prior: float,
 ) -> NDArray[np.float64]:
     """Log odds of the first class against the second for every voxel's column (eq. 8 to 10): (v,).
 
-    The paper names neither factor of eq. 9. Here the prior is each class's share of the voxels of both, and
-    the likelihood says that every voxel of a column is an independent observation, wrong at `error_rate`.
+    The paper names neither factor of eq. 9. Here the `prior` log odds are those of each class's share of the voxels of
+    both, and the likelihood says that every voxel of a column is an independent observation, wrong at `error_rate`.
     """
     first, second = count_grid(keys, labels, classes, cell_voxels=1).T
-    total = [np.count_nonzero(labels == c) for c in classes]
-    prior = np.log((total[0] + 1) / (total[1] + 1))
     return np.asarray(prior + (first - second) * np.log(1 / settings.error_rate - 1), np.float64)
 
 
@@ -178,39 +211,28 @@ def evidence_log_odds(
     labels: NDArray[np.int8],
     own: NDArray[np.float32],
     classes: tuple[int, int],
-    settings: CountGridSettings,
-    voxel_size_m: float,
+    columns: tuple[int, int, int],
+    error_rate: float,
 ) -> NDArray[np.float64]:
     """Log odds of the first class against the second for every voxel, from its column and itself: (v,).
 
-    `own` (v,) nat is what the voxel's own evidence says.
+    `own` (v,) nat is what the voxel's own evidence says; `columns` are the last three arguments of `count_grid`.
 
     Prior: flat. Likelihood of the *other* voxels' labels: beta-binomial. In a column of one class the share
     of right labels is not a constant but itself random, Beta(a, b), since one bad view spoils a column as a
     whole; so a hundred voxels of one opinion count far less than a hundred independent ones. a + b is fixed, and
-    a and b follow from how often two voxels of one column of this map disagree, which is 2 a b / ((a + b) (a
-    + b + 1)). With a = 2, b = 1 the log odds are ln((n1 + 1) / (n2 + 1)).
+    b = `error_rate` (a + b). With a = 2, b = 1 the log odds are ln((n1 + 1) / (n2 + 1)).
     """
-    cell = max(round(settings.cell_m / voxel_size_m), 1)
-    reach = max(round(settings.reach_m / settings.cell_m), 0)
-    counts = count_grid(keys, labels, classes, cell, cell, reach).astype(np.float64)
-    a, b = _beta_of(counts[np.isin(labels, classes)], PSEUDO_COUNTS)
+    counts = count_grid(keys, labels, classes, *columns)
     others = [np.maximum(counts[:, k] - (labels == classes[k]), 0) for k in (0, 1)]
-    columns = (
-        gammaln(others[0] + a) + gammaln(others[1] + b) - gammaln(others[0] + b) - gammaln(others[1] + a)
-    )
-    return np.asarray(np.clip(own, -OWN_LIMIT_NAT, OWN_LIMIT_NAT) + columns)
+    by_count = _log_gamma_ratio(int(counts.max(initial=0)), error_rate)
+    return np.asarray(np.clip(own, -OWN_LIMIT_NAT, OWN_LIMIT_NAT) + by_count[others[0]] - by_count[others[1]])
 
 
-def _beta_of(counts: NDArray[np.float64], pseudo_counts: float) -> tuple[float, float]:
-    """Beta(a, b) of a column's share of right labels, from how often pairs of its voxels disagree."""
-    pairs = counts.sum(1) - 1
-    # every voxel of n counts once: n voxels with n1 n2 / n of the pairs that disagree
-    disagreeing = 2 * counts[:, 0] * counts[:, 1] / np.maximum(counts.sum(1), 1)
-    disagreement = disagreeing[pairs > 0].sum() / max(pairs[pairs > 0].sum(), 1.0)
-    product = disagreement * (pseudo_counts + 1) / (2 * pseudo_counts)
-    error_rate = np.clip((1 - np.sqrt(max(1 - 4 * product, 0.0))) / 2, LEAST_ERROR_RATE, MOST_ERROR_RATE)
-    return pseudo_counts * (1 - error_rate), pseudo_counts * error_rate
+def _log_gamma_ratio(most: int, error_rate: float) -> NDArray[np.float64]:
+    """ln Gamma(n + a) - ln Gamma(n + b) for n from 0 to `most`."""
+    n, b = np.arange(most + 1), PSEUDO_COUNTS * error_rate
+    return np.asarray(gammaln(n + PSEUDO_COUNTS - b) - gammaln(n + b), np.float64)
 
 
 def decide(

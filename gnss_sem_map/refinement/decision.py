@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.state import MapState, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State, entropy_of
@@ -38,12 +38,12 @@ def apply(state: MapState, settings: DecisionSettings) -> MapState:
     voxels, scores, model = state.voxels, state.scores, state.beside.sensor_model
     temperature = settings.temperature if model is None else model.temperature
     known = voxels.observed | state.inferred
-    labels = np.where(known, scores.argmax(axis=1), UNLABELLED).astype(np.int8)
+    labels = state.labels
     states = np.where(voxels.observed, State.OBSERVED, State.UNOBSERVED).astype(np.uint8)
     states[labels != voxels.labels] = State.REFINED
     states[state.inferred] = State.INFERRED
     states[state.removed] = State.REMOVED
     probabilities = doubted(softmax(scores / np.float32(temperature)), state.systematic_error)
-    confidence = np.where(known, probabilities.max(axis=1, initial=0.0), 0).astype(np.float32)
+    confidence = np.where(known, reduce(np.maximum, probabilities.T), np.float32(0))
     entropy = np.where(known, entropy_of(probabilities), np.log(scores.shape[1])).astype(np.float32)
     return replace(state, decided=SemanticMap(voxels, labels, confidence, states, entropy))

@@ -26,5 +26,4 @@ def reach_m(settings: DiscountSettings, voxel_size_m: float) -> float:
 def apply(state: MapState, settings: DiscountSettings) -> MapState:
     """Eq. 6 adds log-likelihoods as if images were independent of each other; here their sum is tempered."""
     factors = state.observations ** (settings.exponent - 1)
-    images = np.asarray(state.images * factors[:, None], np.float32)
-    return replace(state, images=images, scores=images)
+    return replace(state, scores=np.asarray(state.scores * factors[:, None], np.float32))

@@ -10,25 +10,27 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
 from gnss_sem_map.dynamics.visibility import KeyframeScans, hits_and_misses
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 OVER_M = (0.4, 3.0)
 """Only voxels with another one so far below them (least, most) are removed: the ground stays."""
-POINTS_PER_MISS = 2.0
+POINTS_PER_MISS = 4.0
 """A voxel with more points per miss than this stays, whatever the keyframe scans say: other scans saw it often."""
 
 
 class FreeSpaceSettings(StepSettings):
-    """How often a voxel must be traversed before it is removed; keyframe scans are 1 m or 1 s apart."""
+    """How often a voxel must be traversed before it is removed; keyframe scans are 2 m or 2 s apart."""
 
     least_misses: int = Field(
-        default=6, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
+        default=3, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
     misses_per_hit: float = Field(default=3.0, gt=0, description="and least ratio of misses to hits.")
     farthest_m: float = Field(
@@ -39,15 +41,19 @@ class FreeSpaceSettings(StepSettings):
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
-    """The voxels below; keyframe scans are used wherever they are."""
-    return OVER_M[1] + voxel_size_m
+    """The columns beside; keyframe scans are used wherever they are."""
+    return voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     """Remove the voxels that rays traverse repeatedly; see `traversed`."""
     if state.beside.keyframes is None:
         raise NotApplicable("no keyframe scans with poses from LiDAR odometry")
-    return replace(state, removed=state.removed | traversed(state.voxels, state.beside.keyframes, settings))
+    assert state.decided is not None
+    removed = traversed(state.voxels, state.beside.keyframes, settings)
+    removed &= state.decided.states != State.SPLIT  # a kerb is ground
+    states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
+    return replace(state, decided=replace(state.decided, states=states))
 
 
 def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
@@ -56,7 +62,8 @@ def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSet
     Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
     because grazing rays traverse them.
     """
-    high = np.flatnonzero(_stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M]))
+    stands = _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M])
+    high = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * len(keyframes.images)))
     hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings.farthest_m)
     empty = misses >= settings.least_misses
     empty &= misses > settings.misses_per_hit * hits
@@ -70,9 +77,17 @@ def _stands_over(keys: NDArray[np.int64], under: Sequence[int]) -> NDArray[np.bo
     """Which of the sorted voxels (v,) have one under them, in 3 x 3 columns, so many voxels lower (least, most)."""
     least, most = under
     found = np.zeros(len(keys), np.bool_)
-    for x in (-1, 0, 1):
-        for y in (-1, 0, 1):
-            column = keys + (x << 2 * AXIS_BITS) + (y << AXIS_BITS)
-            highest = np.searchsorted(keys, column - least, side="right") - 1
-            found |= (highest >= 0) & (keys[highest] >= column - most)
+    beside = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    _find_under(keys, np.array(beside), least, most, found)
     return found
+
+
+@njit(cache=True, nogil=True)
+def _find_under(keys, beside, least, most, found):
+    for column in beside:
+        above = 0  # the first voxel that is not so low
+        for i in range(len(keys)):
+            highest = keys[i] + column - least
+            while above < len(keys) and keys[above] <= highest:
+                above += 1
+            found[i] |= above > 0 and keys[above - 1] >= keys[i] + column - most

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.refinement.height_above_ground import REACH_M
 from gnss_sem_map.refinement.normals import flatness
 from gnss_sem_map.refinement.state import MapState, StepSettings
 
@@ -37,8 +36,8 @@ class GeometricPriorSettings(StepSettings):
 
 
 def reach_m(settings: GeometricPriorSettings, voxel_size_m: float) -> float:
-    """The ground is made in blocks."""
-    return REACH_M
+    """The neighbours of a voxel say how flat it lies; its height is known."""
+    return voxel_size_m
 
 
 def apply(state: MapState, settings: GeometricPriorSettings) -> MapState:

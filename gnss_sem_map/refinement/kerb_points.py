@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
+
+from gnss_sem_map.voxels import kernels
 
 SUREST = 0.98
 """Upper limit of the difference of probabilities by position alone, so that height can change it."""
@@ -18,13 +21,13 @@ FACE_BEGINS = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Kerbs:
-    """The e voxels of a map where road and sidewalk meet at a step, in order."""
+    """The e voxels of a map where road and sidewalk meet at a step."""
 
     voxel_size_m: float
     classes: tuple[int, int]
     """Road and sidewalk."""
-    rows: NDArray[np.int32]
-    """(v,) place of every voxel of the map among the e, -1 where no kerb is."""
+    keys: NDArray[np.int64]
+    """(e,) packed voxels, sorted."""
     leaning: NDArray[np.float32]
     """(e, 3, 3) probability of road minus that of sidewalk in the voxel and those beside it in x and y, 0 elsewhere."""
     known: NDArray[np.bool_]
@@ -32,16 +35,27 @@ class Kerbs:
     levels: NDArray[np.float64]
     """(2, e) m, height of the road and of the sidewalk here."""
 
+    def __getitem__(self, chosen: NDArray[np.int64]) -> Kerbs:
+        """Those at increasing places."""
+        return replace(
+            self,
+            keys=self.keys[chosen],
+            leaning=self.leaning[chosen],
+            known=self.known[chosen],
+            levels=self.levels[:, chosen],
+        )
+
     def decide(
-        self, places: NDArray[np.int64], p_map: NDArray[np.float64]
+        self, keys: NDArray[np.int64], p_map: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int8], NDArray[np.float32]]:
         """Which of the points (n, 3) m lie in a kerb (k,), the class of each (k,), and how probable that is (k,).
 
-        `places` (n,) are the points' voxels in the map, -1 for none. Two independent sources: log odds
+        `keys` (n,) are the points' packed voxels. Two independent sources: log odds
         of the place, bilinear between the centres of the voxels of one layer, and of the height, two normal
         distributions around the levels.
         """
-        rows = np.where(places >= 0, self.rows[places], -1)
+        rows = np.empty(len(keys), np.int64)
+        kernels.find(self.keys, keys, rows)
         inside = np.flatnonzero(rows >= 0)
         rows, p_map = rows[inside], p_map[inside]
         log_odds = self._of_place(rows, p_map) + self._of_height(rows, p_map[:, 2])
@@ -49,7 +63,7 @@ class Kerbs:
         chosen = np.where(log_odds >= 0, road, sidewalk).astype(np.int8)
         return inside, chosen, np.asarray(expit(np.abs(log_odds)), np.float32)
 
-    def _of_place(self, rows: NDArray[np.int32], p_map: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _of_place(self, rows: NDArray[np.int64], p_map: NDArray[np.float64]) -> NDArray[np.float64]:
         from_centre = np.mod(p_map[:, :2] / self.voxel_size_m, 1) - 0.5
         (x, y), (a, b) = np.where(from_centre < 0, 0, 2).T, np.abs(from_centre).T
         corners = (
@@ -59,8 +73,23 @@ class Kerbs:
         known = sum(weight * self.known[rows, i, j] for i, j, weight in corners)
         return np.asarray(2 * np.arctanh(np.clip(leaning / known, -SUREST, SUREST)))
 
-    def _of_height(self, rows: NDArray[np.int32], z: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _of_height(self, rows: NDArray[np.int64], z: NDArray[np.float64]) -> NDArray[np.float64]:
         road, sidewalk = self.levels[:, rows]
         step = sidewalk - road
         turning = road + FACE_BEGINS * step
         return np.asarray(step * (turning - z) / POINT_STDDEV_M**2)
+
+
+def joined(parts: Sequence[Kerbs]) -> Kerbs | None:
+    """The kerbs of parts of one map that share no voxel; None for no part."""
+    if not parts:
+        return None
+    keys = np.concatenate([part.keys for part in parts])
+    order = np.argsort(keys)
+    return replace(
+        parts[0],
+        keys=keys[order],
+        leaning=np.concatenate([part.leaning for part in parts])[order],
+        known=np.concatenate([part.known for part in parts])[order],
+        levels=np.concatenate([part.levels for part in parts], axis=1)[:, order],
+    )

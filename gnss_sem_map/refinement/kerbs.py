@@ -44,7 +44,8 @@ def apply(state: MapState, settings: KerbSettings) -> MapState:
     kerbs = find_kerbs(state.decided, heights_of(state), settings)
     if kerbs is None:
         return state
-    states = np.where(kerbs.rows >= 0, np.uint8(State.SPLIT), state.decided.states)
+    states = state.decided.states.copy()
+    states[state.decided.voxels.indices_of(kerbs.keys)] = State.SPLIT
     return replace(state, kerbs=kerbs, decided=replace(state.decided, states=states))
 
 
@@ -67,8 +68,6 @@ def find_kerbs(
     kerbs = edge[is_step]
     if len(kerbs) == 0:
         return None
-    rows = np.full(len(labels), -1, np.int32)
-    rows[kerbs] = np.arange(len(kerbs))
     beside = _around(semantic_map, kerbs, (1, 1, 0)).T.reshape(-1, 3, 3)
     known = (beside >= 0) & (labels[beside] >= 0)
     sure = np.maximum(2 * semantic_map.confidence[beside] - 1, 0)  # unsure of one is not sure of the other
@@ -77,7 +76,7 @@ def find_kerbs(
     return Kerbs(
         semantic_map.voxels.voxel_size_m,
         classes,
-        rows,
+        semantic_map.voxels.keys[kerbs],
         leaning,
         known,
         levels,

@@ -51,8 +51,8 @@ class LevelSettings(RoadEdgeSettings):
 
 
 def reach_m(settings: LevelSettings, voxel_size_m: float) -> float:
-    """Each iteration of the fit spreads information by the radius of one plane fit."""
-    return (ROUNDS + 1) * (REACH[0] + 1) * CELL_M
+    """The radius of one fit; what the fits there take from beyond is left out."""
+    return (REACH[0] + 1) * CELL_M
 
 
 def apply(state: MapState, settings: LevelSettings) -> MapState:

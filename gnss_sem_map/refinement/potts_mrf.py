@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
+from numba import njit, uint64
 from numpy.typing import NDArray
 from pydantic import Field
 
+from gnss_sem_map.refinement.neighbours import pairs_of_neighbours
 from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
-from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.voxel_map import softmax
 
 LEAST_PROBABILITY = 1e-12
@@ -18,17 +18,6 @@ TEMPER = 0.5
 """A voxel's own evidence is multiplied by this, or neighbours have no say."""
 ITERATIONS = 5
 """Mean-field updates, all voxels at once; each reaches one voxel farther."""
-HALF_STENCIL = np.array(
-    [
-        (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z
-        for x in (-1, 0, 1)
-        for y in (-1, 0, 1)
-        for z in (-1, 0, 1)
-        if (x, y, z) < (0, 0, 0)
-    ],
-    np.int64,
-)
-"""Key offsets of 13 of the 26 neighbours; the others see the pair from their side."""
 
 
 class PottsSettings(StepSettings):
@@ -70,26 +59,31 @@ def mean_field(
     if len(seen) == 0:
         return scores
     own = np.float32(temper) * scores[seen]
+    pairs = pairs_of_neighbours(keys[seen])
     q = softmax(own)
     for _ in range(iterations):
         messages = np.zeros_like(q)
-        sum_of_neighbours(keys[seen], q, HALF_STENCIL, messages)
-        q = softmax(own + np.float32(coupling_nat) * messages)
+        sum_of_neighbours(pairs, q, messages, tuple(range(q.shape[1])))
+        _add_scaled(own, np.float32(coupling_nat), messages)
+        q = softmax(messages)
     result = scores.copy()
     result[seen] = np.log(np.maximum(q, LEAST_PROBABILITY))
     return result
 
 
 @njit(cache=True, nogil=True)
-def sum_of_neighbours(keys, q, stencil, messages):
-    """Sum of q (v, c) over the neighbours of every voxel; with sorted keys each offset is one walk through them."""
-    for offset in stencil:
-        j = 0
-        for i in range(len(keys)):
-            wanted = keys[i] + offset
-            while keys[j] < wanted:
-                j += 1
-            if keys[j] == wanted:
-                for c in range(q.shape[1]):
-                    messages[i, c] += q[j, c]
-                    messages[j, c] += q[i, c]
+def sum_of_neighbours(pairs, q, messages, classes):
+    """Add q (v, c) of the neighbours of every voxel to its messages (v, c); a tuple of classes is unrolled."""
+    for pair in range(len(pairs)):
+        i, j = uint64(pairs[pair, 0]), uint64(pairs[pair, 1])
+        for c in classes:
+            messages[i, c] += q[j, c]
+            messages[j, c] += q[i, c]
+
+
+@njit(cache=True, nogil=True)
+def _add_scaled(own, coupling, messages):
+    """Own evidence (v, c), plus messages times their coupling, in place of the messages."""
+    for i in range(len(own)):
+        for c in range(own.shape[1]):
+            messages[i, c] = own[i, c] + coupling * messages[i, c]

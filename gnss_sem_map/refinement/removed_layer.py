@@ -26,22 +26,7 @@ def apply(state: MapState, settings: RemovedLayerSettings) -> MapState:
     if state.beside.moved is None:
         raise NotApplicable("moving objects were not sought")
     assert state.decided is not None
-    refined = with_removed(state.decided, state.beside.moved)
-    rows = refined.voxels.indices_of(state.voxels.keys)
-    count = len(refined)
-    removed, inferred = np.ones(count, np.bool_), np.zeros(count, np.bool_)
-    removed[rows], inferred[rows] = state.removed, state.inferred
-    images, scores = (np.zeros((count, one.shape[1]), np.float32) for one in (state.images, state.scores))
-    images[rows], scores[rows] = state.images, state.scores
-    return replace(
-        state,
-        voxels=refined.voxels,
-        images=images,
-        scores=scores,
-        removed=removed,
-        inferred=inferred,
-        decided=refined,
-    )
+    return replace(state, decided=with_removed(state.decided, state.beside.moved))
 
 
 def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
@@ -69,9 +54,8 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
 
 def _with_hits(refined: SemanticMap, static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     """The same voxels; those of `static` that things moved through have their hits as well."""
-    hits, gone = refined.voxels.hits.copy(), refined.removed_hits.copy()
     through = removed[static.voxels.indices_of(removed.keys) >= 0]
-    places = refined.voxels.indices_of(through.keys)
-    hits[places] += through.hits
-    gone[places] += through.hits
-    return replace(refined, voxels=replace(refined.voxels, hits=hits), hits_removed=gone)
+    nothing = np.zeros_like(through.evidence)
+    gone = refined.removed_hits.copy()
+    gone[refined.voxels.indices_of(through.keys)] += through.hits
+    return replace(refined, voxels=refined.voxels + replace(through, evidence=nothing), hits_removed=gone)

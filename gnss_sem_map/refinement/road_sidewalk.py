@@ -41,17 +41,16 @@ def is_road_or_sidewalk(semantic_map: SemanticMap) -> NDArray[np.bool_]:
     shown = np.where(semantic_map.shown, semantic_map.labels, UNLABELLED)
     if classes is None or not all((shown == one).any() for one in classes):
         return np.zeros(len(shown), np.bool_)
-    return np.isin(shown, classes)
+    return np.asarray((shown == classes[ROAD]) | (shown == classes[SIDEWALK]))
 
 
 def heights_of(state: MapState) -> NDArray[np.float64]:
     """Mean height of the points in every voxel (v,) m, NaN where unknown. Raises NotApplicable."""
-    heights = state.beside.surface_heights
-    if heights is None:
-        raise NotApplicable("heights of surfaces were not measured")
     if state.decided is None or not is_road_or_sidewalk(state.decided).any():
         raise NotApplicable("the map has no road, or no sidewalk")
-    return heights.of(state.decided.voxels)
+    if state.decided.voxels.heights is None:
+        raise NotApplicable("heights of surfaces were not measured")
+    return state.decided.voxels.surface_heights
 
 
 def around(
@@ -72,8 +71,9 @@ def meeting(
 ) -> NDArray[np.bool_]:
     """Which voxels (v,) of one of the classes are beside one of the other, in their own layer."""
     found, keys = np.zeros(len(labels), np.bool_), semantic_map.voxels.keys
-    for own, other in (classes, classes[::-1]):
-        candidates = np.flatnonzero(labels == own)
-        for beside in around(keys, keys[candidates], (1, 1, 0)):
-            found[candidates] |= (beside >= 0) & (labels[beside] == other)
+    own, other = sorted(classes, key=lambda one: np.count_nonzero(labels == one))
+    candidates = np.flatnonzero(labels == own)  # of the rarer class: whoever meets is met
+    for beside in around(keys, keys[candidates], (1, 1, 0)):
+        meets = (beside >= 0) & (labels[beside] == other)
+        found[candidates[meets]] = found[beside[meets]] = True
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,22 +11,20 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics.motion_state import Motion
 from gnss_sem_map.dynamics.visibility import KeyframeScans
-from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.sensor_model import LabelCalibration
+from gnss_sem_map.refinement.figures import Figures
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import VoxelMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, best_classes
 
 Scores = NDArray[np.float32]
 """(v, c) log scores; their softmax is the class distribution."""
 
 NAT_PER_OBSERVATION = 1.3
 """Between an uninformative observation (1) and a certain one (1.6 for five classes and a floor of 5 %)."""
-WHOLE_MAP = float("inf")
-"""The reach of a step that reads the whole map."""
 
 
 class StepSettings(BaseModel):
@@ -51,8 +49,6 @@ class Evidence:
     """Where the classes were found to stand, in place of rules, and a temperature."""
     keyframes: KeyframeScans | None = None
     """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
-    surface_heights: SurfaceHeights | None = None
-    """How high the surface in a voxel lies, finer than the voxel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +70,10 @@ class MapState:
 
     voxels: VoxelMap
     beside: Evidence
-    images: Scores
-    """What the images alone say."""
+    figures: Figures
+    """What is known of the whole map, of which this may be a part."""
+    heights: NDArray[np.float32]
+    """(v,) m, of every voxel over the ground."""
     scores: Scores
     """What everything so far says."""
     removed: NDArray[np.bool_]
@@ -89,32 +87,46 @@ class MapState:
     kerbs: Kerbs | None = None
     """Voxels whose points are classified one by one."""
     decided: SemanticMap | None = None
-    """The map with its decisions, once they are made; later steps change those."""
+    """The map with its decisions, once they are made; later steps change those, and the last adds a layer."""
 
     @classmethod
-    def of(cls, voxels: VoxelMap, beside: Evidence) -> MapState:
+    def of(cls, voxels: VoxelMap, beside: Evidence, figures: Figures | None = None) -> MapState:
         """The state before the first step: eq. 6, every observation counted in full."""
+        heights = height_over_ground(voxels.centres)
         scores = voxels.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
         nothing = np.zeros(len(voxels), np.bool_)
-        return cls(voxels, beside, scores, scores, nothing, nothing)
+        return cls(voxels, beside, figures or Figures(), heights, scores, nothing, nothing)
 
-    @property
+    def __getitem__(self, chosen: NDArray[np.int64]) -> MapState:
+        """The voxels at increasing places, with all that is known of them."""
+        voxels = self.voxels[chosen]
+        return replace(
+            self,
+            voxels=voxels,
+            heights=self.heights[chosen],
+            scores=self.scores.take(chosen, axis=0),
+            removed=self.removed[chosen],
+            inferred=self.inferred[chosen],
+            decided=None if self.decided is None else replace(self.decided[chosen], voxels=voxels),
+            kerbs=None if self.kerbs is None else self._kerbs_in(voxels),
+        )
+
+    def _kerbs_in(self, voxels: VoxelMap) -> Kerbs:
+        assert self.kerbs is not None
+        return self.kerbs[np.flatnonzero(voxels.indices_of(self.kerbs.keys) >= 0)]
+
+    @cached_property
     def labels(self) -> NDArray[np.int8]:
         """The class of every voxel (v,), -1 where nothing is known."""
         if self.decided is not None:
             return self.decided.labels
         known = self.voxels.observed | self.inferred
-        return np.where(known, self.scores.argmax(axis=1), UNLABELLED).astype(np.int8)
+        return best_classes(self.scores, known)
 
     @property
     def is_removed(self) -> NDArray[np.bool_]:
         """Which voxels (v,) are part of something that moved."""
         return self.removed if self.decided is None else self.decided.states == State.REMOVED
-
-    @cached_property
-    def heights(self) -> NDArray[np.float32]:
-        """Height of every voxel over the ground (v,) m."""
-        return height_over_ground(self.voxels.centres)
 
     @cached_property
     def observations(self) -> NDArray[np.float32]:
@@ -124,7 +136,7 @@ class MapState:
         sum over the c classes by at least c ln c, and by little more than half as much again.
         """
         count = len(self.voxels.label_set.names)
-        nats = -self.voxels.evidence.sum(axis=1, dtype=np.float32) / np.float32(UNITS_PER_NAT)
+        nats = -sum(self.voxels.evidence.T.astype(np.float32)) / np.float32(UNITS_PER_NAT)
         return np.asarray(
             np.maximum(nats / np.float32(NAT_PER_OBSERVATION * count * np.log(count)), 1), np.float32
         )

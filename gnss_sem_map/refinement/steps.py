@@ -7,13 +7,14 @@ Its name is the same in the file, in the settings and in the report.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gnss_sem_map.dynamics.motion_state import TrackedObject
+from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
 from gnss_sem_map.refinement import (
     count_grid,
     decision,
@@ -37,12 +38,10 @@ from gnss_sem_map.refinement.kerbs import KerbSettings
 from gnss_sem_map.refinement.levels import LevelSettings
 from gnss_sem_map.refinement.potts_mrf import PottsSettings
 from gnss_sem_map.refinement.removed_layer import RemovedLayerSettings
-from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, StepSettings, VehicleObject
+from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings, VehicleObject
 from gnss_sem_map.refinement.systematic_error import SystematicErrorSettings
 from gnss_sem_map.refinement.unobserved import UnobservedSettings
 from gnss_sem_map.refinement.vehicles import VehicleSettings
-from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 class RefinementSettings(BaseModel):
@@ -71,20 +70,12 @@ class RefinementSettings(BaseModel):
     potts_mrf: PottsSettings = Field(
         default=PottsSettings(), description="Neighbouring voxels as evidence for each other."
     )
-    free_space: FreeSpaceSettings = Field(
-        default=FreeSpaceSettings(),
-        description="Voxels that rays traverse again and again are removed, where poses come from LiDAR odometry.",
-    )
     unobserved: UnobservedSettings = Field(
         default=UnobservedSettings(),
         description="Labels for voxels that no camera saw, from their neighbours; they are marked as inferred.",
     )
     decision: DecisionSettings = Field(
         default=DecisionSettings(), description="The most probable class, and its confidence."
-    )
-    removed_layer: RemovedLayerSettings = Field(
-        default=RemovedLayerSettings(),
-        description="Moving objects come back as a layer that is not shown.",
     )
     levels: LevelSettings = Field(
         default=LevelSettings(),
@@ -93,6 +84,14 @@ class RefinementSettings(BaseModel):
     kerbs: KerbSettings = Field(
         default=KerbSettings(),
         description="Points where road meets sidewalk are classified by their own position and height, in `labels/`.",
+    )
+    free_space: FreeSpaceSettings = Field(
+        default=FreeSpaceSettings(),
+        description="Voxels that rays traverse again and again are removed, where poses come from LiDAR odometry.",
+    )
+    removed_layer: RemovedLayerSettings = Field(
+        default=RemovedLayerSettings(),
+        description="Moving objects come back as a layer that is not shown.",
     )
 
 
@@ -120,12 +119,12 @@ STEPS = tuple(
         count_grid,
         vehicles,
         potts_mrf,
-        free_space,
         unobserved,
         decision,
-        removed_layer,
         levels,
         kerbs,
+        free_space,
+        removed_layer,
     )
 )
 
@@ -145,6 +144,15 @@ class StepReport:
         """Voxels that changed."""
         return sum(self.changes.values())
 
+    def __add__(self, other: StepReport) -> StepReport:
+        """Of two parts of a map; a step was done when it was done in one of them."""
+        changes = {
+            pair: self.changes.get(pair, 0) + other.changes.get(pair, 0)
+            for pair in sorted({*self.changes, *other.changes})
+        }
+        skipped = max(self.skipped, other.skipped) if self.skipped and other.skipped else ""
+        return StepReport(self.name, changes, skipped)
+
 
 @dataclass(frozen=True, eq=False)
 class RefinementReport:
@@ -157,48 +165,82 @@ class RefinementReport:
     systematic_errors: float = 0.0
     """Share of observations that are wrong in all views alike, as far as the map can tell."""
 
+    def to_json(self) -> dict[str, Any]:
+        """What it says of a tile, without objects through time; `from_json` reads it back."""
+        steps = [
+            {
+                "name": step.name,
+                "changes": [[*pair, n] for pair, n in step.changes.items()],
+                "skipped": step.skipped,
+            }
+            for step in self.steps
+        ]
+        objects = [asdict(thing) | {"centre": thing.centre.tolist()} for thing in self.objects]
+        return {"steps": steps, "objects": objects, "systematic_errors": self.systematic_errors}
 
-def refine(
-    voxels: VoxelMap, settings: RefinementSettings | None = None, beside: Evidence | None = None
-) -> tuple[SemanticMap, RefinementReport]:
-    """Refine a whole map; no voxel is deleted, and one that no camera saw stays unlabelled unless it is inferred."""
-    state, report = run_steps(voxels, settings, beside)
-    assert state.decided is not None
-    return state.decided, report
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> RefinementReport:
+        """Raises KeyError, TypeError or ValueError for anything else."""
+        steps = [
+            StepReport(
+                str(step["name"]),
+                {(str(a), str(b)): int(n) for a, b, n in step["changes"]},
+                str(step["skipped"]),
+            )
+            for step in content["steps"]
+        ]
+        if [step.name for step in steps] != [step.name for step in STEPS]:
+            raise ValueError("a report of other steps")
+        objects = [
+            VehicleObject(
+                **{
+                    **thing,
+                    "motion": Motion(thing["motion"]),
+                    "centre": np.array(thing["centre"], np.float64),
+                }
+            )
+            for thing in content["objects"]
+        ]
+        return cls(tuple(steps), tuple(objects), (), float(content["systematic_errors"]))
+
+    def __add__(self, other: RefinementReport) -> RefinementReport:
+        """Of two parts of a map; objects are numbered from west to east."""
+        objects = sorted((*self.objects, *other.objects), key=lambda thing: tuple(thing.centre))
+        return RefinementReport(
+            tuple(a + b for a, b in zip(self.steps, other.steps, strict=True)),
+            tuple(replace(thing, number=number) for number, thing in enumerate(objects)),
+            (*self.tracked, *other.tracked),
+            max(self.systematic_errors, other.systematic_errors),
+        )
 
 
-def run_steps(
-    voxels: VoxelMap, settings: RefinementSettings | None = None, beside: Evidence | None = None
-) -> tuple[MapState, RefinementReport]:
-    """All steps one after the other: the last state, decided, and what each of them changed."""
-    settings = settings or RefinementSettings()
-    state, reports = MapState.of(voxels, beside or Evidence()), []
-    for step in STEPS:
-        state, report = _do(step, state, step.settings(settings))
-        reports.append(report)
-    return state, RefinementReport(tuple(reports), state.vehicles, systematic_errors=state.systematic_error)
-
-
-def _do(step: Step, state: MapState, settings: StepSettings) -> tuple[MapState, StepReport]:
-    if not settings.enabled:
+def do(
+    step: Step, state: MapState, settings: RefinementSettings, own: NDArray[np.bool_] | slice = slice(None)
+) -> tuple[MapState, StepReport]:
+    """The state after a step, and what it changed in a map's `own` voxels (v,), all by default."""
+    section = step.settings(settings)
+    if not section.enabled:
         return state, StepReport(step.name, {}, "switched off")
     try:
-        after = step.apply(state, settings)
+        after = step.apply(state, section)
     except NotApplicable as reason:
         return state, StepReport(step.name, {}, str(reason))
-    return after, StepReport(step.name, _changes(state, after))
+    return after, StepReport(step.name, _changes(state, after, own))
 
 
-def _changes(before: MapState, after: MapState) -> dict[tuple[str, str], int]:
+def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | slice) -> dict[tuple[str, str], int]:
     """How many voxels went from which class to which; a voxel that is new in the map was what its evidence says."""
+    if after.scores is before.scores and after.decided is before.decided and after.removed is before.removed:
+        return {}
     names = [*after.voxels.label_set.names, "removed", "unlabelled"]  # -1, unlabelled, is the last
-    removed = len(names) - 2
-    target = np.where(after.is_removed, removed, after.labels)
-    source = np.where(before.is_removed, removed, before.labels)
-    if after.voxels is not before.voxels:
-        known = after.voxels.labels.astype(np.int64)
-        known[after.voxels.indices_of(before.voxels.keys)] = source
+    removed = np.int8(len(names) - 2)
+    source, target = (np.where(one.is_removed, removed, one.labels) for one in (before, after))
+    if len(source) < len(target):
+        assert after.decided is not None
+        known = after.decided.voxels.labels.copy()
+        known[after.decided.voxels.indices_of(before.voxels.keys)] = source
         source = known
+    source, target = source[own], target[own]
     differ = target != source
     pairs, counts = np.unique(np.stack([source[differ], target[differ]]), axis=1, return_counts=True)
     return {(names[a], names[b]): int(n) for (a, b), n in zip(pairs.T, counts, strict=True)}

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from gnss_sem_map.refinement import potts_mrf
+from gnss_sem_map.refinement.figures import FIXED_POINT, MOST_SYSTEMATIC, Sums
 from gnss_sem_map.refinement.potts_mrf import PottsSettings, mean_field
-from gnss_sem_map.refinement.state import WHOLE_MAP, MapState, StepSettings
+from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
+from gnss_sem_map.voxels.voxel_map import best_classes
 
-MOST = 0.5
-"""Upper limit of the estimate."""
 COUPLING_NAT: float = PottsSettings().coupling_nat
 
 
@@ -22,46 +23,59 @@ class SystematicErrorSettings(StepSettings):
     rate: float | None = Field(
         default=None,
         ge=0,
-        le=0.5,
+        le=MOST_SYSTEMATIC,
         description="Share of observations that are wrong in all views alike, so that looking again makes no voxel"
         " surer; default: estimated from the map itself, by how often geometry and neighbours overrule the images.",
     )
 
 
 def reach_m(settings: SystematicErrorSettings, voxel_size_m: float) -> float:
-    """One figure for the whole map."""
-    return WHOLE_MAP
+    """A voxel alone, and one figure for the whole map."""
+    return 0.0
 
 
 def apply(state: MapState, settings: SystematicErrorSettings) -> MapState:
-    """What is set, or what geometry and neighbours, each for itself, say of the images."""
+    """What is set, or what geometry and neighbours, each for itself, say of the images of the whole map."""
+    rate = state.figures.systematic_error if settings.rate is None else settings.rate
+    return replace(state, systematic_error=rate)
+
+
+def measure(
+    state: MapState, images: Scores, settings: SystematicErrorSettings, own: NDArray[np.bool_]
+) -> Sums:
+    """How often geometry and neighbours overrule the images in a map's `own` voxels (v,); see `counted`.
+
+    `images` (v, c) is what these alone say, the scores of `state` what geometry says as well.
+    """
     if settings.rate is not None:
-        return replace(state, systematic_error=settings.rate)
-    voxels, seen = state.voxels, state.voxels.observed
-    with_neighbours = mean_field(voxels.keys, state.images, seen, COUPLING_NAT)
+        return Sums()
+    voxels, seen = state.voxels, state.voxels.observed & own
+    with_neighbours = mean_field(voxels.keys, images, voxels.observed, COUPLING_NAT)
     called, by_geometry, by_neighbours = (
-        scores[seen].argmax(axis=1) for scores in (state.images, state.scores, with_neighbours)
+        best_classes(scores, seen) for scores in (images, state.scores, with_neighbours)
     )
     first, second = by_geometry != called, by_neighbours != called
-    return replace(state, systematic_error=systematic_errors(first, second, state.observations[seen]))
+    return counted(first[seen], second[seen], state.observations[seen])
 
 
-def systematic_errors(
-    first: NDArray[np.bool_], second: NDArray[np.bool_], observations: NDArray[np.floating]
-) -> float:
-    """Share of observations, 0 to 0.5, that are wrong in all views alike, by capture and recapture.
+def measure_reach_m(voxel_size_m: float) -> float:
+    """How far from a voxel `measure` reads."""
+    return potts_mrf.reach_m(PottsSettings(), voxel_size_m)
 
-    `first` and `second` (v,) are the voxels in which two independent sources (geometry and neighbours) overrule the
-    images; a voxel is weighted with its `observations` (v,). The first source finds the same share of all errors as of
-    those that the second one finds: all = first * second / both. With one source only, its errors are the estimate.
-    Source: Chapman, "Some properties of the hypergeometric distribution" (1951), which is unbiased for small numbers.
-    """
-    if not len(observations):
-        return 0.0
-    weight = observations / observations.mean()
-    by_first, by_second, by_both = (float(weight[found].sum()) for found in (first, second, first & second))
-    errors = (by_first + 1) * (by_second + 1) / (by_both + 1) - 1
-    return min(errors / len(observations), MOST)
+
+def counted(first: NDArray[np.bool_], second: NDArray[np.bool_], observations: NDArray[np.floating]) -> Sums:
+    """The sums of voxels (v,) in which geometry and neighbours overrule the images, weighted by `observations` (v,)."""
+    weight = np.rint(observations * FIXED_POINT).astype(np.int64)
+    total, by_first, by_second, by_both = (
+        int(weight[found].sum()) for found in (np.ones_like(first), first, second, first & second)
+    )
+    return Sums(
+        observed=len(weight),
+        observations=total,
+        by_geometry=by_first,
+        by_neighbours=by_second,
+        by_both=by_both,
+    )
 
 
 def doubted(

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.refinement.potts_mrf import HALF_STENCIL, sum_of_neighbours
+from gnss_sem_map.refinement.neighbours import pairs_of_neighbours
+from gnss_sem_map.refinement.potts_mrf import sum_of_neighbours
 from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
 from gnss_sem_map.voxels.voxel_map import softmax
 
@@ -41,11 +42,11 @@ def infer(
 
     Messages come from observed neighbours first, then from inferred ones.
     """
-    scores, known = scores.copy(), observed.copy()
+    scores, known, pairs = scores.copy(), observed.copy(), pairs_of_neighbours(keys)
     for _ in range(settings.iterations):
         q = np.where(known[:, None], softmax(scores), np.float32(0))
         messages = np.zeros_like(q)
-        sum_of_neighbours(keys, q, HALF_STENCIL, messages)
+        sum_of_neighbours(pairs, q, messages, tuple(range(q.shape[1])))
         reached = ~known & messages.any(axis=1)
         if not reached.any():
             break

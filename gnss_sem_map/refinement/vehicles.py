@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.spatial import cKDTree
 
 from gnss_sem_map.dynamics.motion_state import Motion
+from gnss_sem_map.refinement.figures import Sums
 from gnss_sem_map.refinement.state import (
-    WHOLE_MAP,
     MapState,
     NotApplicable,
     StepSettings,
@@ -20,13 +20,11 @@ from gnss_sem_map.refinement.state import (
     classes_of,
 )
 from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
-from gnss_sem_map.voxels.voxel_map import pack, unpack
-
-COLUMN = np.array([1, 1, 0], np.int32)
-"""Times a voxel, its column."""
 
 LOWEST_M, HIGHEST_M = 0.1, 3.5
 """Heights over the ground between which a voxel may be a vehicle: lower is the ground, higher no truck reaches."""
+REACH_M = 5.0
+"""A car's length."""
 REJECTED_NAT = 6.0
 """What the rules count against a voxel that they reject: odds of 400 to 1."""
 
@@ -60,8 +58,8 @@ class VehicleSettings(StepSettings):
 
 
 def reach_m(settings: VehicleSettings, voxel_size_m: float) -> float:
-    """A group of voxels is judged whole, however long it is."""
-    return WHOLE_MAP
+    """Of a group of voxels that is longer, the part within reach is judged."""
+    return REACH_M
 
 
 def apply(state: MapState, settings: VehicleSettings) -> MapState:
@@ -71,12 +69,18 @@ def apply(state: MapState, settings: VehicleSettings) -> MapState:
     if settings.method == "paper":
         found = paper(voxels.indices, labels, vehicle, road, settings, voxels.voxel_size_m)
         return replace(state, removed=state.removed | found.moving | found.rejected, vehicles=found.objects)
-    if not (labels == road).any():  # nothing is known of any vehicle: a camera that looks aside sees no road
+    if not state.figures.has_road:  # nothing is known of any vehicle: a camera that looks aside sees no road
         raise NotApplicable("the map has no road to stand on")
     found = supported(voxels.indices, labels, state.heights, vehicle, road, settings, voxels.voxel_size_m)
     scores = state.scores.copy()
     scores[found.rejected, vehicle] -= np.float32(REJECTED_NAT)
     return replace(state, scores=scores, vehicles=found.objects)
+
+
+def measure(state: MapState, settings: VehicleSettings, own: NDArray[np.bool_]) -> Sums:
+    """How many of a map's `own` voxels (v,) are road."""
+    (road,) = classes_of(state.voxels.label_set, "road")
+    return Sums(roads=int(np.count_nonzero(own & (state.labels == road))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +180,23 @@ def _over(indices: NDArray[np.int32], road: NDArray[np.int32], reach_voxels: flo
     """Which voxels (v, 3) have a road voxel (r, 3) within a distance in x and y."""
     if len(indices) == 0 or len(road) == 0:
         return np.zeros(len(indices), np.bool_)
-    columns, column = np.unique(pack(indices * COLUMN), return_inverse=True)
-    roads = unpack(np.unique(pack(road * COLUMN)))[:, :2]
-    distances = cKDTree(roads).query(unpack(columns)[:, :2], distance_upper_bound=reach_voxels + TIE)[0]
-    return np.asarray(np.isfinite(distances)[column])
+    reach = int(reach_voxels + TIE)
+    x, y = (one.ravel() for one in np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"))
+    order = np.argsort(np.hypot(x, y), kind="stable")  # the nearest first: most have road there
+    disc = np.stack([x, y], axis=1)[order][np.hypot(x, y)[order] <= reach_voxels + TIE]
+    origin = np.minimum(indices.min(axis=0), road.min(axis=0))[:2] - reach
+    is_road = np.zeros(np.maximum(indices.max(axis=0), road.max(axis=0))[:2] - origin + reach + 1, np.bool_)
+    is_road[tuple((road[:, :2] - origin).T)] = True
+    found = np.zeros(len(indices), np.bool_)
+    _near_marked(is_road, indices[:, :2] - origin, disc, found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _near_marked(marked, cells, offsets, found):
+    """Which of the cells (n, 2) have a marked one at one of the offsets."""
+    for i in range(len(cells)):
+        for k in range(len(offsets)):
+            if marked[cells[i, 0] + offsets[k, 0], cells[i, 1] + offsets[k, 1]]:
+                found[i] = True
+                break

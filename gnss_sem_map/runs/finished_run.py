@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,14 +19,17 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.export.formats import FORMATS, Exported, Format
-from gnss_sem_map.files.output_folder import refuse_inputs
-from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.formats import FORMATS, Format
+from gnss_sem_map.files.atomic import link_or_copy
+from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
+from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.raw_map import DRIVES, MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.merged_run import TRACK, write_merged
@@ -46,6 +51,7 @@ def run(
     frames: str | None = None,
     drive_format: str | None = None,
     device: str = "auto",
+    origin: LocalFrame | None = None,
     workers: int = 1,
     resume: bool = False,
     write_labels: bool = False,
@@ -54,11 +60,12 @@ def run(
 ) -> Run:
     """Map one drive into a run folder, as `gnss-sem-map run` does.
 
-    `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only; `frames` is `A:B`; `log` is what
-    these open, if it is open already. Raises PreflightError where the drive looks wrong (see `force`), DataError,
-    ConfigError, and what the smoother raises.
+    `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only, and `{drive}` in it the name of
+    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. Raises PreflightError where the drive
+    looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
+    segmenter = run_folder.segmenter_of(drive, segmenter)
     with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
         log = log or open_drive(drive, drive_format).between(frames)
         refuse_inputs(claim.out, sorted(log.folders))
@@ -66,11 +73,14 @@ def run(
         if segmenter not in (None, "none"):
             label_set = open_label_set(settings.classes)
             network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
-        result = pipeline.run(
-            log, network, settings, progress,
-            work=claim.work, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
-        )  # fmt: skip
-        run_folder.write_run(out, drive, log, result, settings, write_labels, segmenter, frames)
+        with new_folder(out) as folder:
+            mapped = pipeline.run(
+                log, network, settings, folder, claim.work, progress,
+                origin=origin, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
+            )  # fmt: skip
+            refined = pipeline.refine(folder, settings, mapped.stats, progress)
+            inputs = run_folder.inputs_of_run(drive, segmenter, frames)
+            run_folder.write_run(folder, drive, mapped, refined, settings, write_labels, inputs)
     return Run(out)
 
 
@@ -96,7 +106,7 @@ class Run:
 
     @property
     def is_merged(self) -> bool:
-        """Whether it was merged from two runs: then it has no drive, no trajectory and no point labels."""
+        """Whether it is a map of several drives: then it has no drive, no trajectory and no point labels of its own."""
         return "merged" in self.about
 
     @cached_property
@@ -130,17 +140,23 @@ class Run:
         Scans are read only if the run has point labels. Raises ConfigError if other settings differ too.
         """
         _check_same_map(self.settings, settings)
-        found, raw, stats = evidence.read(self.folder, self.label_set), self.map(refined=False), RunStats()
-        with stats.stage("refinement"):
-            state, report = pipeline.refine_map(raw.voxels - found.moved, found, settings)
-        assert state.decided is not None
-        result = pipeline.Result(
-            self._track, None, raw, state.decided, report, stats, found, kerbs=state.kerbs
-        )
-        if self.is_merged:
-            return self._written_merged(out, result, settings)
-        log = self.drive() if is_folder(self.folder / "labels") else None
-        return self._written(out, result, settings, log, {}, same_map=True)
+        stats = RunStats()
+        has_labels = not self.is_merged and is_folder(self.folder / "labels")
+        log = self.drive() if has_labels else None
+        with self._rewritten(out) as folder:
+            for part in (MAP, evidence.FOLDER, DRIVES):
+                if is_folder(self.folder / part):
+                    shutil.copytree(self.folder / part, folder / part, copy_function=link_or_copy)
+            refined = pipeline.refine(folder, settings, stats)
+            if self.is_merged:
+                about = self.about | {"map": run_folder.about_map(folder, refined.report)}
+                write_merged(folder, self.folder / TRACK, settings, about)
+            else:
+                known = self.folder / run_folder.RAW_LABELS
+                run_folder.write_again(
+                    folder, self.folder, self.trajectory, refined, stats, settings, log, {}, known
+                )
+        return Run(self.folder if out is None else Path(out))
 
     def relabel(
         self,
@@ -159,10 +175,26 @@ class Run:
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
-        result = pipeline.map_drive(drive, RunStats(), progress, labels_from=segmenter)
         inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
-        return self._written(out, result, settings, with_labels, {"inputs": inputs})
+        stats = RunStats()
+        with self._rewritten(out) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:
+            mapped = pipeline.map_drive(
+                drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter
+            )
+            refined = pipeline.refine(folder, settings, stats, progress)
+            refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
+            run_folder.write_again(
+                folder,
+                self.folder,
+                self.trajectory,
+                refined,
+                stats,
+                settings,
+                with_labels,
+                {"inputs": inputs},
+            )
+        return Run(self.folder if out is None else Path(out))
 
     def export(self, formats: Iterable[str], to: Path | str | None = None) -> list[Path]:
         """Write the map in formats (`laz`, `ply`, ...; see `export.formats`), into the run or the folder `to`."""
@@ -170,7 +202,8 @@ class Run:
         chosen = list(formats)
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
-        exported = Exported(self.map(), self.frame, self._driven, str(self.about["name"]))
+        refined = tiles.open_map(self.folder / "refined", self.label_set)
+        exported = Exported(refined, self._driven, str(self.about["name"]))
         if to is None:
             return [self._amended(known[name], exported) for name in chosen]
         files = [Path(to) / known[name].file for name in chosen]
@@ -183,9 +216,8 @@ class Run:
 
     def _amended(self, format_: Format, exported: Exported) -> Path:
         with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-            file = Path(folder) / format_.file
-            format_.write(exported, file)
-            amend(self.folder, format_.file, file.read_bytes())
+            format_.write(exported, Path(folder) / format_.file)
+            amend_all(self.folder, Path(folder))
         return self.folder / format_.file
 
     def drive(self) -> SensorLog:
@@ -215,27 +247,13 @@ class Run:
                 f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; use one of those"
             )
 
-    def _written_merged(self, out: Path | str | None, result: pipeline.Result, settings: Settings) -> Run:
+    @contextmanager
+    def _rewritten(self, out: Path | str | None) -> Iterator[Path]:
+        """A new folder for this run with another map; it takes the place of the run, or of `out`."""
         place = self.folder if out is None else Path(out)
         inputs = [self.folder] if place.resolve() != self.folder.resolve() else []
-        with run_folder.claimed_run(place, inputs):
-            about = self.about | {"map": run_folder.about_map(result)}
-            write_merged(place, self.folder / TRACK, result, settings, self.frame, about)
-        return Run(place)
-
-    def _written(
-        self,
-        out: Path | str | None,
-        result: pipeline.Result,
-        settings: Settings,
-        log: SensorLog | None,
-        changed: dict[str, Any],
-        same_map: bool = False,
-    ) -> Run:
-        place = self.folder if out is None else Path(out)
-        tracked = self.about["map"]["refinement"] if not result.refinement.tracked else None
-        run_folder.write_again(place, self.folder, result, settings, log, changed, tracked, same_map)
-        return Run(place)
+        with run_folder.claimed_run(place, inputs), new_folder(place) as folder:
+            yield folder
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:

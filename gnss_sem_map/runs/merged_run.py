@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.config import Settings
@@ -16,10 +15,9 @@ from gnss_sem_map.files.output_folder import new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.merging import Alignment, merge_runs
-from gnss_sem_map.pipeline import Result, refine_map
-from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_raw, write_refined
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.mapping.raw_map import open_raw
+from gnss_sem_map.mapping.refining import refine_map
+from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_map_files
 
 TRACK = "track.parquet"
 """Trajectory of the first run, for pictures: a merged run has no trajectory of its own."""
@@ -37,52 +35,32 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
         raise DataError(
             f"{second}: is the first run as well, and all its evidence would count twice; give another run"
         )
-    with claimed_run(out, [first, second]):
-        return _merge(first, second, out, match)
+    with claimed_run(out, [first, second]), new_folder(out) as folder:
+        return _merge(first, second, folder, match)
 
 
-def _merge(first: Path, second: Path, out: Path, match: bool) -> dict[str, Any]:
+def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, Any]:
     settings = config.load(first / "config.yaml")
     label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
-    state, report = refine_map(merged.static, merged.evidence, settings)
-    assert state.decided is not None
-    raw = SemanticMap.of(merged.static + merged.evidence.moved)
-    result = Result(
-        Trajectory.load(first / "trajectory.parquet"),
-        None,
-        raw,
-        state.decided,
-        report,
-        RunStats(),
-        merged.evidence,
-        kerbs=state.kerbs,
-    )
+    merged.write_raw(folder)
+    refined = refine_map(open_raw(folder, label_set), folder, settings)
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
         "local_frame": asdict(merged.frame),
-        "map": about_map(result),
+        "map": about_map(folder, refined.report),
         "match": _about(merged.alignment),
     }
-    write_merged(out, first / "trajectory.parquet", result, settings, merged.frame, about)
+    write_merged(folder, first / "trajectory.parquet", settings, about)
     return about
 
 
-def write_merged(
-    out: Path,
-    track: Path,
-    result: Result,
-    settings: Settings,
-    frame: LocalFrame | None,
-    about: dict[str, Any],
-) -> None:
-    """Write the folder of a merged run; `track` is the file of its trajectory. Raises DataError."""
-    with new_folder(out) as folder:
-        write_raw(folder, result, frame)
-        write_refined(folder, result, frame, result.trajectory, str(about["name"]))
-        shutil.copyfile(track, folder / TRACK)
-        write_about(folder, settings, about, {})
+def write_merged(folder: Path, track: Path, settings: Settings, about: dict[str, Any]) -> None:
+    """Write the files of a merged run beside its maps; `track` is the file of its trajectory. Raises DataError."""
+    shutil.copyfile(track, folder / TRACK)
+    write_map_files(folder, Trajectory.load(folder / TRACK), str(about["name"]))
+    write_about(folder, settings, about, {})
 
 
 def _about(alignment: Alignment) -> dict[str, Any]:

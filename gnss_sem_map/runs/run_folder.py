@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS
 from gnss_sem_map.evaluation.preflight.findings import Preflight
-from gnss_sem_map.export.formats import Exported, write_exports
+from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import label_points
+from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
-from gnss_sem_map.pipeline import Result
+from gnss_sem_map.pipeline import Mapped
+from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import SensorLog
@@ -59,6 +64,16 @@ def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> Abstract
     return claimed(out, inputs, is_run_file)
 
 
+def name_of(drive: Path) -> str:
+    """The name of a drive: that of its folder, or of the link that was given."""
+    return Path(os.path.abspath(drive)).name
+
+
+def segmenter_of(drive: Path, spec: str | None) -> str | None:
+    """The segmenter's SPEC for a drive, whose name `{drive}` stands for."""
+    return None if spec is None else spec.replace("{drive}", name_of(drive))
+
+
 def places_read(
     drive: Path, settings: Settings, segmenter: str | None = None, config: Path | None = None
 ) -> list[Path | str | None]:
@@ -69,94 +84,95 @@ def places_read(
 
 
 def write_run(
-    out: Path,
+    folder: Path,
     drive: Path,
-    log: SensorLog,
-    result: Result,
+    mapped: Mapped,
+    refined: Refined,
     settings: Settings,
     write_labels: bool,
-    segmenter: str | None = None,
-    frames: str | None = None,
-) -> dict[str, Any]:
-    """Write everything that a run made; returns the content of run.json."""
-    inputs = {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
-    with claimed_run(out, [drive]), new_folder(out) as folder:
-        with result.stats.stage("export"):
-            _write_trajectory(folder, log, result.trajectory, result.solution)
-            driven = _while_mapping(result.trajectory, log)
-            write_raw(folder, result, log.frame)
-            write_refined(folder, result, log.frame, driven, log.name)
-            if write_labels:
-                write_point_labels(folder, log, result, settings)
-        about = about_run(drive, log, result.stats) | {
-            "inputs": inputs,
-            "scans_s": [log.scans[0].stamp, log.scans[-1].stamp],
-            "preflight": result.preflight.as_dict(),
-            "trajectory": _about_solution(result.solution),
-            "from_lidar_odometry": result.from_lidar_odometry,
-            "map": about_map(result),
-        }
-        metrics = {"sharpness": {name: figures.as_dict() for name, figures in result.sharpness.items()}}
-        write_about(folder, settings, about, metrics)
-    return about
+    inputs: dict[str, Any],
+) -> None:
+    """Write everything that a run of one drive made beside its maps, which are in the folder already."""
+    refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
+    with mapped.stats.stage("export"):
+        write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
+        write_map_files(folder, _while_mapping(mapped.trajectory, mapped.log), mapped.log.name)
+        if write_labels:
+            write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
+    about = about_mapped(drive, mapped, inputs) | {"map": about_map(folder, refined.report)}
+    write_about(folder, settings, about, metrics_of(mapped))
+
+
+def write_drive(
+    folder: Path, drive: Path, mapped: Mapped, settings: Settings, inputs: dict[str, Any]
+) -> None:
+    """Write what is known of one of several drives beside its raw map, which is in the folder already."""
+    write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
+    write_about(folder, settings, about_mapped(drive, mapped, inputs), metrics_of(mapped))
+
+
+def inputs_of_run(drive: Path, segmenter: str | None, frames: str | None) -> dict[str, Any]:
+    """From what a run is made, for run.json."""
+    return {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
+
+
+def about_mapped(drive: Path, mapped: Mapped, inputs: dict[str, Any]) -> dict[str, Any]:
+    """What is known of a drive beside its map, for run.json."""
+    scans = mapped.log.scans
+    return about_run(drive, mapped.log, mapped.stats) | {
+        "inputs": inputs,
+        "scans_s": [scans[0].stamp, scans[-1].stamp],
+        "preflight": mapped.preflight.as_dict(),
+        "trajectory": _about_solution(mapped.solution),
+        "from_lidar_odometry": mapped.from_lidar_odometry,
+    }
+
+
+def metrics_of(mapped: Mapped) -> dict[str, Any]:
+    """Figures of a drive that need no truth, for metrics.json."""
+    return {"sharpness": {name: figures.as_dict() for name, figures in mapped.sharpness.items()}}
 
 
 def write_again(
-    out: Path,
+    folder: Path,
     source: Path,
-    result: Result,
+    trajectory: Trajectory,
+    refined: Refined,
+    stats: RunStats,
     settings: Settings,
     log: SensorLog | None,
     changed: dict[str, Any],
-    tracked: dict[str, Any] | None = None,
-    same_map: bool = False,
-) -> dict[str, Any]:
-    """Write a finished run once more, with another map of the same drive; returns the content of run.json.
+    known_raw: Path | None = None,
+) -> None:
+    """Write a finished run once more, with another map of the same drive, which is in the folder already.
 
-    What stays is copied from `source`, which may be `out`; scores of the map before do not. Point labels are written
-    where there is a `log`. `changed` is what run.json says anew, `tracked` what it said of moving objects, where they
-    were not sought again. `same_map`: only the refinement differs.
+    What stays is copied from `source`; scores of the map before do not. Point labels are written where there is a
+    `log`, with those before refinement copied from `known_raw`. `changed` is what run.json says anew; what it said of
+    moving objects stays where they were not sought again.
     """
     about, metrics = read_run(source), read_json(source / "metrics.json")
     first, last = about["scans_s"]
-    with claimed_run(out, [source] if source.resolve() != out.resolve() else []), new_folder(out) as folder:
-        for file in source.glob("trajectory*"):
-            shutil.copyfile(file, folder / file.name)
-        frame = tiles.read_frame(source / "map")
-        driven = between(result.trajectory, first, last)
-        with result.stats.stage("export"):
-            if same_map:
-                for part in ("map", evidence.FOLDER):
-                    shutil.copytree(source / part, folder / part)
-            else:
-                write_raw(folder, result, frame)
-            write_refined(folder, result, frame, driven, str(about["name"]))
-            if log is not None:
-                write_point_labels(folder, log, result, settings, source / RAW_LABELS if same_map else None)
-        about |= changed | {
-            "seconds": about["seconds"] | _seconds(result.stats),
-            "counts": about["counts"] | dict(sorted(result.stats.counts.items())),
-            "warnings": list(dict.fromkeys([*about["warnings"], *result.stats.warnings])),
-            "map": about_map(result),
-        }
-        if tracked is not None:
-            about["map"]["refinement"] |= {name: tracked[name] for name in ("tracked", "untracked_segments")}
-        write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
-    return about
+    for file in source.glob("trajectory*"):
+        shutil.copyfile(file, folder / file.name)
+    with stats.stage("export"):
+        write_map_files(folder, between(trajectory, first, last), str(about["name"]))
+        if log is not None:
+            write_point_labels(folder, log, trajectory, refined.kerbs, settings, known_raw)
+    tracked = about["map"]["refinement"]
+    about |= changed | {
+        "seconds": about["seconds"] | _seconds(stats),
+        "counts": about["counts"] | dict(sorted(stats.counts.items())),
+        "warnings": list(dict.fromkeys([*about["warnings"], *stats.warnings])),
+        "map": about_map(folder, refined.report),
+    }
+    if not refined.report.tracked:
+        about["map"]["refinement"] |= {name: tracked[name] for name in ("tracked", "untracked_segments")}
+    write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
 
 
-def write_raw(folder: Path, result: Result, frame: LocalFrame | None) -> None:
-    """Write the map before refinement, and its evidence."""
-    tiles.write(result.raw, folder / "map", frame)
-    evidence.write(result.evidence, folder, frame)
-
-
-def write_refined(
-    folder: Path, result: Result, frame: LocalFrame | None, driven: Trajectory, title: str
-) -> None:
-    """Write the refined map, as tiles and in all formats."""
-    tiles.write(result.refined, folder / "refined", frame)
-    write_exports(Exported(result.refined, frame, driven, title), folder)
+def write_map_files(folder: Path, driven: Trajectory, title: str) -> None:
+    """Write the refined map of a run folder in all formats."""
+    write_exports(Exported(tiles.open_map(folder / REFINED), driven, title), folder)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:
@@ -188,7 +204,7 @@ def write_trajectory_run(
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        _write_trajectory(folder, log, found.trajectory, found.solution)
+        write_trajectory_files(folder, log, found.trajectory, found.solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(drive, log, stats) | {
             "preflight": page.as_dict(),
@@ -198,7 +214,7 @@ def write_trajectory_run(
     return about
 
 
-def _write_trajectory(
+def write_trajectory_files(
     folder: Path, log: SensorLog, trajectory: Trajectory, solution: Solution | None
 ) -> None:
     trajectory.save(folder / "trajectory.parquet")
@@ -227,7 +243,12 @@ def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
 
 
 def write_point_labels(
-    folder: Path, log: SensorLog, result: Result, settings: Settings, known_raw: Path | None = None
+    folder: Path,
+    log: SensorLog,
+    trajectory: Trajectory,
+    kerbs: Kerbs | None,
+    settings: Settings,
+    known_raw: Path | None = None,
 ) -> None:
     """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
@@ -240,12 +261,11 @@ def write_point_labels(
         (folder / RAW_LABELS).mkdir()
     else:
         shutil.copytree(known_raw, folder / RAW_LABELS)
-    known_ids = result.raw.voxels.label_set.semantic_kitti_ids
-    ids = np.append(known_ids, 0).astype("<u4")  # the label -1 finds the last
-    maps = [result.raw] * (known_raw is None) + [result.refined]
-    for scan, (*raw, refined) in label_points(
-        log, result.trajectory, maps, settings, result.evidence.moving, result.kerbs
-    ):
+    label_set = open_label_set(settings.classes)
+    ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
+    maps = [tiles.open_map(folder / name, label_set) for name in (MAP, REFINED)[known_raw is not None :]]
+    moving = evidence.read(folder, label_set).moving_points
+    for scan, (*raw, refined) in label_points(log, trajectory, maps, settings, moving, kerbs):
         if raw:
             ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{scan.name}.label")
         ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
@@ -261,7 +281,7 @@ def about_run(drive: Path, log: SensorLog, stats: RunStats) -> dict[str, Any]:
         frames[skip.what] += skip.frames
     return {
         "versions": {name: _version(name) for name in PACKAGES},
-        "drive": drive.name,
+        "drive": name_of(drive),
         "name": log.name,
         "epoch_ns": log.epoch_ns,
         "local_frame": None if log.frame is None else asdict(log.frame),
@@ -281,17 +301,27 @@ def _seconds(stats: RunStats) -> dict[str, float]:
     return {name: round(value, 3) for name, value in stats.seconds.items()}
 
 
-def about_map(result: Result) -> dict[str, Any]:
-    names = result.raw.voxels.label_set.names
+def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
+    """What is in the maps of a run folder, for run.json."""
+    maps = {name: tiles.open_map(folder / place) for name, place in (("raw", MAP), ("refined", REFINED))}
+    names = maps["raw"].label_set.names
+    labelled = {name: np.zeros(len(names), np.int64) for name in maps}
+    voxels = points = removed = 0
+    for name, tiled in maps.items():
+        for piece in tiled:
+            labelled[name] += np.bincount(piece.labels[piece.shown], minlength=len(names))
+            if name == "raw":
+                voxels, points = voxels + len(piece), points + int(piece.voxels.hits.sum(dtype=np.int64))
+            else:
+                removed += int(piece.removed_hits.sum(dtype=np.int64))
     return {
-        "voxels": len(result.raw),
-        "points": int(result.raw.voxels.hits.sum()),
-        "points_removed": int(result.refined.removed_hits.sum()),
+        "voxels": voxels,
+        "points": points,
+        "points_removed": removed,
         "labelled": {
-            stage: {name: int(np.count_nonzero(m.labels[m.shown] == i)) for i, name in enumerate(names)}
-            for stage, m in (("raw", result.raw), ("refined", result.refined))
+            name: dict(zip(names, counts.tolist(), strict=True)) for name, counts in labelled.items()
         },
-        "refinement": _about_refinement(result.refinement),
+        "refinement": _about_refinement(report),
     }
 
 

@@ -3,24 +3,44 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import int64, njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.voxels.hash_unique import distinct
+from gnss_sem_map.scans.kernels import coordinates
+from gnss_sem_map.sensor_log import Points
+from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, slot_of
 from gnss_sem_map.voxels.kernels import pack_keys
+
+SLOTS_PER_S = 20.0
+"""Points of one cube are averaged if they were measured within the same 50 ms: where a sweep begins and ends, one cube
+holds points of two places, because the vehicle has moved on."""
+INDEX_BITS, SLOT_BITS = 20, 3
+"""Bits of a key: of each index of its cube, and of the number of its 50 ms."""
+MEANS = 5
+"""Columns of a cube: the means of x, y, z, intensity and stamp."""
 
 
 def one_per_cube(points: NDArray[np.float64], edge_m: float) -> NDArray[np.float64]:
-    """The mean (c, 3) m of the points (n, 3) m in each occupied cube of this edge length, in the order of the keys.
-
-    Compiled, and releases the GIL: scans are prepared while others are matched.
-    """
+    """The mean (c, 3) m of the points (n, 3) m in each occupied cube of this edge length, in the order of the keys."""
     keys = np.empty(len(points), np.int64)
     pack_keys(points, edge_m, keys)
     cubes, cube = distinct(keys)
     means = np.zeros((len(cubes), 3))
     _mean(points, cube, means)
     return means
+
+
+def thinned(points: Points, edge_m: float, nearest_m: float, farthest_m: float) -> Points:
+    """The means of the usable points of a sweep, stamps included, in each occupied cube of this edge length.
+
+    Deskewing a mean is as good as averaging deskewed points: within a cube and 50 ms, the pose is linear in time. Cubes
+    are in order of appearance. Compiled, and releases the GIL: scans are prepared while others are matched.
+    """
+    stamps = np.empty(0) if points.stamps is None else points.stamps
+    means = np.empty((len(points.xyz), MEANS))
+    means = means[: _thin(points.rows, stamps, edge_m, nearest_m, farthest_m, means)]
+    rows = means[:, :4].astype(np.float32)
+    return Points(rows[:, :3], rows[:, 3], None if points.stamps is None else means[:, 4].copy())
 
 
 @njit(cache=True, nogil=True)
@@ -33,3 +53,56 @@ def _mean(points, cube, means):
     for c in range(len(means)):
         for axis in range(3):
             means[c, axis] /= counts[c]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
+    """Average the usable points (4 n,) of each cube into `means`; returns the number of cubes.
+
+    Consecutive points of a scan are often in the same cube: a key that repeats the one before needs no look-up.
+    """
+    nearest, farthest, is_timed = nearest_m * nearest_m, farthest_m * farthest_m, len(stamps) > 0
+    bits, count, row, previous, stamp = LEAST_BITS, 0, 0, int64(-1), 0.0
+    table = np.full(1 << bits, -1, np.int32)
+    keys, counts = np.empty(len(means), np.int64), np.empty(len(means), np.int64)
+    for i in range(len(means)):
+        x, y, z = coordinates(rows, i)
+        square = x * x + y * y + z * z
+        if not (square >= nearest and square <= farthest):
+            continue
+        if is_timed:
+            stamp = stamps[i]
+        key = _key(x / edge_m, y / edge_m, z / edge_m, stamp * SLOTS_PER_S)
+        if key != previous:
+            previous = key
+            slot = slot_of(key, keys, table, bits)
+            if table[slot] < 0:
+                table[slot], keys[count], counts[count], means[count] = count, key, 0, 0.0
+                count += 1
+            row = table[slot]
+            if 2 * count > len(table):
+                bits += 1
+                table = np.full(1 << bits, -1, np.int32)
+                for number in range(count):
+                    table[slot_of(keys[number], keys, table, bits)] = number
+        mean = means[row]
+        counts[row] += 1
+        mean[0] += x
+        mean[1] += y
+        mean[2] += z
+        mean[3] += rows[4 * i + 3]
+        mean[4] += stamp
+    for row in range(count):
+        for column in range(MEANS):
+            means[row, column] /= counts[row]
+    return count
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _key(i, j, k, slot):
+    """Key of a cube, at one time of several; indices are taken modulo their number."""
+    cells = (1 << INDEX_BITS) - 1
+    key = int64(np.floor(slot)) & ((1 << SLOT_BITS) - 1)
+    for index in (i, j, k):
+        key = (key << INDEX_BITS) | (int64(np.floor(index)) & cells)
+    return key

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import int64, njit
 
-from gnss_sem_map.voxels.kernels import pack_key
+from gnss_sem_map.voxels.kernels import height_in_voxel, pack_key
 
 BLOCK = 1024
 """Points per block: their coordinates take 24 kB, which fits into the L1 cache."""
@@ -47,12 +47,13 @@ def _append(block, count, m, p_map):
 @njit(cache=True, nogil=True, error_model="numpy")
 def place(
     rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, voxel_size_m, P, nearest_depth_m, half_columns,
-    valid, keys, p_map, points, columns, lines, depths, nearest,
+    valid, keys, heights, p_map, points, columns, lines, depths, nearest,
 ):  # fmt: skip
     """Compute the voxel keys of the usable points of a scan and project them into the image; returns both numbers.
 
-    As `to_map`, but writes the voxel `keys` (m,), 0 for a point outside of the addressable volume, and the results of
-    `project` with `P`; without an image `nearest` is empty. Positions are written only if `p_map` is not empty.
+    As `to_map`, but writes the voxel `keys` (m,), 0 for a point outside of the addressable volume, the `heights` (m,)
+    of the points in their voxels, and the results of `project` with `P`; without an image `nearest` is empty. Positions
+    are written only if `p_map` is not empty.
     """
     count, inside, block, knots = 0, 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
     for start in range(0, len(valid), BLOCK):
@@ -62,6 +63,9 @@ def place(
         x, y, z, here = block[0, :m], block[1, :m], block[2, :m], keys[count : count + m]
         for i in range(m):
             here[i] = pack_key(x[i], y[i], z[i], voxel_size_m)
+        over = heights[count : count + m]
+        for i in range(m):
+            over[i] = height_in_voxel(z[i], voxel_size_m)
         if len(p_map) > 0:
             _append(block, count, m, p_map)
         if len(nearest) > 0:
@@ -88,7 +92,7 @@ def _move_block(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _coordinates(rows, i):
+def coordinates(rows, i):
     return np.float64(rows[COLUMNS * i]), np.float64(rows[COLUMNS * i + 1]), np.float64(rows[COLUMNS * i + 2])
 
 
@@ -97,7 +101,7 @@ def mark_usable(rows, nearest_m, farthest_m, valid):
     """Mark the points (n,) that are finite and in range."""
     nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
     for i in range(len(valid)):
-        x, y, z = _coordinates(rows, i)
+        x, y, z = coordinates(rows, i)
         square = x * x + y * y + z * z
         valid[i] = (square >= nearest) & (square <= farthest)
 
@@ -134,7 +138,7 @@ def _move(rows, knots, k, pose, x_map, y_map, z_map):
     yx, yy, yz, y0, dyx, dyy, dyz, dy0 = pose[1]
     zx, zy, zz, z0, dzx, dzy, dzz, dz0 = pose[2]
     for i in range(len(x_map)):
-        x, y, z = _coordinates(rows, i)
+        x, y, z = coordinates(rows, i)
         part = knots[i] - k
         x_map[i] = xx * x + xy * y + xz * z + x0 + part * (dxx * x + dxy * y + dxz * z + dx0)
         y_map[i] = yx * x + yy * y + yz * z + y0 + part * (dyx * x + dyy * y + dyz * z + dy0)

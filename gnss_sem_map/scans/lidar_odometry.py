@@ -7,7 +7,6 @@ graph uses relative poses, because absolute positions drift. There is no loop cl
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
-from gnss_sem_map.scans.downsampling import one_per_cube
+from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
@@ -39,7 +38,8 @@ SETTLED = 0.5
 COARSE_M, FINE_M = 0.01, 0.001
 # Neighbours for the plane of a point: with ten or twenty, planes tilt at edges, and the sweep rolls with them.
 NEIGHBOURS = 6
-THREADS = min(os.cpu_count() or 1, 4)
+# Sweeps overlap, so every other matched one is added to the local map: on simulated drives the poses drift no more.
+EVERY_NTH_IN_MAP = 2
 
 
 class ScanMatchingSettings(BaseModel):
@@ -49,7 +49,7 @@ class ScanMatchingSettings(BaseModel):
 
     nearest_m: float = Field(2.5, ge=0, description="Nearer returns, of the vehicle itself, are left out.")
     farthest_m: float = Field(80.0, gt=0, description="Farther returns are too sparse to match.")
-    downsampling_m: float = Field(0.5, gt=0, description="One point of a sweep per cube of this edge.")
+    downsampling_m: float = Field(0.55, gt=0, description="One point of a sweep per cube of this edge.")
     voxel_size_m: float = Field(0.5, gt=0, description="Edge of the local map's voxels.")
     map_scans: int = Field(
         100, gt=0, description="Voxels not observed for so many sweeps are removed from the local map."
@@ -69,7 +69,7 @@ class ScanMatchingSettings(BaseModel):
     translation_stddev_m: float = Field(0.005, gt=0, description="Least standard deviation of translation.")
     rotation_stddev_rad: float = Field(0.0005, gt=0, description="Least standard deviation of rotation.")
     degenerate_share: float = Field(
-        0.003,
+        0.0031,
         gt=0,
         lt=1,
         description="A direction constrained by less than this share of points is degenerate.",
@@ -128,7 +128,7 @@ def match_scans(
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips = []
-    # the next sweeps are read, deskewed and downsampled on a second core while one is matched
+    # the next sweeps are read, downsampled and deskewed on a second core while one is matched
     prepare = partial(
         _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
     )
@@ -174,20 +174,19 @@ def _prepare(
 
 
 def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings) -> _Sweep:
-    """Deskew a sweep, keep one point per cube, and fit a plane to each."""
+    """Keep one point per cube of a sweep, deskew these, and fit a plane to each."""
     raw, nearest_m, farthest_m = scan.read(), settings.nearest_m, settings.farthest_m
-    cloud, T_map_lidar = usable_points_at_stamp(
-        raw, scan.stamp, trajectory, T_imu_lidar, nearest_m, farthest_m
-    )
-    if not len(cloud):
+    some = thinned(raw, settings.downsampling_m, nearest_m, farthest_m)
+    if not len(some.xyz):
         raise DataError(f"no point between {nearest_m:g} and {farthest_m:g} m of {len(raw.xyz)}")
-    points = small_gicp.PointCloud(one_per_cube(cloud, settings.downsampling_m))
+    cloud, T_map_lidar = usable_points_at_stamp(some, scan.stamp, trajectory, T_imu_lidar)
+    points = small_gicp.PointCloud(cloud)
     if points.size() < settings.min_points:
         raise _NoMatch(
             f"found {points.size()} points after downsampling, expected at least {settings.min_points}"
         )
-    # small_gicp holds the GIL, so only its own threads help here, where points are independent
-    small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS, num_threads=THREADS)
+    # on one thread: a second one of small_gicp waits by spinning, and costs as much time as it saves
+    small_gicp.estimate_covariances(points, small_gicp.KdTree(points), NEIGHBOURS)
     return _Sweep(points, T_map_lidar)
 
 
@@ -200,17 +199,20 @@ class _Odometry:
         self._last: tuple[Scan, Array, Array] | None = None
 
     def match(self, scan: Scan, sweep: _Sweep) -> _Match:
-        """Register a sweep and add it to the local map; raises _NoMatch, and leaves the map unchanged then."""
+        """Register a sweep, and add every other one to the local map; raises _NoMatch, with the map unchanged."""
         if self._last is None or scan.stamp - self._last[0].stamp > self._settings.max_gap_s:
             self._map = small_gicp.GaussianVoxelMap(self._settings.voxel_size_m)
-            self._map.set_lru(horizon=self._settings.map_scans)
+            self._map.set_lru(horizon=max(1, self._settings.map_scans // EVERY_NTH_IN_MAP))
             self.local_maps += 1
+            self._matched = 0
             T, covariance, is_open = np.eye(4), np.zeros((6, 6)), False
         else:
             _, T_last, T_map_last = self._last
             guess = T_last @ np.linalg.inv(T_map_last) @ sweep.T_map_lidar
             T, covariance, is_open = self._register(sweep.points, guess)
-        self._map.insert(sweep.points, T)
+        if self._matched % EVERY_NTH_IN_MAP == 0:
+            self._map.insert(sweep.points, T)
+        self._matched += 1
         self._last = scan, T, sweep.T_map_lidar
         return _Match(scan, self.local_maps, T, covariance, is_open)
 

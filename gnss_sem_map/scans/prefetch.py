@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,6 +14,14 @@ Made = TypeVar("Made")
 
 PER_THREAD = 2
 """Items in progress per thread: enough to keep every thread busy, with little memory."""
+THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
+"""Environment variable: threads of one process. Several processes of one machine share its cores by it."""
+
+
+def threads() -> int:
+    """Threads that this process should use at a time: what the variable says, else one per core that it may use."""
+    said = os.environ.get(THREADS_VARIABLE, "")
+    return int(said) if said.isdecimal() and int(said) else len(os.sched_getaffinity(0))
 
 
 def prefetch(

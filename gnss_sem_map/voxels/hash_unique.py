@@ -31,7 +31,7 @@ def _numbered(keys):
         if i > 0 and keys[i] == keys[i - 1]:
             numbers[i] = numbers[i - 1]
             continue
-        slot = _slot_of(keys[i], found, table, bits)
+        slot = slot_of(keys[i], found, table, bits)
         if table[slot] < 0:
             table[slot], found[count] = count, keys[i]
             count += 1
@@ -40,12 +40,12 @@ def _numbered(keys):
             bits += 1
             table = np.full(1 << bits, -1, np.int32)
             for number in range(count):
-                table[_slot_of(found[number], found, table, bits)] = number
+                table[slot_of(found[number], found, table, bits)] = number
     return found[:count].copy(), numbers
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _slot_of(key, found, table, bits):
+def slot_of(key, found, table, bits):
     """Slot of a key in the table, or the empty slot for it."""
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h = (h ^ (h >> uint64(29))) * uint64(0xD6E8FEB86659FD93)

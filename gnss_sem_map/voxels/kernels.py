@@ -4,8 +4,8 @@ All are module-level functions (numba caches only those), release the GIL, and a
 do not depend on order, so any order of scans and any number of threads give the same bits. The tests hold a numpy
 version of each.
 
-A voxel is one row of a hash table: int64 key, c int32 log-likelihood sums, uint32 hits (32 bytes for five classes,
-half a cache line), found by open addressing with linear probing. Key 0 marks an empty row.
+A voxel is one row of a hash table: int64 key, c int32 log-likelihood sums, uint32 hits, and in the last word the int64
+sum of heights (40 bytes for five classes), found by open addressing with linear probing. Key 0 marks an empty row.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ AXIS_BITS = 21
 AXIS_OFFSET = 1 << 20
 """Voxel indices lie in [-2^20, 2^20): +-209 km at 0.2 m."""
 AXIS_MASK = (1 << AXIS_BITS) - 1
+HEIGHT_UNITS = 256
+"""Heights of points are measured from the bottom of their voxel in this part of its edge: 0.8 mm at 0.2 m."""
 UNITS_PER_NAT = 1024
 """Log-likelihoods are sums of round(1024 ln p): exact, with a resolution far below the errors of any network."""
 EVIDENCE_LIMIT = 1 << 30
@@ -29,6 +31,8 @@ EVIDENCE_LIMIT = 1 << 30
 HITS_LIMIT = (1 << 31) - 1
 """Most points of one voxel."""
 PREFETCH_AHEAD = 16
+STEPS_ON = 8
+"""So many rows on, walking is quicker than searching."""
 FIRST_SUM = 2
 """Column of the first sum in the int32 view of a row (the key fills the two before it)."""
 
@@ -58,13 +62,12 @@ def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
 def _home(key, size):
     """Row where the search for a key begins: a multiplicative hash, scaled to any table size.
 
-    It is always the first of two rows that share a cache line. Rows are in the order of their hash, so that rehashing
-    into a larger table writes from front to back.
+    Rows are in the order of their hash, so that rehashing into a larger table writes from front to back.
     """
     h = uint64(key) * uint64(0x9E3779B97F4A7C15)
     h ^= h >> uint64(32)
     h *= uint64(0xD6E8FEB86659FD93)
-    return int64((((h >> uint64(32)) * uint64(size >> 1)) >> uint64(32)) << uint64(1))
+    return int64(((h >> uint64(32)) * uint64(size)) >> uint64(32))
 
 
 @njit(cache=True, nogil=True)
@@ -88,6 +91,13 @@ def pack_key(x, y, z, voxel_size_m):
     return int64(i) << 2 * AXIS_BITS | int64(j) << AXIS_BITS | int64(k) if inside else int64(0)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def height_in_voxel(z, voxel_size_m):
+    """Height of a point over the bottom of its voxel, in 1 / HEIGHT_UNITS of the voxel's edge, rounded down."""
+    part = z / voxel_size_m
+    return np.uint8(min(HEIGHT_UNITS * (part - np.floor(part)), HEIGHT_UNITS - 1.0))
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def pack_keys(p_map, voxel_size_m, keys):
     """Key of every point (n, 3)."""
@@ -96,11 +106,12 @@ def pack_keys(p_map, voxel_size_m, keys):
 
 
 @njit(cache=True, nogil=True)
-def fuse(rows, ints, count, capacity, start, keys, pixels, observations, classes):
+def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations, classes):
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
     `pixels[i]` is the row of `observations` (p, c) of point i, or -1 without a pixel; `classes` are the columns, as a
-    tuple, so that their number is known at compile time. Returns the number of voxels and the first point that is not
+    tuple, so that their number is known at compile time; `heights` (n,) are those of the points in 1 / HEIGHT_UNITS of
+    a voxel's edge. Returns the number of voxels and the first point that is not
     added yet, or -1 - i for a point i whose voxel overflows.
     """
     hits = FIRST_SUM + len(classes)
@@ -119,6 +130,10 @@ def fuse(rows, ints, count, capacity, start, keys, pixels, observations, classes
         if ints[slot, hits] > HITS_LIMIT - (end - first):
             return count, -1 - first
         ints[slot, hits] += end - first
+        height = int64(0)
+        for i in range(first, end):
+            height += heights[i]
+        rows[slot, -1] += height
         while next_observed < len(observed) and observed[next_observed] < end:
             pixel, lowest = pixels[observed[next_observed]], int64(0)
             for c in range(len(classes)):
@@ -194,7 +209,9 @@ def rehash(old, new):
 
 
 @njit(cache=True, nogil=True)
-def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence, hits):
+def merge(
+    keys_a, evidence_a, hits_a, heights_a, keys_b, evidence_b, hits_b, heights_b, keys, evidence, hits, heights
+):  # fmt: skip
     """Add two maps, both sorted by key; returns the number of voxels of the result, or -1 on overflow."""
     a, b, to = 0, 0, 0
     while a < len(keys_a) or b < len(keys_b):
@@ -205,6 +222,7 @@ def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence
         if total > HITS_LIMIT:
             return -1
         hits[to] = total
+        heights[to] = (heights_a[a] if from_a else int64(0)) + (heights_b[b] if from_b else int64(0))
         for c in range(evidence.shape[1]):
             nats = (int64(evidence_a[a, c]) if from_a else int64(0)) + (
                 int64(evidence_b[b, c]) if from_b else int64(0)
@@ -218,11 +236,47 @@ def merge(keys_a, evidence_a, hits_a, keys_b, evidence_b, hits_b, keys, evidence
 
 @njit(cache=True, nogil=True)
 def find(keys, wanted, rows):
-    """Row of every wanted key in the sorted `keys`, or -1; consecutive points of a scan are often in the same voxel."""
-    previous_key, previous_row = int64(-1), int64(-1)
+    """Row of every wanted key in the sorted `keys`, or -1; quick where the next one is the same, or not far on."""
+    row = 0
     for i in range(len(wanted)):
-        if wanted[i] != previous_key:
-            previous_key = wanted[i]
-            row = np.searchsorted(keys, previous_key)
-            previous_row = row if row < len(keys) and keys[row] == previous_key else -1
-        rows[i] = previous_row
+        key = wanted[i]
+        if 0 < row + STEPS_ON < len(keys) and keys[row] <= key <= keys[row + STEPS_ON]:
+            while keys[row] < key:
+                row += 1
+        else:
+            row = np.searchsorted(keys, key)
+        rows[i] = row if row < len(keys) and keys[row] == key else -1
+
+
+@njit(cache=True, nogil=True)
+def find_largest(values, wanted, places):
+    """The place of the first of the largest values (v, c) of every wanted row."""
+    for i in range(len(values)):
+        if wanted[i]:
+            best, largest = 0, values[i, 0]
+            for c in range(1, values.shape[1]):
+                is_larger = values[i, c] > largest
+                best, largest = c if is_larger else best, max(values[i, c], largest)  # no branch
+            places[i] = best
+
+
+@njit(cache=True, nogil=True)
+def subtract_largest(values, result):
+    """Every row (v, c) without its largest value."""
+    for i in range(len(values)):
+        largest = values[i, 0]
+        for c in range(1, values.shape[1]):
+            largest = max(largest, values[i, c])
+        for c in range(values.shape[1]):
+            result[i, c] = values[i, c] - largest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def normalise(values):
+    """Divide every row (v, c) by its sum."""
+    for i in range(len(values)):
+        total = values[i, 0]
+        for c in range(1, values.shape[1]):
+            total += values[i, c]
+        for c in range(values.shape[1]):
+            values[i, c] /= total

@@ -105,4 +105,5 @@ class SemanticMap:
 
 def entropy_of(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
     """Entropy (v,) nat of class distributions (v, c): 0 for a certain class, ln c for a uniform distribution."""
-    return np.asarray(-(probabilities * np.log(np.maximum(probabilities, 1e-30))).sum(axis=1), np.float32)
+    terms = probabilities * np.log(np.maximum(probabilities, np.float32(1e-30)))
+    return np.asarray(-sum(terms.T), np.float32)

@@ -1,20 +1,24 @@
 """The map on disk: Parquet tiles of 512 x 512 columns of voxels, described by `map.json`.
 
 A tile `x_y.parquet` holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key
-(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, and the label, confidence and state of each
-voxel. A refined map counts all hits, and in `hits_removed` those of moving objects; its sums are of static objects
-only. Keys are sorted and delta-coded, so a voxel takes about 12 bytes. Any Parquet reader opens them. A map folder is
-written completely or not at all; `map.json` holds the checksum of every tile.
+(x 9 bits, y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, the sum of the points' heights over the bottom
+of the voxel where it is known, and the label, confidence and state of each voxel. A refined map counts all hits, and in
+`hits_removed` those of moving objects; log-likelihoods are of static objects only. Keys are sorted and delta-coded, so
+a voxel takes about 14 bytes. Any Parquet reader opens them. A map folder is written completely or not at all;
+`map.json` holds the checksum of every tile.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_OFFSET
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import VoxelMap, pack, unpack
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 TILE_BITS = 9
 Z_BITS = 14
@@ -36,14 +41,18 @@ Z_OFFSET = 1 << (Z_BITS - 1)
 FORMAT = 2
 HITS_REMOVED = "hits_removed"
 """Column of maps in which objects moved through static voxels."""
+HEIGHTS = "heights"
+"""Column of maps that know how high the surface in a voxel lies."""
 Tile = tuple[int, int]
+TILES_HELD = 16
+"""Tiles of a map in memory at a time: each is read again with its neighbours."""
 NAME = re.compile(r"(-?\d{1,6})_(-?\d{1,6})\.parquet", re.ASCII)
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
     """Write a map into a new folder; raises DataError for voxels more than 2^13 above or below the origin."""
     voxels = semantic_map.voxels
-    pieces = ((tile, _piece(semantic_map, indices)) for tile, indices in _indices_by_tile(voxels.keys))
+    pieces = ((tile, semantic_map[indices]) for tile, indices in _indices_by_tile(voxels.keys))
     write_tiles(pieces, folder, frame, voxels.voxel_size_m, voxels.label_set)
 
 
@@ -53,25 +62,33 @@ def write_tiles(
     frame: LocalFrame | None,
     voxel_size_m: float,
     label_set: LabelSet,
+    reuse: Reuse | None = None,
 ) -> None:
     """Write a map tile by tile, each tile once, into a new folder: one tile at a time is in memory.
 
-    Raises DataError when the folder exists, the disk is full, or a voxel is more than 2^13 above or below the origin.
+    Tiles of an earlier map that `reuse` says to stay are linked, and are not among the pieces. Raises DataError when
+    the folder exists, the disk is full, or a voxel is more than 2^13 above or below the origin.
     """
     if folder.exists():
         raise DataError(f"{folder}: exists; remove it or choose another folder")
     beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     files: dict[str, dict[str, Any]] = {}
-    points = 0
     try:
         beside.mkdir(parents=True)
-        for (x, y), piece in pieces:
-            content = _encode(piece)
-            (beside / f"{x}_{y}.parquet").write_bytes(content)
-            checksum = hashlib.sha256(content).hexdigest()
-            files[f"{x}_{y}.parquet"] = {"voxels": len(piece), "sha256": checksum}
-            points += int(piece.voxels.hits.sum())
-        about = _about(voxel_size_m, label_set, frame, files, points)
+        if reuse is not None and reuse.earlier is not None:
+            for tile, about in reuse.same.items():
+                link_or_copy(reuse.earlier / name_of(tile), beside / name_of(tile))
+                files[name_of(tile)] = about | reuse.about(tile)
+        for tile, piece in pieces:
+            content, name = _encode(piece), name_of(tile)
+            (beside / name).write_bytes(content)
+            files[name] = {
+                "voxels": len(piece),
+                "points": int(piece.voxels.hits.sum(dtype=np.int64)),
+                "sha256": hashlib.sha256(content).hexdigest(),
+                **({} if reuse is None else reuse.about(tile)),
+            }
+        about = _about(voxel_size_m, label_set, frame, dict(sorted(files.items())))
         (beside / "map.json").write_text(json.dumps(about, indent=1) + "\n", "utf-8")
         beside.rename(folder)
     except OSError as error:
@@ -82,6 +99,133 @@ def write_tiles(
         shutil.rmtree(beside, ignore_errors=True)
 
 
+def name_of(tile: Tile) -> str:
+    """File of a tile."""
+    return f"{tile[0]}_{tile[1]}.parquet"
+
+
+@dataclass(frozen=True, eq=False)
+class Reuse:
+    """From what the tiles of a map are made; those that an earlier map made from the same need not be made again."""
+
+    made_from: Mapping[Tile, str]
+    """Digest of all that decides a tile."""
+    earlier: Path | None = None
+    """Folder of the earlier map."""
+    said: dict[Tile, Any] = field(default_factory=dict)
+    """What `map.json` is to keep of a tile beside it: JSON, there before the tile is written."""
+
+    def about(self, tile: Tile) -> dict[str, Any]:
+        """What `map.json` says of a tile that is made now."""
+        known = {"made_from": self.made_from[tile]}
+        return known | ({"said": self.said[tile]} if tile in self.said else {})
+
+    @cached_property
+    def same(self) -> dict[Tile, dict[str, Any]]:
+        """What the earlier map says of the tiles that stay; none where there is no such map."""
+        known = files_of(self.earlier)
+        names = {tile: name_of(tile) for tile in self.made_from}
+        return {
+            tile: known[name]
+            for tile, name in names.items()
+            if name in known and known[name].get("made_from") == self.made_from[tile]
+        }
+
+
+def files_of(folder: Path | None) -> dict[str, dict[str, Any]]:
+    """What `map.json` of a folder says of its files; nothing where there is no map, or a damaged one."""
+    if folder is None:
+        return {}
+    try:
+        files: dict[str, dict[str, Any]] = _read_about(folder / "map.json")["files"]
+    except DataError:
+        return {}
+    return {name: about for name, about in files.items() if is_file(folder / name)}
+
+
+@dataclass(frozen=True, eq=False)
+class TiledMap:
+    """A map that is read tile by tile, in order of the tiles; `open_map` and `in_memory` make it."""
+
+    voxel_size_m: float
+    label_set: LabelSet
+    frame: LocalFrame | None
+    """None for a map in its drive's own poses."""
+    tiles: tuple[Tile, ...]
+    """Sorted."""
+    read_tile: Callable[[Tile], SemanticMap]
+    """The voxels of one of the tiles."""
+
+    def __iter__(self) -> Iterator[SemanticMap]:
+        return map(self.read_tile, self.tiles)
+
+    def around(self, tile: Tile, margin_m: float) -> SemanticMap:
+        """The voxels of a tile and those within a margin around it; empty where the map has none."""
+        margin, edge = math.ceil(margin_m / self.voxel_size_m), 1 << TILE_BITS
+        low = np.array(tile) * edge - margin
+        high, tiles = low + edge + 2 * margin, -(-margin // edge)
+        reach, parts = range(-tiles, tiles + 1), []
+        for near in ((tile[0] + i, tile[1] + j) for i in reach for j in reach):
+            if near in self._known:
+                part = self.read_tile(near)
+                xy = part.voxels.indices[:, :2]
+                parts.append(part[np.flatnonzero(((xy >= low) & (xy < high)).all(axis=1))])
+        return joined(parts, self.voxel_size_m, self.label_set)
+
+    @cached_property
+    def _known(self) -> frozenset[Tile]:
+        return frozenset(self.tiles)
+
+    def inside(self, box: tuple[ArrayLike, ArrayLike]) -> SemanticMap:
+        """The voxels with centres in a box (low, high), each (3,) m; only the tiles of the box are read."""
+        tiles = [tile for tile in self.tiles if _touches(tile, box, self.voxel_size_m)]
+        parts = [_inside(self.read_tile(tile), box) for tile in tiles]
+        return joined(parts, self.voxel_size_m, self.label_set)
+
+    def whole(self) -> SemanticMap:
+        """All voxels at once."""
+        return joined(list(self), self.voxel_size_m, self.label_set)
+
+
+def in_memory(semantic_map: SemanticMap, frame: LocalFrame | None = None) -> TiledMap:
+    """The tiles of a map that is in memory."""
+    voxels = semantic_map.voxels
+    indices = dict(_indices_by_tile(voxels.keys))
+    return TiledMap(
+        voxels.voxel_size_m, voxels.label_set, frame, tuple(indices), lambda tile: semantic_map[indices[tile]]
+    )
+
+
+def open_map(folder: Path, label_set: LabelSet | None = None, held: int = TILES_HELD) -> TiledMap:
+    """A map on disk, with so many tiles `held` in memory; without `label_set` the class set is the one that it names.
+
+    Raises DataError when `map.json` is damaged, a tile is missing, or the classes differ; reading raises it for a
+    damaged tile.
+    """
+    about = _read_about(folder / "map.json")
+    label_set = label_set or open_label_set(str(about.get("class_set")))
+    if tuple(about["classes"]) != label_set.names:
+        raise DataError(
+            f"{shown(folder)}: found classes {about['classes']}, expected {list(label_set.names)}"
+        )
+    files: dict[str, dict[str, Any]] = about["files"]
+    missing = [name for name in files if not is_file(folder / name)]
+    if missing:
+        raise DataError(
+            f"{shown(folder)}: found {len(files) - len(missing)} tiles, expected {len(files)}, such as {missing[0]};"
+            " make the map again"
+        )
+    names = {_tile_of(name): name for name in files}
+    voxel_size_m = float(about["voxel_size_m"])
+
+    @lru_cache(held)
+    def read_tile(tile: Tile) -> SemanticMap:
+        columns = _decode(folder / names[tile], files[names[tile]], label_set)
+        return _of_columns(columns, voxel_size_m, label_set)
+
+    return TiledMap(voxel_size_m, label_set, read_frame(folder), tuple(sorted(names)), read_tile)
+
+
 def read(
     folder: Path, label_set: LabelSet | None = None, box: tuple[ArrayLike, ArrayLike] | None = None
 ) -> SemanticMap:
@@ -90,22 +234,8 @@ def read(
     Without `label_set` the class set is the one that the map names. Raises DataError when the map is damaged,
     incomplete, or of another class set.
     """
-    about = _read_about(folder / "map.json")
-    label_set = label_set or open_label_set(str(about.get("class_set")))
-    if tuple(about["classes"]) != label_set.names:
-        raise DataError(
-            f"{shown(folder)}: found classes {about['classes']}, expected {list(label_set.names)}"
-        )
-    voxel_size_m = float(about["voxel_size_m"])
-    missing = [name for name in about["files"] if not is_file(folder / name)]
-    if missing:
-        raise DataError(
-            f"{shown(folder)}: found {len(about['files']) - len(missing)} tiles, expected {len(about['files'])}, such"
-            f" as {missing[0]}; make the map again"
-        )
-    names = [name for name in about["files"] if _touches(_tile_of(name), box, voxel_size_m)]
-    parts = [_decode(folder / name, about["files"][name], label_set) for name in sorted(names)]
-    return _join(parts, voxel_size_m, label_set, box)
+    opened = open_map(folder, label_set)
+    return opened.whole() if box is None else opened.inside(box)
 
 
 def by_tile(voxels: VoxelMap) -> Iterator[tuple[Tile, VoxelMap]]:
@@ -127,34 +257,49 @@ def _indices_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np
         yield xy, order[edges[i] : edges[i + 1]]
 
 
-def _piece(semantic_map: SemanticMap, indices: NDArray[np.int64]) -> SemanticMap:
-    return SemanticMap(
-        semantic_map.voxels[indices],
-        semantic_map.labels[indices],
-        semantic_map.confidence[indices],
-        semantic_map.states[indices],
-        hits_removed=None if semantic_map.hits_removed is None else semantic_map.hits_removed[indices],
-    )
-
-
 def _encode(piece: SemanticMap) -> bytes:
     """One tile as a Parquet file."""
+    columns = _columns_of(piece.voxels)
+    columns |= {"label": piece.labels.astype(np.int32), "state": piece.states.astype(np.int32)}
+    columns |= {"confidence": piece.confidence}
+    if piece.hits_removed is not None:
+        columns[HITS_REMOVED] = piece.hits_removed
+    return _as_parquet(columns)
+
+
+def encode_voxels(voxels: VoxelMap) -> bytes:
+    """The voxels of one tile, without decisions, as a Parquet file."""
+    return _as_parquet(_columns_of(voxels))
+
+
+def decode_voxels(content: bytes, tile: Tile, voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+    """What `encode_voxels` wrote; raises ValueError or pyarrow's ArrowException for anything else."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    voxels = piece.voxels
+    table = pq.ParquetFile(pa.BufferReader(content)).read()
+    columns = {name: _column(table, name) for name in table.column_names}
+    return _voxels_of(columns | {"key": _global(tile, columns["key"])}, voxel_size_m, label_set)
+
+
+def _columns_of(voxels: VoxelMap) -> dict[str, NDArray[Any]]:
     # Parquet's smallest integer is 32 bits; it packs small ones tightly
-    columns: dict[str, NDArray[Any]] = {"key": _local(voxels)}
+    columns: dict[str, NDArray[Any]] = {"key": local_keys(voxels)}
     columns |= {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
-    columns |= {"hits": voxels.hits, "label": piece.labels.astype(np.int32)}
-    columns |= {"state": piece.states.astype(np.int32), "confidence": piece.confidence}
-    if piece.hits_removed is not None:
-        columns[HITS_REMOVED] = piece.hits_removed
+    columns |= {"hits": voxels.hits}
+    return columns if voxels.heights is None else columns | {HEIGHTS: voxels.heights}
+
+
+def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     whole = [name for name in columns if name != "confidence"]
     sink = pa.BufferOutputStream()
     pq.write_table(
         pa.table(columns), sink, compression="zstd", use_dictionary=False, write_statistics=False,
-        column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED") | {"confidence": "BYTE_STREAM_SPLIT"},
+        column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED")
+        | {name: "BYTE_STREAM_SPLIT" for name in columns if name == "confidence"},
     )  # fmt: skip
     return bytes(sink.getvalue())
 
@@ -172,7 +317,7 @@ def _decode(path: Path, about: dict[str, Any], label_set: LabelSet) -> dict[str,
         file = pq.ParquetFile(pa.BufferReader(content))
         if file.metadata.num_rows != about["voxels"]:
             raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
-        names += [HITS_REMOVED] * (HITS_REMOVED in file.schema_arrow.names)
+        names += [name for name in (HITS_REMOVED, HEIGHTS) if name in file.schema_arrow.names]
         table = file.read(columns=names)
         columns = {name: _column(table, name) for name in names}
         if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
@@ -196,51 +341,74 @@ def _column(table: Any, name: str) -> NDArray[Any]:
     return np.from_dlpack(column)  # `to_numpy` imports pandas, which takes half a second
 
 
-def _join(
-    parts: list[dict[str, NDArray[Any]]],
-    voxel_size_m: float,
-    label_set: LabelSet,
-    box: tuple[ArrayLike, ArrayLike] | None,
-) -> SemanticMap:
-    if box is not None:
-        parts = [_inside(part, box, voxel_size_m) for part in parts]
-
-    def column(name: str, dtype: type[np.generic]) -> NDArray[Any]:
-        return np.concatenate([np.empty(0, dtype), *(part[name].astype(dtype, copy=False) for part in parts)])
-
-    keys = column("key", np.int64)
-    order = np.argsort(keys)
-    evidence = np.empty((len(keys), len(label_set.names)), np.int32)
-    for i, name in enumerate(label_set.names):
-        evidence[:, i] = column(f"log_{name}", np.int32)[order]
-    voxels = VoxelMap(voxel_size_m, label_set, keys[order], evidence, column("hits", np.uint32)[order])
-    are_told = bool(parts) and all(HITS_REMOVED in part for part in parts)
+def _of_columns(columns: dict[str, NDArray[Any]], voxel_size_m: float, label_set: LabelSet) -> SemanticMap:
+    order, removed = np.argsort(columns["key"]), columns.get(HITS_REMOVED)
     return SemanticMap(
-        voxels=voxels,
-        labels=column("label", np.int8)[order],
-        confidence=column("confidence", np.float32)[order],
-        states=column("state", np.uint8)[order],
-        hits_removed=column(HITS_REMOVED, np.uint32)[order] if are_told else None,
+        voxels=_voxels_of(columns, voxel_size_m, label_set),
+        labels=columns["label"].astype(np.int8)[order],
+        confidence=columns["confidence"].astype(np.float32)[order],
+        states=columns["state"].astype(np.uint8)[order],
+        hits_removed=None if removed is None else removed.astype(np.uint32)[order],
     )
 
 
-def _touches(tile: Tile, box: tuple[ArrayLike, ArrayLike] | None, voxel_size_m: float) -> bool:
-    if box is None:
-        return True
+def _voxels_of(columns: dict[str, NDArray[Any]], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+    order, heights = np.argsort(columns["key"]), columns.get(HEIGHTS)
+    evidence = np.stack([columns[f"log_{name}"][order] for name in label_set.names], axis=1, dtype=np.int32)
+    return VoxelMap(
+        voxel_size_m,
+        label_set,
+        columns["key"][order],
+        evidence,
+        columns["hits"].astype(np.uint32)[order],
+        None if heights is None else heights.astype(np.int64)[order],
+    )
+
+
+def joined_voxels(parts: Sequence[VoxelMap], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+    """The voxels of parts that share none."""
+    keys = np.concatenate([np.empty(0, np.int64), *(part.keys for part in parts)])
+    order = np.argsort(keys)
+    evidence = np.concatenate(
+        [np.empty((0, len(label_set.names)), np.int32), *(part.evidence for part in parts)]
+    )
+    hits = np.concatenate([np.empty(0, np.uint32), *(part.hits for part in parts)])
+    heights = [part.heights for part in parts if part.heights is not None]
+    of_all = np.concatenate([np.empty(0, np.int64), *heights])[order] if len(heights) == len(parts) else None
+    return VoxelMap(voxel_size_m, label_set, keys[order], evidence[order], hits[order], of_all)
+
+
+def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSet) -> SemanticMap:
+    """One map of parts that share no voxel; entropy is left out, as in a map that was read from disk."""
+    keys = np.concatenate([np.empty(0, np.int64), *(part.voxels.keys for part in parts)])
+    order = np.argsort(keys, kind="stable")  # quick: the keys of each part are sorted
+
+    def column(of: Callable[[SemanticMap], NDArray[Any]], empty: NDArray[Any]) -> NDArray[Any]:
+        return np.concatenate([empty, *map(of, parts)])[order]
+
+    are_told = any(part.hits_removed is not None for part in parts)
+    return SemanticMap(
+        voxels=joined_voxels([part.voxels for part in parts], voxel_size_m, label_set),
+        labels=column(lambda part: part.labels, np.empty(0, np.int8)),
+        confidence=column(lambda part: part.confidence, np.empty(0, np.float32)),
+        states=column(lambda part: part.states, np.empty(0, np.uint8)),
+        hits_removed=column(lambda part: part.removed_hits, np.empty(0, np.uint32)) if are_told else None,
+    )
+
+
+def _touches(tile: Tile, box: tuple[ArrayLike, ArrayLike], voxel_size_m: float) -> bool:
     low = np.array(tile) * voxel_size_m * (1 << TILE_BITS)
     high = low + voxel_size_m * (1 << TILE_BITS)
     return bool((low <= np.asarray(box[1])[:2]).all() and (high >= np.asarray(box[0])[:2]).all())
 
 
-def _inside(
-    part: dict[str, NDArray[Any]], box: tuple[ArrayLike, ArrayLike], voxel_size_m: float
-) -> dict[str, NDArray[Any]]:
-    centres = (unpack(part["key"]) + 0.5) * voxel_size_m
-    inside = ((centres >= np.asarray(box[0])) & (centres <= np.asarray(box[1]))).all(axis=1)
-    return {name: values[inside] for name, values in part.items()}
+def _inside(part: SemanticMap, box: tuple[ArrayLike, ArrayLike]) -> SemanticMap:
+    centres = part.voxels.centres
+    inside = (centres >= np.asarray(box[0])) & (centres <= np.asarray(box[1]))
+    return part[np.flatnonzero(inside.all(axis=1))]
 
 
-def _local(voxels: VoxelMap) -> NDArray[np.uint32]:
+def local_keys(voxels: VoxelMap) -> NDArray[np.uint32]:
     """Keys of voxels inside their tile."""
     x, y, height = voxels.indices.T.astype(np.int64)
     z = height + Z_OFFSET
@@ -277,7 +445,6 @@ def _about(
     label_set: LabelSet,
     frame: LocalFrame | None,
     files: dict[str, dict[str, Any]],
-    points: int,
 ) -> dict[str, Any]:
     origin = None
     if frame is not None:
@@ -293,8 +460,9 @@ def _about(
         "utm_epsg": None if frame is None else frame.utm_epsg,
         "tiles": len(files),
         "voxels": sum(file["voxels"] for file in files.values()),
-        "points": points,
+        "points": sum(file["points"] for file in files.values()),
         "evidence_unit": "2^-10 nat",
+        "height_unit": "1/256 of a voxel's edge",
         "key": "x 9 bits, y 9 bits (inside the tile), z 14 bits (+ 8192), in voxels",
         "files": files,
     }

@@ -8,7 +8,7 @@ immutable result.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.voxels import kernels
-from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, FIRST_SUM, UNITS_PER_NAT
+from gnss_sem_map.voxels.kernels import (
+    AXIS_BITS,
+    AXIS_MASK,
+    AXIS_OFFSET,
+    FIRST_SUM,
+    HEIGHT_UNITS,
+    UNITS_PER_NAT,
+)
 
 SMALLEST_TABLE = 1 << 18
 LARGE_TABLE = 1 << 20
-"""Rows (32 MB for five classes) up to which a table doubles. A larger table grows by a twelfth, to stay under 50 bytes
+"""Rows (40 MB for five classes) up to which a table doubles. A larger table grows by a twelfth, to stay under 63 bytes
 per voxel; growing is cheap, for it reads and writes memory in order."""
 HIGHEST_LOAD = 0.7
 ANSWER_SHARE = 0.5
@@ -41,11 +48,6 @@ class MappingSettings(BaseModel):
         description="Returns nearer to the LiDAR are left out: the vehicle itself (2.4 m on KITTI's).",
     )
     farthest_m: float = Field(120.0, gt=0, description="Returns farther from the LiDAR are left out.")
-    scans_per_chunk: int = Field(
-        100,
-        ge=1,
-        description="Scans per chunk: limits memory and the work lost by an interruption. The map is the same.",
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +62,13 @@ class VoxelMap:
     """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no image shows the voxel."""
     hits: NDArray[np.uint32]
     """(v,) LiDAR points in the voxel."""
+    heights: NDArray[np.int64] | None = None
+    """(v,) sums of the points' heights over the bottom of their voxel, in 1/256 of its edge; None where unknown."""
 
     def __post_init__(self) -> None:
         v, c = len(self.keys), len(self.label_set.names)
+        if self.heights is not None and self.heights.shape != (v,):
+            raise DataError(f"voxel map: found {v} keys and heights {self.heights.shape}; expected ({v},)")
         if self.evidence.shape != (v, c) or self.hits.shape != (v,):
             raise DataError(
                 f"voxel map: found {v} keys, evidence {self.evidence.shape}, hits {self.hits.shape};"
@@ -76,7 +82,7 @@ class VoxelMap:
 
     @classmethod
     def of_rows(cls, rows: NDArray[np.int64], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
-        """The map of table rows (v, words) in any order: key, sums and hits, in the layout of `voxels.kernels`."""
+        """The map of table rows (v, words) in any order, in the layout of `voxels.kernels`."""
         rows = rows[np.argsort(rows[:, 0])]
         ints, end = rows.view(np.int32), FIRST_SUM + len(label_set.names)
         return cls(
@@ -85,19 +91,21 @@ class VoxelMap:
             keys=rows[:, 0].copy(),
             evidence=ints[:, FIRST_SUM:end].copy(),
             hits=ints[:, end].astype(np.uint32),
+            heights=rows[:, -1].copy(),
         )
 
     def to_rows(self) -> NDArray[np.int64]:
-        """The voxels as table rows (v, words): 32 bytes each for five classes."""
+        """The voxels as table rows (v, words): 40 bytes each for five classes."""
         rows = np.zeros((len(self), self.words(self.label_set)), np.int64)
         ints, end = rows.view(np.int32), FIRST_SUM + len(self.label_set.names)
         rows[:, 0], ints[:, FIRST_SUM:end], ints[:, end] = self.keys, self.evidence, self.hits
+        rows[:, -1] = self._known_heights
         return rows
 
     @staticmethod
     def words(label_set: LabelSet) -> int:
-        """Width of a row: the key, and the sums and hits two to a word."""
-        return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2
+        """Width of a row: the key, the sums and hits two to a word, and the heights."""
+        return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2 + 1
 
     def __add__(self, other: VoxelMap) -> VoxelMap:
         """Sum of the evidence of both maps per voxel; raises DataError for another voxel size or class set."""
@@ -108,13 +116,23 @@ class VoxelMap:
             )
         room, c = len(self) + len(other), self.evidence.shape[1]
         keys, evidence = np.empty(room, np.int64), np.empty((room, c), np.int32)
-        hits = np.empty(room, np.uint32)
+        hits, heights = np.empty(room, np.uint32), np.empty(room, np.int64)
         count = kernels.merge(
-            self.keys, self.evidence, self.hits, other.keys, other.evidence, other.hits, keys, evidence, hits
-        )
+            self.keys, self.evidence, self.hits, self._known_heights,
+            other.keys, other.evidence, other.hits, other._known_heights,
+            keys, evidence, hits, heights,
+        )  # fmt: skip
         if count < 0:
             raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
-        return replace(self, keys=keys[:count], evidence=evidence[:count], hits=hits[:count])
+        are_known = self.heights is not None and other.heights is not None
+        return VoxelMap(
+            self.voxel_size_m,
+            self.label_set,
+            keys[:count],
+            evidence[:count],
+            hits[:count],
+            heights[:count] if are_known else None,
+        )
 
     def __sub__(self, part: VoxelMap) -> VoxelMap:
         """This map without a part that was added to it; raises DataError if `part` is not a part of it."""
@@ -122,17 +140,27 @@ class VoxelMap:
         is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
         if not is_part or (rows < 0).any() or (self.hits[rows] < part.hits).any():
             raise DataError("cannot subtract a map that is not part of the other; were both of one run?")
-        evidence, hits = self.evidence.copy(), self.hits.copy()
+        evidence, hits, heights = self.evidence.copy(), self.hits.copy(), self._known_heights.copy()
         evidence[rows] -= part.evidence
         hits[rows] -= part.hits
+        heights[rows] -= part._known_heights
         if evidence[hits == 0].any():
             raise DataError("cannot subtract a map with other evidence; were both of one run?")
-        return replace(self, evidence=evidence, hits=hits)[hits > 0]
+        are_known = self.heights is not None and part.heights is not None
+        return replace(self, evidence=evidence, hits=hits, heights=heights if are_known else None)[hits > 0]
 
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
         """The voxels of a boolean mask (v,), or those at increasing indices."""
-        return replace(
-            self, keys=self.keys[selection], evidence=self.evidence[selection], hits=self.hits[selection]
+        places = np.arange(len(self))[
+            selection
+        ]  # with them, `take` of rows is four times as fast as indexing
+        return VoxelMap(
+            self.voxel_size_m,
+            self.label_set,
+            self.keys[places],
+            self.evidence.take(places, axis=0),
+            self.hits[places],
+            None if self.heights is None else self.heights[places],
         )
 
     @cached_property
@@ -145,15 +173,28 @@ class VoxelMap:
         """(v, 3) m, in the map frame."""
         return (self.indices + np.float64(0.5)) * self.voxel_size_m
 
+    @property
+    def surface_heights(self) -> NDArray[np.float64]:
+        """(v,) m: mean height of the points in the voxel, in the map frame; NaN where it is unknown."""
+        if self.heights is None:
+            return np.full(len(self), np.nan)
+        # heights were rounded down, by half a unit on average
+        inside = (self.heights / np.maximum(self.hits, 1) + 0.5) / HEIGHT_UNITS
+        return np.where(self.hits > 0, (self.indices[:, 2] + inside) * self.voxel_size_m, np.nan)
+
+    @property
+    def _known_heights(self) -> NDArray[np.int64]:
+        return np.zeros(len(self), np.int64) if self.heights is None else self.heights
+
     @cached_property
     def observed(self) -> NDArray[np.bool_]:
         """(v,) whether any image shows the voxel."""
-        return np.asarray(self.evidence.any(axis=1))
+        return np.asarray(reduce(np.bitwise_or, self.evidence.T, np.zeros(len(self), np.int32)) != 0)
 
     @cached_property
     def labels(self) -> NDArray[np.int8]:
         """(v,) most probable class (eq. 7), -1 where no image shows the voxel."""
-        return np.where(self.observed, self.evidence.argmax(axis=1), UNLABELLED).astype(np.int8)
+        return best_classes(self.evidence, self.observed)
 
     @cached_property
     def probabilities(self) -> NDArray[np.float32]:
@@ -189,8 +230,8 @@ class VoxelTable:
         self._floor_percent = round(100 * probability_floor)
         self._words = VoxelMap.words(label_set)
         self._columns = tuple(range(len(label_set.names)))
-        self._count = 0
-        self._rows = _empty_table(SMALLEST_TABLE, self._words)
+        self._count, self._knows_heights = 0, True
+        self._rows = np.zeros((SMALLEST_TABLE, self._words), np.int64)
         share = 1.0 if answers is None else 1.0 - ANSWER_SHARE
         self._log_table = log_table(len(label_set.names), self._floor_percent, share)
         self._log_percent = self._log_table[100 * np.arange(256)]
@@ -198,7 +239,7 @@ class VoxelTable:
 
     def _grow(self) -> None:
         size = len(self._rows)
-        larger = _empty_table(2 * size if size < LARGE_TABLE else (size + size // 12) // 2 * 2, self._words)
+        larger = np.zeros((2 * size if size < LARGE_TABLE else size + size // 12, self._words), np.int64)
         kernels.rehash(self._rows, larger)
         self._rows = larger
 
@@ -210,15 +251,19 @@ class VoxelTable:
         keys: NDArray[np.int64],
         pixels: NDArray[np.int32] | None = None,
         classes: NDArray[np.uint8] | None = None,
+        heights: NDArray[np.uint8] | None = None,
     ) -> None:
         """Add the points of one scan: their voxel keys (n,) and their class probabilities (eq. 6).
 
         `pixels` (n,) is the row in `classes` of each point, -1 for none; `classes` (p, c + 1) are uint8 probabilities,
-        `other` last. Raises DataError when a voxel's evidence would overflow.
+        `other` last. `heights` (n,) are those of the points in their voxels, see `heights_in_voxels`; if they are not
+        given, the map has no heights. Raises DataError when a voxel's evidence would overflow.
         """
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
             classes = np.zeros((0, len(self._columns) + 1), np.uint8)
+        if heights is None:
+            self._knows_heights, heights = False, np.zeros(len(keys), np.uint8)
         observations = np.empty((len(classes), len(self._columns)), np.int32)
         kernels.log_likelihoods(
             classes, self._log_table, self._log_percent, self._floor_percent, self._answers, self._abstain,
@@ -228,7 +273,7 @@ class VoxelTable:
         while done < len(keys):
             self._count, done = kernels.fuse(
                 self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
-                keys, pixels, observations, self._columns,
+                keys, pixels, heights, observations, self._columns,
             )  # fmt: skip
             if done < 0:
                 voxel = unpack(keys[[-1 - done]])[0]
@@ -246,15 +291,8 @@ class VoxelTable:
 
     def to_map(self) -> VoxelMap:
         """The voxels so far, sorted by key."""
-        return VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
-
-
-def _empty_table(size: int, words: int) -> NDArray[np.int64]:
-    """Zeros, aligned to cache lines, so that no row of 32 bytes lies across two."""
-    line = 8  # words of 8 bytes
-    memory = np.zeros(size * words + line, np.int64)
-    start = -(memory.ctypes.data // 8) % line
-    return memory[start : start + size * words].reshape(size, words)
+        voxels = VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
+        return voxels if self._knows_heights else replace(voxels, heights=None)
 
 
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:
@@ -268,6 +306,12 @@ def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64
             f" {AXIS_OFFSET * voxel_size_m / 1000:.0f} km from its origin; check the poses"
         )
     return keys
+
+
+def heights_in_voxels(z: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.uint8]:
+    """Heights z (n,) m of points over the bottom of their voxels, in 1/256 of its edge."""
+    part = z / voxel_size_m
+    return np.minimum(HEIGHT_UNITS * (part - np.floor(part)), HEIGHT_UNITS - 1).astype(np.uint8)
 
 
 def unpack(keys: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -300,7 +344,17 @@ def answer_table(answers: NDArray[np.float64] | None, number_of_classes: int) ->
     return np.asarray(np.rint(ANSWER_SHARE * UNITS_PER_NAT * answers), np.int32)
 
 
+def best_classes(scores: NDArray[np.number], known: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """The class (v,) of the highest score (v, c), the first of equal ones; UNLABELLED where nothing is known."""
+    labels = np.full(len(scores), UNLABELLED, np.int8)
+    kernels.find_largest(scores, known, labels)
+    return labels
+
+
 def softmax(log_scores: NDArray[np.float32]) -> NDArray[np.float32]:
     """Probabilities from log scores, row by row."""
-    shifted = np.exp(log_scores - log_scores.max(axis=1, keepdims=True))
-    return np.asarray(shifted / shifted.sum(axis=1, keepdims=True), np.float32)
+    probabilities = np.empty(log_scores.shape, np.float32)
+    kernels.subtract_largest(log_scores, probabilities)
+    np.exp(probabilities, out=probabilities)
+    kernels.normalise(probabilities)
+    return probabilities

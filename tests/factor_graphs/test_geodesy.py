@@ -65,3 +65,19 @@ def test_the_utm_zone_is_that_of_the_longitude(lat, lon, epsg):
 def test_a_place_off_the_earth_is_refused(place):
     with pytest.raises(MeasurementError, match="LocalFrame at"):
         LocalFrame(*place)
+
+
+@given(LATITUDES, LONGITUDES, st.floats(-100.0, 4000.0), st.integers(0, 2**31))
+def test_the_transform_between_two_frames_is_rigid_and_that_of_the_earth(lat, lon, alt, seed):
+    """Within 10 km of both origins, against the way over the ellipsoid."""
+    rng = np.random.default_rng(seed)
+    here = LocalFrame(lat, lon, alt)
+    [lat], [lon], [alt] = here.to_geodetic(rng.uniform(-7000, 7000, (1, 3)) * [1, 1, 0.02])
+    there = LocalFrame(float(lat), float(lon), float(alt))
+    T_here_there = here.pose_of(there)
+    points = rng.uniform(-7000, 7000, (5, 3)) * [1, 1, 0.02]
+    over_earth = here.to_map(*there.to_geodetic(points))
+    np.testing.assert_allclose(points @ T_here_there[:3, :3].T + T_here_there[:3, 3], over_earth, atol=1e-6)
+    np.testing.assert_allclose(T_here_there[:3, :3] @ T_here_there[:3, :3].T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(there.pose_of(here) @ T_here_there, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(here.pose_of(here), np.eye(4), atol=1e-6)

@@ -129,3 +129,26 @@ def test_wrong_shapes_and_stamps_are_refused():
         Trajectory(t.stamps[::-1], t.T_map_imu)
     with pytest.raises(MeasurementError, match="not empty"):
         Trajectory(np.empty(0), np.empty((0, 4, 4)))
+
+
+@given(st.integers(0, 10**6), st.booleans(), st.booleans())
+def test_in_another_frame_it_is_the_same_motion(seed, velocities, covariances):
+    there = np.eye(4)
+    there[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    there[:3, 3] = np.random.default_rng(seed).uniform(-1e4, 1e4, 3)
+    t = some(seed, velocities=velocities, covariances=covariances)
+    moved = t.moved(there)
+    back = moved.moved(np.linalg.inv(there))
+    np.testing.assert_array_equal(moved.stamps, t.stamps)
+    np.testing.assert_allclose(back.T_map_imu, t.T_map_imu, atol=1e-10)
+    between = np.linspace(t.start, t.end, 31)
+    np.testing.assert_allclose(moved.at(between), there @ t.at(between), atol=1e-8)
+    if velocities:
+        np.testing.assert_allclose(moved.velocities, t.velocities @ there[:3, :3].T)
+        np.testing.assert_allclose(back.velocities, t.velocities, atol=1e-12)
+    else:
+        assert moved.velocities is None
+    if covariances:  # of the tangent in imu axes, which do not turn with the map
+        np.testing.assert_array_equal(moved.covariances, t.covariances)
+    else:
+        assert moved.covariances is None

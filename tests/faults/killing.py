@@ -93,10 +93,10 @@ def write_run_like(out: Path, files: Mapping[str, str]) -> None:
 
 def map_street(drive: Path, probabilities: Path, work: Path) -> None:
     """Map a drive in chunks of four scans into a work folder, going on with what is there."""
-    from gnss_sem_map.mapping.fusion import map_chunks
+    from gnss_sem_map.mapping.fusion import map_scans
     from gnss_sem_map.run_stats import RunStats
 
-    map_chunks(street_drive(drive, probabilities), work, RunStats(), resume=True)
+    map_scans(street_drive(drive, probabilities), work, RunStats(), resume=True)
 
 
 def street_drive(drive: Path, probabilities: Path) -> Any:
@@ -111,7 +111,7 @@ def street_drive(drive: Path, probabilities: Path) -> Any:
     spec, size = f"labels:{probabilities}", log.calibration.image_size
     segmenter = open_segmenter(spec, open_label_set(), expected_size=size)
     assert log.reference is not None
-    settings = Settings.model_validate({"mapping": {"scans_per_chunk": 4}})
+    settings = Settings.model_validate({"dynamics": {"window_scans": 2}})
     return Drive(log, log.reference, segmenter, settings)
 
 

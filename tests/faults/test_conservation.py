@@ -276,26 +276,29 @@ def unaccounted(place: Place, harm: Harm, out: Path, with_labels: bool) -> list[
     """Map a drive, and say which laws do not hold."""
     log = open_drive(place.drive)
     segmenter = place.segmenter(log) if with_labels else None
-    result = pipeline.run(log, segmenter, SETTINGS, force=True)  # a drive so short and damaged may look wrong
     out.mkdir()
-    tiles.write(result.raw, out / "map", log.frame)
-    tiles.write(result.refined, out / "refined", log.frame)
-    write_point_labels(out, log, result, SETTINGS)
-    about = about_run(place.drive, log, result.stats)
+    work = out.with_name(f"{out.name}.work")
+    mapped = pipeline.run(
+        log, segmenter, SETTINGS, out, work, force=True
+    )  # so short and damaged, it may look wrong
+    kerbs = pipeline.refine(out, SETTINGS, mapped.stats).kerbs
+    write_point_labels(out, mapped.log, mapped.trajectory, kerbs, SETTINGS)
+    refined, static = tiles.read(out / "refined"), tiles.read(out / "refined").standing
+    about = about_run(place.drive, log, mapped.stats)
     counts, frames = about["counts"], about["skips"]["frames"]
     labelled = {path.stem: path.stat().st_size // 4 for path in (out / "labels").iterdir()}
     removed = sum(int(np.fromfile(path, "<u4").sum()) for path in (out / "removed").iterdir())
     parts = [counts[f"points {part}"] for part in ("left out", "unlabelled", "labelled")]
-    unlabelled = {s.where for s in result.stats.skips if s.what == "labels"}
+    unlabelled = {s.where for s in mapped.stats.skips if s.what == "labels"}
     used = {scan.number for scan in log.scans if scan.name in labelled}
     laws = {
         "points read": (counts["points"], sum(parts)),
         "points of label files": (sum(labelled.values()), counts["points"]),
         "hits of the map": (hits(out / "map"), counts["points"] - counts["points left out"]),
         "hits of the refined map": (hits(out / "refined"), hits(out / "map")),
-        "points removed": (removed, int(result.refined.removed_hits.sum())),
+        "points removed": (removed, int(refined.removed_hits.sum())),
         "hits removed": (
-            int((result.raw.voxels - tiles.read(out / "refined").standing).hits.sum()),
+            int((tiles.read(out / "map").voxels - static).hits.sum()),
             removed,
         ),
         "scans used": (counts["scans"], len(labelled)),

@@ -200,10 +200,10 @@ def test_what_lies_beside_is_somebody_elses(small_drive: Street, name: str, tria
 
 
 def test_notes_in_the_folder_of_an_interrupted_run_stay(small_drive: Street, trial, tmp_path: Path) -> None:
-    for name in ("notes.txt", "chunks/notes.txt", "0/notes.txt", "answers/notes.txt", "motion/notes.txt"):
+    for name in ("notes.txt", "chunks/notes.txt", "0/notes.txt", "0/static/notes.txt", "answers/notes.txt"):
         work = tmp_path / name.replace("/", "_") / ".out.work"
         write_result(work, {})
-        (work / name).parent.mkdir(exist_ok=True)
+        (work / name).parent.mkdir(parents=True, exist_ok=True)
         (work / name).write_text("important")
         before = content(work.parent)
         outcome = trajectory(small_drive, work.parent / "out", tmp_path / "trial")
@@ -450,7 +450,7 @@ def test_a_full_tmpdir_costs_nothing(small_drive: Street, trial, tmp_path: Path)
         labels = f"labels:{small_drive.labels}"
         words = ("run", small_drive.drive, "--segmenter", labels, "-o", tmp_path / "out")
         for workers in ("1", "2"):
-            chunks = ("--workers", workers, "--set", "mapping.scans_per_chunk=4")
+            chunks = ("--workers", workers, "--set", "dynamics.window_scans=2")
             outcome = gnss_sem_map(*words, *chunks, folder=tmp_path / "trial")
             trial("full TMPDIR", [*outcome.faults, *["refused"] * (outcome.code != 0)], outcome)
     finally:

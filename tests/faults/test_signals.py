@@ -16,7 +16,7 @@ def stop(
 ) -> tuple[list[str], object]:
     """Stop a run after some seconds; what is wrong with its end, and how it ended."""
     labels = f"labels:{street.labels}"
-    words = ("run", street.drive, "--segmenter", labels, "--set", "mapping.scans_per_chunk=1", *more)
+    words = ("run", street.drive, "--segmenter", labels, "--set", "dynamics.window_scans=1", *more)
     outcome = gnss_sem_map(*words, "-o", folder / "out", folder=folder / "trial", interrupt=(after_s, number))
     faults = list(outcome.faults)
     if outcome.code == 0:
@@ -24,7 +24,7 @@ def stop(
     faults += [f"code {outcome.code}"] * (outcome.code != 128 + number)
     faults += ["a result"] * (folder / "out").exists()
     beside = {path.name for path in folder.iterdir()} - {"trial"}
-    kept = any(name.endswith(("record.json", "motion/about.json")) for name in content(folder / ".out.work"))
+    kept = any(name.endswith("record.json") for name in content(folder / ".out.work"))
     faults += [f"left {beside}"] * (beside != ({".out.work"} if kept else set()))
     faults += ["does not name --resume"] * (kept and "--resume" not in outcome.err)
     faults += ["names --resume, but nothing is kept"] * (not kept and "--resume" in outcome.err)

@@ -14,7 +14,7 @@ from faults.killing import street_drive
 from street import Street
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping.fusion import build_maps
+from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 
@@ -25,10 +25,10 @@ sys.path.insert(0, sys.argv[1])
 from faults.killing import street_drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping.fusion import build_maps
+from gnss_sem_map.mapping.fusion import map_scans
 
 try:
-    build_maps(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), RunStats(), work=Path(sys.argv[4]), workers=2)
+    map_scans(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), Path(sys.argv[4]), RunStats(), workers=2)
 except DataError as error:
     print(error)
 """
@@ -109,5 +109,5 @@ def test_a_worker_that_is_killed_is_an_error_and_what_is_mapped_stays(
     drive = street_drive(small_drive.drive, small_drive.labels)
     deadly = Drive(drive.log, drive.trajectory, Deadly(), drive.settings)
     with pytest.raises(DataError, match="a worker process died"):
-        build_maps(deadly, RunStats(), work=tmp_path / "work", workers=2)
+        map_scans(deadly, tmp_path / "work", RunStats(), workers=2)
     trial("workers")

@@ -12,9 +12,11 @@ from street import Street
 
 from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.mapping.evidence import write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.runs.merged_run import merge_run_folders
+from gnss_sem_map.voxels import tiles
 
 MADE_ANEW = {"run.json", "report.html", ".gnss-sem-map.json"}
 """They say how long it took."""
@@ -159,8 +161,9 @@ def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, sm
         merged.relabel(f"labels:{small_drive.labels}")
 
 
-def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run) -> None:
-    log, maps = finished.drive(), [finished.map(refined=False), finished.map()]
-    moving = {log.scans[0].number: np.array([10**6])}
+def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run, tmp_path: Path) -> None:
+    log, maps = finished.drive(), [tiles.open_map(finished.folder / name) for name in ("map", "refined")]
+    moved = tmp_path / "0.npz"
+    write_moving_points({log.scans[0].number: np.array([10**6])}, moved)
     with pytest.raises(DataError, match="make the run again"):
-        list(label_points(log, finished.trajectory, maps, finished.settings, moving))
+        list(label_points(log, finished.trajectory, maps, finished.settings, [moved]))

@@ -38,7 +38,9 @@ def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None
 
 
 KILLED = 137
-LIVE = ("--set", "mapping.scans_per_chunk=4", "--write-labels")
+LIVE = ("--set", "dynamics.window_scans=2", "--write-labels")
+SMALL = ("--set", "dynamics.window_scans=1")
+"""Two scans in a chunk."""
 COMMAND = """
 import os, sys
 
@@ -117,7 +119,7 @@ def results_of(out: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "out"
-    done = run(*run_of(small_drive, out))
+    done = run(*run_of(small_drive, out, *SMALL))
     assert done.returncode == 0, done.stderr
     assert [path.name for path in out.parent.iterdir()] == ["out"], "nothing stays beside the results"
     return out
@@ -134,12 +136,12 @@ def assert_same_maps(a: Path, b: Path) -> None:
 def test_a_killed_run_is_resumed_by_two_processes_and_keeps_what_it_had(
     small_drive: Street, whole: Path, tmp_path: Path
 ) -> None:
-    out, chunks = tmp_path / "out", ("--set", "mapping.scans_per_chunk=2")
-    died = watched(tmp_path / "first", run_of(small_drive, out, *chunks), die_before_chunk=1)
+    out = tmp_path / "out"
+    died = watched(tmp_path / "first", run_of(small_drive, out, *SMALL), die_before_chunk=1)
     assert died.code == KILLED
     assert died.chunks == [0]
     assert not out.exists()
-    resumed = watched(tmp_path / "second", run_of(small_drive, out, *chunks, "--resume", "--workers", "2"))
+    resumed = watched(tmp_path / "second", run_of(small_drive, out, *SMALL, "--resume", "--workers", "2"))
     assert resumed.code == 0, resumed.err
     assert sorted(resumed.chunks) == [1, 2, 3, 4, 5], "the chunk that was there is mapped again"
     assert len(set(resumed.processes)) == 2
@@ -158,7 +160,7 @@ def live(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("moment", "before"),
-    [({"die_at_question": 7}, 6), ({"die_before_chunk": 1}, 12)],
+    [({"die_at_question": 7}, 6), ({"die_before_chunk": 2}, 12)],
     ids=["asking", "mapping"],
 )
 def test_a_resumed_run_asks_the_network_for_no_image_twice(

@@ -1,15 +1,17 @@
 "use strict";
-// Unpacks the voxels of this page, draws them when something has changed, and listens to mouse and touch.
+// Draws the voxels when something has changed, loads finer ones, and listens to mouse and touch.
 // Lengths are in voxels, x east, y north, z up.
 
 const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
-const ORIGINS = ["not seen by a camera", "seen", "inferred", "refined", "removed"];
-const ORIGIN_COLOURS = [[150, 150, 150], [90, 150, 255], [255, 170, 60], [90, 210, 120], [240, 60, 60]];
+const ORIGINS = ["not seen by a camera", "seen", "inferred", "refined", "removed", "road and sidewalk meet"];
+const ORIGIN_COLOURS = [[150, 150, 150], [90, 150, 255], [255, 170, 60], [90, 210, 120], [240, 60, 60],
+                        [200, 120, 240]];
 
 const meta = JSON.parse(document.getElementById("meta").textContent);
 const canvas = document.querySelector("canvas");
 const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
 const hash = new URLSearchParams(location.hash.slice(1));  // #colour=height&hide=building,vegetation
+const MOST_BEADS = 500000;
 const classes = meta.classes.length;  // then one entry for unlabelled and one for the track
 const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], count: meta.unlabelled },
                 { name: "track", colour: [255, 214, 10], count: meta.track.length }];
@@ -18,40 +20,97 @@ const visible = layers.map(layer => !hidden.has(layer.name));
 let showRemoved = hash.has("removed"), mode = 0, frameAsked = false;
 const camera = { azimuth: -0.6, elevation: 0.65, distance: meta.view.distance, target: [...meta.view.target] };
 
-async function inflate() {
-  const packed = Uint8Array.from(atob(document.getElementById("voxels").textContent), c => c.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
+// Puts voxels onto the graphics card: for each the cell, as numbers of a kind, then class, confidence and origin.
+function upload(node, data, kind, stride) {
+  node.vao = gl.createVertexArray();
+  node.buffer = gl.createBuffer();
+  gl.bindVertexArray(node.vao);
+  gl.bindBuffer(gl.ARRAY_BUFFER, node.buffer);
+  gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+  gl.vertexAttribPointer(0, 3, kind, false, stride, 0);
+  gl.vertexAttribIPointer(1, 4, gl.UNSIGNED_BYTE, stride, stride - 4);
+  [0, 1].forEach(place => gl.enableVertexAttribArray(place));
+  node.state = "ready";
 }
 
-// Planes of n bytes: for x, y and z the low, middle and high byte of the zigzag difference to the voxel before, then
-// class, confidence and origin. The beads of the track follow the voxels.
-function decode(bytes, beads) {
-  const n = meta.count, total = n + beads.length;
-  const cells = new Float32Array(3 * total), about = new Uint8Array(4 * total);
-  let at = 0;
-  const plane = () => bytes.subarray(at, at += n);
-  for (let axis = 0; axis < 3; axis++) {
-    const low = plane(), middle = plane(), high = plane();
-    for (let i = 0, value = 0; i < n; i++) {
-      const zigzag = low[i] | middle[i] << 8 | high[i] << 16;
-      cells[3 * i + axis] = (value += (zigzag >>> 1) ^ -(zigzag & 1)) + 0.5;
-    }
-  }
-  for (let k = 0; k < 3; k++) plane().forEach((value, i) => { about[4 * i + k] = value; });
-  beads.forEach((bead, i) => { cells.set(bead, 3 * (n + i)); about[4 * (n + i)] = classes + 1; });
-  return { cells, about, total };
+function drop(node) {
+  gl.deleteVertexArray(node.vao);
+  gl.deleteBuffer(node.buffer);
+  node.state = "absent";
 }
 
-function beadsOf(track) {
-  const beads = [];
+async function unpack(node, text) {
+  const bytes = await inflated(text);
+  if (bytes.length !== 9 * node.count) throw new Error(`found ${bytes.length} bytes, expected ${9 * node.count}`);
+  upload(node, decoded(bytes, node.count), gl.SHORT, STRIDE);
+}
+
+// The track as beads; a long one has fewer.
+function trackNode(track) {
+  const steps = (a, b) => Math.hypot(...a.map((v, k) => b[k] - v));
+  const length = track.slice(1).reduce((sum, point, i) => sum + steps(track[i], point), 0);
+  const apart = Math.max(TRACK_HALF, length / MOST_BEADS), beads = [];
   for (let i = 1; i < track.length; i++) {
-    const [a, b] = [track[i - 1], track[i]];
-    const steps = Math.ceil(Math.hypot(b[0] - a[0], b[1] - a[1], b[2] - a[2]) / TRACK_HALF);
-    for (let s = 0; s < steps; s++) beads.push(a.map((v, k) => v + (b[k] - v) * s / steps));
+    const [a, b] = [track[i - 1], track[i]], n = Math.ceil(steps(a, b) / apart);
+    for (let s = 0; s < n; s++) beads.push(a.map((v, k) => v - track[0][k] - 0.5 + (b[k] - v) * s / n));
   }
-  return beads;
+  const node = { name: "track", corner: track[0], scale: 1, count: beads.length };
+  const data = new ArrayBuffer(16 * beads.length), about = new Uint8Array(data);
+  new Float32Array(data).set(beads.flatMap(bead => [...bead, 0]));
+  beads.forEach((_, i) => { about.set([classes + 1, 0, 0, 0], 16 * i + 12); });
+  upload(node, data, gl.FLOAT, 16);
+  return node;
 }
+
+// Loads what a view needs; for that it drops what no view has needed for longest.
+function load(wanted) {
+  const now = ++scene.views, nodes = [...scene.nodes.values()].filter(node => node.level < meta.level);
+  wanted.forEach(node => { node.lastUsed = now; });
+  let held = nodes.reduce((sum, node) => sum + (node.state === "ready" || isComing(node) ? node.count : 0), 0);
+  const spare = nodes.filter(node => node.state === "ready" && node.lastUsed < now)
+    .sort((a, b) => b.lastUsed - a.lastUsed);
+  const next = wanted.filter(({ state }) => state === "absent").slice(0, AT_ONCE - waiting());
+  held += next.reduce((sum, { count }) => sum + count, 0);
+  while (spare.length && held > most) {
+    held -= spare.at(-1).count;
+    drop(spare.pop());
+  }
+  next.forEach(ask);
+}
+
+function ask(node) {
+  const script = document.createElement("script");
+  node.state = "loading";
+  const ended = what => () => {
+    script.remove();
+    if (node.state === "loading") fail(node, new Error(`${meta.folder}/${node.name}.js ${what}`));
+  };
+  script.onload = ended("is damaged");
+  script.onerror = ended("is not beside this page");
+  script.setAttribute("src", `${encodeURIComponent(meta.folder)}/${node.name}.js`);
+  document.head.append(script);
+}
+
+// Called by the files in the folder.
+function voxels(name, text) {
+  const node = scene.nodes.get(name);
+  if (node?.state !== "loading") return;
+  node.state = "unpacking";
+  unpack(node, text)
+    .catch(() => fail(node, new Error(`${meta.folder}/${name}.js is damaged, or of another page`)))
+    .finally(redraw);
+}
+
+function fail(node, error) {
+  node.state = "failed";
+  document.getElementById("about").textContent =
+    `${meta.about}, joined to ${inMetres(2 ** meta.level)} m where finer ones are missing: ${error.message}`;
+  redraw();
+}
+
+const isComing = ({ state }) => state === "loading" || state === "unpacking";
+const waiting = () => [...scene.nodes.values()].filter(isComing).length;
+const inMetres = length => +(length * meta.voxel_m).toFixed(3);
 
 function program(vertex, fragment) {
   const linked = gl.createProgram();
@@ -99,8 +158,12 @@ let scene = null;
 function draw() {
   frameAsked = false;
   fitTarget();
-  const { right, up, forward } = axesOf(camera), { voxels, lighting } = scene;
-  const eye = camera.target.map((t, k) => t - camera.distance * forward[k]);
+  const { right, up, forward } = axesOf(camera), { cubes, lighting } = scene;
+  const eye = camera.target.map((t, k) => t - camera.distance * forward[k]), focal = 0.9 * canvas.height;
+  const tangents = [canvas.width, canvas.height].map(pixels => pixels / (2 * focal));
+  const view = { eye, axes: [right, up, forward], focal, tangents }, wanted = needed(scene.roots, view);
+  scene.drawn = ranges(scene.roots, wanted, view);
+  if (scene.track) scene.drawn.push([scene.track, 0, scene.track.count]);
   const palette = layers.flatMap((layer, i) => [...layer.colour.map(c => c / 255), visible[i] ? 1 : 0]);
   const flat = colours => colours.flat().map(c => c / 255);
   gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -109,20 +172,31 @@ function draw() {
   gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
   gl.clearBufferuiv(gl.COLOR, 1, [0, 0, 0, 0]);
   gl.clearBufferfv(gl.DEPTH, 0, [1]);
-  gl.useProgram(voxels.linked);
-  gl.uniformMatrix3fv(voxels.at("axes"), false, [...right, ...up, ...forward]);
-  gl.uniform3fv(voxels.at("eye"), eye);
-  gl.uniform2f(voxels.at("size"), canvas.width, canvas.height);
-  gl.uniform1f(voxels.at("focal"), 0.9 * canvas.height);
-  gl.uniform1f(voxels.at("largest"), gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1]);
-  gl.uniform4fv(voxels.at("palette"), palette);
-  gl.uniform3fv(voxels.at("ramp"), flat(RAMP));
-  gl.uniform3fv(voxels.at("origins"), flat(ORIGIN_COLOURS));
-  gl.uniform2fv(voxels.at("heights"), meta.heights);
-  gl.uniform1i(voxels.at("mode"), mode);
-  gl.uniform1i(voxels.at("track"), classes + 1);
-  gl.uniform1i(voxels.at("removed"), showRemoved ? 1 : 0);
-  gl.drawArrays(gl.POINTS, 0, scene.total);
+  gl.useProgram(cubes.linked);
+  gl.uniformMatrix3fv(cubes.at("axes"), false, [...right, ...up, ...forward]);
+  gl.uniform1f(cubes.at("eyeHeight"), eye[2]);
+  gl.uniform2f(cubes.at("size"), canvas.width, canvas.height);
+  gl.uniform1f(cubes.at("focal"), focal);
+  gl.uniform1f(cubes.at("largest"), gl.getParameter(gl.ALIASED_POINT_SIZE_RANGE)[1]);
+  gl.uniform4fv(cubes.at("palette"), palette);
+  gl.uniform3fv(cubes.at("ramp"), flat(RAMP));
+  gl.uniform3fv(cubes.at("origins"), flat(ORIGIN_COLOURS));
+  gl.uniform2fv(cubes.at("heights"), meta.heights);
+  gl.uniform1i(cubes.at("mode"), mode);
+  gl.uniform1i(cubes.at("track"), classes + 1);
+  gl.uniform1i(cubes.at("removed"), showRemoved ? 1 : 0);
+  let before = 0;
+  for (const [i, [node, first, count]] of scene.drawn.entries()) {
+    if (node !== scene.drawn[i - 1]?.[0]) {
+      node.before = before;
+      before += node.count;
+      gl.bindVertexArray(node.vao);
+      gl.uniform3fv(cubes.at("corner"), node.corner.map((v, k) => v - eye[k]));
+      gl.uniform1f(cubes.at("scale"), node.scale);
+      gl.uniform1ui(cubes.at("before"), node.before);
+    }
+    gl.drawArrays(gl.POINTS, first, count);
+  }
   gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   gl.disable(gl.DEPTH_TEST);
   gl.useProgram(lighting.linked);
@@ -132,26 +206,50 @@ function draw() {
     gl.uniform1i(lighting.at(name), unit);
   });
   gl.uniform2f(lighting.at("size"), canvas.width, canvas.height);
+  gl.bindVertexArray(scene.nothing);
   gl.drawArrays(gl.TRIANGLES, 0, 3);
+  load(wanted);
 }
 
 function redraw() {
   if (!frameAsked) frameAsked = requestAnimationFrame(draw);
 }
 
-function pick(event) {
+// What the picture shows at a pointer: the node, the place, class, confidence and origin; null for the sky.
+function voxelAt(event) {
   const scale = canvas.width / innerWidth, found = new Uint32Array(4);
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
   gl.readBuffer(gl.COLOR_ATTACHMENT1);
   gl.readPixels(event.clientX * scale, canvas.height - 1 - event.clientY * scale, 1, 1,
                 gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
-  const i = found[0] - 1, [label, confidence, origin] = scene.about.subarray(4 * i, 4 * i + 3);
-  const metres = [...scene.cells.subarray(3 * i, 3 * i + 3)]
-    .map((v, k) => ((v + meta.origin[k]) * meta.voxel_m).toFixed(1));
-  const place = `east ${metres[0]} m, north ${metres[1]} m, up ${metres[2]} m`;
+  if (!found[0]) return null;
+  const number = found[0] - 1;
+  const [node] = scene.drawn.find(([{ before, count }]) => number >= before && number < before + count);
+  const stride = node === scene.track ? 16 : STRIDE, bytes = new Uint8Array(stride);
+  gl.bindBuffer(gl.ARRAY_BUFFER, node.buffer);
+  gl.getBufferSubData(gl.ARRAY_BUFFER, stride * (number - node.before), bytes);
+  const cell = node === scene.track ? new Float32Array(bytes.buffer, 0, 3) : new Int16Array(bytes.buffer, 0, 3);
+  return [node, [...cell].map((v, k) => (v + 0.5) * node.scale + node.corner[k]), ...bytes.subarray(stride - 4)];
+}
+
+function pick(event) {
+  const found = voxelAt(event);
+  document.getElementById("picked").textContent = found ? described(...found) : "";
+}
+
+function described(node, place, label, confidence, origin) {
+  const metres = place.map((v, k) => ((v + meta.origin[k]) * meta.voxel_m).toFixed(1));
   const what = label > classes ? "track" : `${layers[label]?.name}, ${ORIGINS[origin]}`
-    + (label < classes ? `, probability ${(confidence / 255).toFixed(2)}` : "");
-  document.getElementById("picked").textContent = i < 0 ? "" : `${what}\n${place}`;
+    + (label < classes ? `, probability ${(confidence / 255).toFixed(2)}` : "")
+    + (node.level ? `, the most hit voxel in ${inMetres(node.scale)} m` : "");
+  return `${what}\neast ${metres[0]} m, north ${metres[1]} m, up ${metres[2]} m`;
+}
+
+function goTo(event) {
+  const found = voxelAt(event);
+  if (!found) return;
+  camera.target = found[1];
+  zoom(1 / 3);
 }
 
 function zoom(factor) {
@@ -195,6 +293,7 @@ function listen() {
     pointers.delete(event.pointerId);
     if (name === "pointerup" && moved < 4) pick(event);
   });
+  canvas.addEventListener("dblclick", goTo);
   canvas.addEventListener("wheel", event => {
     event.preventDefault();
     zoom(Math.exp(0.001 * event.deltaY));
@@ -224,15 +323,11 @@ function colourBy(name) {
 
 async function main() {
   if (!gl) throw new Error("this browser has no WebGL 2");
-  const { cells, about, total } = decode(await inflate(), beadsOf(meta.track));
-  [[cells, 3, false], [about, 4, true]].forEach(([data, width, whole], place) => {
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(place);
-    if (whole) gl.vertexAttribIPointer(place, width, gl.UNSIGNED_BYTE, 0, 0);
-    else gl.vertexAttribPointer(place, width, gl.FLOAT, false, 0, 0);
-  });
-  scene = { cells, about, total, voxels: program(VERTEX, FRAGMENT), lighting: program(SCREEN, LIGHTING) };
+  const nodes = nodesOf(meta.nodes), roots = [...nodes.values()].filter(({ level }) => level === meta.level);
+  const texts = document.getElementById("voxels").textContent.split("\n");
+  await Promise.all(roots.map((root, i) => unpack(root, texts[i])));
+  scene = { nodes, roots, drawn: [], views: 0, track: meta.track.length ? trackNode(meta.track) : null,
+            nothing: gl.createVertexArray(), cubes: program(VERTEX, FRAGMENT), lighting: program(SCREEN, LIGHTING) };
   layers.forEach((layer, i) => {
     if (layer.count) addLayer(layer.name, layer.colour, layer.count, visible[i], on => { visible[i] = on; });
   });

@@ -2,18 +2,19 @@
 // The two passes of the viewer. First, every voxel is a point sprite in which the fragment shader meets the exact
 // cube; then hollows are darkened (eye-dome lighting). Lengths are in voxels, x east, y north, z up.
 
-const NEAR = 1, FAR = 200000, TRACK_HALF = 0.3, REMOVED = 4;
+const NEAR = 1, FAR = 2e7, TRACK_HALF = 0.3, REMOVED = 4;
 
 const VERTEX = `#version 300 es
 precision highp float;
 layout(location = 0) in vec3 cell;
 layout(location = 1) in uvec4 about;  // class, confidence, origin
 uniform mat3 axes;                    // columns: right, up, forward
-uniform vec3 eye;
+uniform vec3 corner;                  // of the node, from the eye
 uniform vec2 size;
-uniform float focal, largest;
+uniform float focal, largest, scale, eyeHeight;
+uniform uint before;                  // voxels of the nodes that were drawn before
 uniform vec4 palette[66];             // rgb and whether it is shown
-uniform vec3 ramp[5], origins[5];
+uniform vec3 ramp[5], origins[6];
 uniform vec2 heights;
 uniform int mode, track;
 uniform bool removed;
@@ -28,18 +29,18 @@ vec3 ramped(float t) {
 void main() {
   vec4 entry = palette[about.x];
   bool bead = int(about.x) == track, unlabelled = int(about.x) == track - 1;
-  centre = cell - eye;
+  centre = (cell + 0.5) * scale + corner;
   vec3 seen = centre * axes;
-  extent = bead ? ${TRACK_HALF} : 0.5;
+  extent = bead ? ${TRACK_HALF} : 0.5 * scale;
   ahead = seen.z;
-  number = uint(gl_VertexID) + 1u;
+  number = before + uint(gl_VertexID) + 1u;
   bool gone = about.z == ${REMOVED}u;
   if (ahead < ${NEAR}.0 || entry.a < 0.5 || (gone && !removed)) {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     return;
   }
   colour = bead || mode == 0 || (unlabelled && mode == 2) ? entry.rgb
-         : mode == 1 ? ramped((cell.z - heights.x) / (heights.y - heights.x))
+         : mode == 1 ? ramped((centre.z + eyeHeight - heights.x) / (heights.y - heights.x))
          : mode == 2 ? ramped(float(about.y) / 255.0) : origins[about.z];
   if (gone) colour = origins[${REMOVED}];
   pixels = 3.4641 * extent * focal / ahead;

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.dynamics.motion_state import MotionSettings
-from gnss_sem_map.dynamics.moving_objects import MovingObjectDetector, observe
+from gnss_sem_map.dynamics.moving_objects import decide, moved_points, observe
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement.vehicles import Motion
 
@@ -46,7 +46,7 @@ def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=N
     Returns, for each car, the share of its points in all scans that was removed, that share of everything else, and
     the objects. A camera sees `view_deg` ahead and calls exactly the cars vehicles.
     """
-    detector = MovingObjectDetector(settings, matched)
+    settings, scans_seen = settings or MotionSettings(), []
     facades = [(np.array([-40.0, y - 0.2, 0.0]), np.array([110.0, y + 0.2, 9.0])) for y in (-11.0, 12.0)]
     kept = []
     for scan in range(scans):
@@ -60,17 +60,31 @@ def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=N
         T_map_lidar = np.eye(4)
         T_map_lidar[:3, 3] = origin + drift_m * np.array([np.sin(t), np.cos(1.7 * t), 0.3 * np.sin(2 * t)])
         p_map = p_map + T_map_lidar[:3, 3] - origin
-        detector.add(
-            observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings or MotionSettings())
-        )
+        scans_seen.append(observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings))
         kept.append(what)
-    moving = detector.decide()
+    moving, objects = decided(scans_seen, settings, matched)
     removed, total = np.zeros(len(cars) + 3), np.zeros(len(cars) + 3)
     for scan, what in enumerate(kept):
         total += np.bincount(what, minlength=len(total))
-        removed += np.bincount(what[moving.points[scan]], minlength=len(total))
+        removed += np.bincount(what[moving[scan]], minlength=len(total))
     share = removed / np.maximum(total, 1)
-    return share[3:], removed[:3].sum() / total[:3].sum(), moving.objects
+    return share[3:], removed[:3].sum() / total[:3].sum(), objects
+
+
+def decided(seen, settings=None, matched=False, first=0, last=None, window=1000):
+    """The points of the scans from `first` to `last` that moved, by scan number, and the objects.
+
+    `seen` are the results of `observe` of a whole drive; up to `window` scans before and after are evidence.
+    """
+    settings, last = settings or MotionSettings(), len(seen) if last is None else last
+    before = [observation.seen for observation, _ in seen[max(first - window, 0) : first]]
+    observations = [observation for observation, _ in seen[first : last + window]]
+    decision = decide(observations, last - first, before, settings, matched)
+    moving = {
+        observation.number: near.indices[moved_points(near, moved, settings.grow_m)]
+        for (observation, near), moved in zip(seen[first:last], decision.moved, strict=True)
+    }
+    return moving, decision.objects
 
 
 def parked(x, y):
@@ -187,17 +201,16 @@ def test_without_vehicles_nothing_is_removed():
 
 
 def test_only_points_of_the_mover_are_removed_and_no_scans_are_no_error():
-    detector = MovingObjectDetector(MotionSettings())
-    assert detector.decide().points == {}
-    mover = {}
+    assert decided([]) == ({}, ())
+    mover, scans_seen = {}, []
     for scan in range(20):
         p_map, what = cast(np.array([0.0, 0.0, LIDAR_HEIGHT_M]), [car_at(30 - scan, 3.0)])
-        detector.add(seen(scan, p_map, pose(0.0), what == 1))
+        scans_seen.append(seen(scan, p_map, pose(0.0), what == 1))
         mover[scan] = what == 1
-    moving = detector.decide()
-    for scan, points in moving.points.items():
+    moving, _ = decided(scans_seen)
+    for scan, points in moving.items():
         assert mover[scan][points].all()
-    assert sum(map(len, moving.points.values())) > 0
+    assert sum(map(len, moving.values())) > 0
 
 
 def seen(scan, p_map, T_map_lidar, is_object):
@@ -213,40 +226,40 @@ def pose(x):
 
 
 def test_every_point_called_vehicle_is_no_error():
-    detector = MovingObjectDetector()
+    scans_seen = []
     for scan in range(5):
         p_map, what = cast(np.array([scan, 0.0, LIDAR_HEIGHT_M]), [car_at(12, 3.0)])
-        detector.add(seen(scan, p_map, pose(scan), np.ones(len(what), bool)))
-    removed = sum(map(len, detector.decide().points.values()))
-    assert removed == 0
+        scans_seen.append(seen(scan, p_map, pose(scan), np.ones(len(what), bool)))
+    moving, _ = decided(scans_seen)
+    assert sum(map(len, moving.values())) == 0
 
 
 @pytest.mark.slow
-def test_settling_in_windows_says_what_deciding_at_the_end_says_and_forgets_the_points():
-    whole, windows = {}, {}
-    for found, window in ((whole, 1000), (windows, 10)):
-        detector = MovingObjectDetector(MotionSettings(window_scans=window))
-        for scan in range(50):
-            t = scan * SCAN_S
-            cars = [car_at(12, 4.5), car_at(20, 4.5), car_at(60 - 12 * t, -3.5)]
-            p_map, what = cast(np.array([6 * t, 0.0, LIDAR_HEIGHT_M]), cars)
-            detector.add(seen(scan, p_map, pose(6 * t), what > 0))
-            found.update(detector.settle().points)
-        assert (len(found) > 0) == (window == 10)
-        found.update(detector.decide().points)
-        assert list(found) == list(range(50))
-        assert detector.decide().points == {}
+def test_deciding_chunk_by_chunk_says_nearly_what_deciding_a_whole_drive_says():
+    """Chunks of twenty scans, with ten before and ten after each as evidence; every object is said once."""
+    scans_seen = []
+    for scan in range(50):
+        t = scan * SCAN_S
+        cars = [car_at(12, 4.5), car_at(20, 4.5), car_at(60 - 12 * t, -3.5)]
+        p_map, what = cast(np.array([6 * t, 0.0, LIDAR_HEIGHT_M]), cars)
+        scans_seen.append(seen(scan, p_map, pose(6 * t), what > 0))
+    whole, _ = decided(scans_seen)
+    parts = {}
+    for first, last in ((0, 20), (20, 40), (40, 50)):
+        moving, objects = decided(scans_seen, first=first, last=last, window=10)
+        assert all(first * SCAN_S <= one.first_stamp < last * SCAN_S for one in objects)
+        parts.update(moving)
+    assert list(parts) == list(whole) == list(range(50))
     count = sum(map(len, whole.values()))
-    differ = sum(len(np.setxor1d(whole[scan], windows[scan])) for scan in whole)
+    differ = sum(len(np.setxor1d(whole[scan], parts[scan])) for scan in whole)
     assert count > 1000
     assert differ < 0.02 * count
 
 
 def test_empty_scans_and_scans_out_of_order():
-    detector = MovingObjectDetector()
-    nothing = np.empty((0, 3))
-    empty = seen(7, nothing, np.eye(4), np.zeros(0, bool))
-    detector.add(empty)
+    empty = seen(7, np.empty((0, 3)), np.eye(4), np.zeros(0, bool))
     with pytest.raises(DataError, match="time order"):
-        detector.add(empty)
-    assert detector.decide().points[7].shape == (0,)
+        decided([empty, empty])
+    moving, objects = decided([empty])
+    assert moving[7].shape == (0,)
+    assert objects == ()

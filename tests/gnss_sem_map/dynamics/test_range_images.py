@@ -27,7 +27,9 @@ def seen_at(image, places, T_lidar_map=None):
     places = np.asarray(places, float).reshape(-1, 3)
     hits, misses = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
     poses = np.eye(4)[None] if T_lidar_map is None else T_lidar_map[None]
-    range_images.count_hits_and_misses(places, image[None], poses, 3.0, 40.0, 0.3, 0.01, hits, misses)
+    range_images.count_hits_and_misses(
+        places, image[None], poses, np.arange(1), 3.0, 40.0, 0.3, 0.01, hits, misses
+    )
     return hits - misses
 
 

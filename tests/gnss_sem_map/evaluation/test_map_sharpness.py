@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import map_sharpness
-from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings
+from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, SweepSample
 from gnss_sem_map.scans.lidar_odometry import match_scans
-from gnss_sem_map.sensor_log import Points, SensorLog
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
 FEW = SharpnessSettings(min_scans=3, every_nth_point=1)
@@ -123,6 +124,25 @@ def test_unreadable_sweeps_are_left_out() -> None:
     assert found.scans == 15
     (nothing,) = map_sharpness.of_drive(replace(log, scans=()), [truth])
     assert (nothing.scans, nothing.voxels, nothing.as_dict()["voxels_per_m"]) == (0, 0, None)
+
+
+def test_sweeps_that_were_read_for_odometry_are_not_read_again() -> None:
+    log, truth = street()
+    reads: Counter[int] = Counter()
+
+    def read(scan: Scan) -> Points:
+        reads[scan.number] += 1
+        return scan.read()
+
+    counted = replace(log, scans=tuple(replace(scan, read=partial(read, scan)) for scan in log.scans))
+    some = SharpnessSettings(max_scans=8, stretch_scans=4, min_scans=2)
+    (expected,) = map_sharpness.of_drive(log, [truth], some)
+    sample = SweepSample(counted, some)
+    match_scans(sample.listening(), truth)
+    (found,) = map_sharpness.of_sample(sample, [truth])
+    assert set(reads.values()) == {1}
+    assert len(reads) == len(log.scans)
+    assert found.as_dict() == expected.as_dict()
 
 
 def test_a_long_drive_is_sampled_in_stretches() -> None:

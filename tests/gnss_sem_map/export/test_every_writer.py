@@ -12,22 +12,24 @@ import pytest
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.pictures import write_perspective, write_topview
-from gnss_sem_map.export.point_cloud import visible, write_laz, write_ply
+from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import in_memory
 
 Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
 
 WRITERS: dict[str, Writer] = {
-    "map.ply": lambda m, t, f, path: write_ply(m, path, f),
-    "map.laz": lambda m, t, f, path: write_laz(m, f, path),
-    "topview.png": lambda m, t, f, path: write_topview(m, path, t),
-    "perspective.png": lambda m, t, f, path: write_perspective(m, path, t),
-    "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(m, f, path),
-    "viewer.html": lambda m, t, f, path: write_viewer(m, t, path),
+    "map.ply": lambda m, t, f, path: write_ply(Exported(in_memory(m, f), t), path),
+    "map.laz": lambda m, t, f, path: write_laz(Exported(in_memory(m, f), t), path),
+    "topview.png": lambda m, t, f, path: write_topview(Exported(in_memory(m, f), t), path),
+    "perspective.png": lambda m, t, f, path: write_perspective(Exported(in_memory(m, f), t), path),
+    "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(Exported(in_memory(m, f), t), path),
+    "viewer.html": lambda m, t, f, path: write_viewer(in_memory(m), t, path),
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
     "trajectory_kitti.txt": lambda m, t, f, path: write_kitti(t, path),
     "trajectory.geojson": lambda m, t, f, path: write_geojson(t, f, path),
@@ -57,7 +59,7 @@ def test_a_map_that_shows_no_label_is_written_all_the_same(
     for semantic_map in (unlabelled, replace(street, states=np.full_like(street.states, State.REMOVED))):
         WRITERS[name](semantic_map, track, karlsruhe, tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
-    np.testing.assert_array_equal(visible(unlabelled), ~removed)
+    np.testing.assert_array_equal(Exported(in_memory(unlabelled)).extent.visible(unlabelled), ~removed)
 
 
 @contextmanager
@@ -78,5 +80,14 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing(
     with room_for(1000), pytest.raises(DataError) as caught:
         WRITERS[name](street, track, karlsruhe, tmp_path / name)
     assert f"{name}: no room to write it" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_nothing_of_a_page_with_levels_of_detail(
+    street: SemanticMap, tmp_path: Path
+) -> None:
+    with room_for(1000), pytest.raises(DataError, match="viewer: no room to write it") as caught:
+        write_viewer(in_memory(street), None, tmp_path / "viewer.html", most_voxels=10_000)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())

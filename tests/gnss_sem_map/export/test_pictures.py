@@ -8,10 +8,12 @@ import pytest
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.render import Camera
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tiles import in_memory
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 NAMES = open_label_set().names
@@ -47,7 +49,7 @@ def read(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("length_m", [40, 2000])
 def test_north_is_up_and_the_hedge_lies_north_of_the_road(length_m: float, tmp_path: Path) -> None:
-    write_topview(strip(length_m), tmp_path / "topview.png", title="a street")
+    write_topview(Exported(in_memory(strip(length_m)), title="a street"), tmp_path / "topview.png")
     image = read(tmp_path / "topview.png")
     height, width = image.shape[:2]
     assert 900 <= width <= 2000
@@ -61,8 +63,8 @@ def test_north_is_up_and_the_hedge_lies_north_of_the_road(length_m: float, tmp_p
 def test_the_legend_names_the_classes_that_are_there_and_no_others(
     street: SemanticMap, tmp_path: Path
 ) -> None:
-    write_topview(street, tmp_path / "street.png")
-    write_topview(strip(40), tmp_path / "strip.png")
+    write_topview(Exported(in_memory(street)), tmp_path / "street.png")
+    write_topview(Exported(in_memory(strip(40))), tmp_path / "strip.png")
     swatches = [read(tmp_path / name)[-80:] for name in ("street.png", "strip.png")]
     colours = open_label_set().colours
     shown = [
@@ -74,8 +76,8 @@ def test_the_legend_names_the_classes_that_are_there_and_no_others(
 def test_the_track_is_drawn_on_the_road_that_it_follows(
     street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:
-    write_topview(street, tmp_path / "without.png")
-    write_topview(street, tmp_path / "with.png", trajectory=track)
+    write_topview(Exported(in_memory(street)), tmp_path / "without.png")
+    write_topview(Exported(in_memory(street), track), tmp_path / "with.png")
     without, drawn = (read(tmp_path / name) for name in ("without.png", "with.png"))
     rows = len(without) - 100  # above the legend, which has one more entry
     without, drawn = without[:rows], drawn[:rows]
@@ -85,7 +87,7 @@ def test_the_track_is_drawn_on_the_road_that_it_follows(
 
 
 def test_the_removed_car_is_not_in_the_picture(street: SemanticMap, tmp_path: Path) -> None:
-    write_topview(street, tmp_path / "topview.png")
+    write_topview(Exported(in_memory(street)), tmp_path / "topview.png")
     image = read(tmp_path / "topview.png")[:-100]
     columns = np.flatnonzero(near(image, "vehicle").any(axis=0))
     assert np.ptp(columns) < 0.1 * image.shape[1]
@@ -94,7 +96,7 @@ def test_the_removed_car_is_not_in_the_picture(street: SemanticMap, tmp_path: Pa
 def test_an_empty_map_is_refused_in_one_line(street: SemanticMap, tmp_path: Path) -> None:
     empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
     with pytest.raises(DataError, match="no voxels to draw"):
-        write_topview(empty, tmp_path / "topview.png")
+        write_topview(Exported(in_memory(empty)), tmp_path / "topview.png")
     assert not list(tmp_path.iterdir())
 
 
@@ -104,7 +106,7 @@ def chased(size: tuple[int, int]) -> Camera:
 
 
 def test_driving_east_the_hedge_in_the_north_is_on_the_left(tmp_path: Path) -> None:
-    write_perspective(strip(60), tmp_path / "perspective.png", camera=chased((480, 270)))
+    write_perspective(Exported(in_memory(strip(60))), tmp_path / "perspective.png", camera=chased((480, 270)))
     image = read(tmp_path / "perspective.png")[:270]
     road, hedge = (np.argwhere(near(image, name)) for name in ("road", "vegetation"))
     assert len(road) > 1000
@@ -117,7 +119,7 @@ def test_driving_east_the_hedge_in_the_north_is_on_the_left(tmp_path: Path) -> N
 def test_the_default_camera_flies_behind_the_vehicle_and_sees_its_track(
     street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:
-    write_perspective(street, tmp_path / "perspective.png", track)
+    write_perspective(Exported(in_memory(street), track), tmp_path / "perspective.png")
     image = read(tmp_path / "perspective.png")
     assert image.shape[1] == 1920
     yellow = np.argwhere((image[:1080] > (200, 160, 0)).all(axis=2) & (image[:1080, :, 2] < 60))
@@ -127,7 +129,7 @@ def test_the_default_camera_flies_behind_the_vehicle_and_sees_its_track(
 
 
 def test_without_a_trajectory_the_whole_map_is_in_the_picture(street: SemanticMap, tmp_path: Path) -> None:
-    write_perspective(street, tmp_path / "perspective.png")
+    write_perspective(Exported(in_memory(street)), tmp_path / "perspective.png")
     image = read(tmp_path / "perspective.png")[:1080]
     drawn = np.argwhere(near(image, "road") | near(image, "sidewalk"))
     assert len(drawn) > 10_000

@@ -9,17 +9,27 @@ import pytest
 from pyproj import Geod, Proj
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import in_memory
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
+def as_written(whole: SemanticMap) -> np.ndarray:
+    """The places of the voxels in the order of files: tile by tile, of 512 x 512 columns, and sorted in each."""
+    x, y, _ = whole.voxels.indices.T
+    order = np.lexsort((whole.voxels.keys, y // 512, x // 512))
+    assert (order != np.arange(len(whole))).any()  # the street lies in more than one tile
+    return order
+
+
 def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, tmp_path: Path) -> None:
-    write_ply(street, tmp_path / "map.ply")
+    write_ply(Exported(in_memory(street)), tmp_path / "map.ply")
     vertices = plyfile.PlyData.read(tmp_path / "map.ply")["vertex"]
-    shown = street.shown
-    assert 0 < shown.sum() < len(street)
+    shown = as_written(street)[street.shown[as_written(street)]]
+    assert 0 < len(shown) < len(street)
     read = np.column_stack([vertices[axis] for axis in "xyz"])
     np.testing.assert_allclose(read, street.voxels.centres[shown], atol=1e-5)
     np.testing.assert_array_equal(vertices["label"], street.labels[shown])
@@ -33,7 +43,7 @@ def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, t
 def test_the_ply_says_its_frame_and_its_classes(
     street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
 ) -> None:
-    write_ply(street, tmp_path / "map.ply", karlsruhe)
+    write_ply(Exported(in_memory(street, karlsruhe)), tmp_path / "map.ply")
     comments = "\n".join(plyfile.PlyData.read(tmp_path / "map.ply").comments)
     assert "lat_deg 49.0000000000 lon_deg 8.4000000000 alt_m 115.0000" in comments
     assert "label 3: building" in comments
@@ -43,7 +53,7 @@ def test_a_map_that_no_camera_saw_is_still_worth_a_file(street: SemanticMap, tmp
     dark = VoxelMap(
         0.2, street.voxels.label_set, street.voxels.keys, 0 * street.voxels.evidence, street.voxels.hits
     )
-    write_ply(SemanticMap.of(dark), tmp_path / "map.ply")
+    write_ply(Exported(in_memory(SemanticMap.of(dark))), tmp_path / "map.ply")
     vertices = plyfile.PlyData.read(tmp_path / "map.ply")["vertex"]
     assert len(vertices.data) == len(street)
     assert (vertices["label"] == 255).all()
@@ -55,8 +65,8 @@ def test_class_names_cannot_break_out_of_the_header(street: SemanticMap, tmp_pat
     spiteful = LabelSet("x", names, old.colours, old.semantic_kitti_ids, old.asprs_codes, {})
     voxels = VoxelMap(0.2, spiteful, street.voxels.keys, street.voxels.evidence, street.voxels.hits)
     hostile = SemanticMap(voxels, street.labels, street.confidence, street.states)
-    write_ply(hostile, tmp_path / "map.ply")
-    write_laz(hostile, LocalFrame(49.0, 8.4, 115.0), tmp_path / "map.laz")
+    write_ply(Exported(in_memory(hostile)), tmp_path / "map.ply")
+    write_laz(Exported(in_memory(hostile, LocalFrame(49.0, 8.4, 115.0))), tmp_path / "map.laz")
     assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == street.shown.sum()
     assert len(laspy.read(tmp_path / "map.laz").points) == len(street)
 
@@ -64,21 +74,23 @@ def test_class_names_cannot_break_out_of_the_header(street: SemanticMap, tmp_pat
 def test_the_laz_holds_every_voxel_and_reads_back_equal(
     street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
 ) -> None:
-    write_laz(street, karlsruhe, tmp_path / "map.laz")
+    write_laz(Exported(in_memory(street, karlsruhe)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     assert (str(las.header.version), las.header.point_format.id) == ("1.4", 7)
     assert len(las.points) == len(street)
-    unlabelled = street.labels < 0
-    ids = np.where(unlabelled, 0, street.voxels.label_set.semantic_kitti_ids[street.labels])
-    codes = np.where(unlabelled, 0, street.voxels.label_set.asprs_codes[street.labels])
+    order = as_written(street)
+    labels, states = street.labels[order], street.states[order]
+    unlabelled = labels < 0
+    ids = np.where(unlabelled, 0, street.voxels.label_set.semantic_kitti_ids[labels])
+    codes = np.where(unlabelled, 0, street.voxels.label_set.asprs_codes[labels])
     np.testing.assert_array_equal(las["sem_label"], ids)
     np.testing.assert_array_equal(las.classification, codes)
-    np.testing.assert_array_equal(las["confidence"], street.confidence)
-    np.testing.assert_array_equal(las["hits"], street.voxels.hits)
-    np.testing.assert_array_equal(las["state"], street.states)
-    np.testing.assert_array_equal(np.asarray(las.withheld), street.states == State.REMOVED)
+    np.testing.assert_array_equal(las["confidence"], street.confidence[order])
+    np.testing.assert_array_equal(las["hits"], street.voxels.hits[order])
+    np.testing.assert_array_equal(las["state"], states)
+    np.testing.assert_array_equal(np.asarray(las.withheld), states == State.REMOVED)
     np.testing.assert_array_equal(
-        las.red[~unlabelled] >> 8, street.voxels.label_set.colours[street.labels[~unlabelled], 0]
+        las.red[~unlabelled] >> 8, street.voxels.label_set.colours[labels[~unlabelled], 0]
     )
     assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
     assert las.header.number_of_points_by_return[0] == len(street)
@@ -96,23 +108,23 @@ def test_the_laz_holds_every_voxel_and_reads_back_equal(
 def test_the_laz_lies_in_the_zone_and_hemisphere_of_the_origin(
     frame: LocalFrame, epsg: int, street: SemanticMap, tmp_path: Path
 ) -> None:
-    write_laz(street, frame, tmp_path / "map.laz")
+    write_laz(Exported(in_memory(street, frame)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     crs = las.header.parse_crs()
     assert crs is not None
     assert crs.to_epsg() == epsg
     assert las.header.global_encoding.wkt
-    expected = utm_by_geodesic(street.voxels.centres, frame, epsg)
+    expected = utm_by_geodesic(street.voxels.centres[as_written(street)], frame, epsg)
     np.testing.assert_allclose(las.xyz, expected, atol=0.002)
 
 
 def test_a_map_without_georeference_keeps_its_metres_and_claims_no_crs(
     street: SemanticMap, tmp_path: Path
 ) -> None:
-    write_laz(street, None, tmp_path / "map.laz")
+    write_laz(Exported(in_memory(street)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     assert las.header.parse_crs() is None
-    np.testing.assert_allclose(las.xyz, street.voxels.centres, atol=0.001)
+    np.testing.assert_allclose(las.xyz, street.voxels.centres[as_written(street)], atol=0.001)
 
 
 def utm_by_geodesic(p_map: np.ndarray, frame: LocalFrame, epsg: int) -> np.ndarray:
@@ -137,12 +149,12 @@ def utm_by_geodesic(p_map: np.ndarray, frame: LocalFrame, epsg: int) -> np.ndarr
     return np.column_stack([easting, northing, frame.alt_m + up + (east**2 + north**2) / (2 * radius)])
 
 
-def test_a_map_larger_than_one_chunk_is_written_whole(
+def test_a_tile_larger_than_one_chunk_is_written_whole(
     street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write_laz(street, karlsruhe, tmp_path / "whole.laz")
+    write_laz(Exported(in_memory(street, karlsruhe)), tmp_path / "whole.laz")
     monkeypatch.setattr("gnss_sem_map.export.point_cloud.LAZ_CHUNK", 1000)
-    write_laz(street, karlsruhe, tmp_path / "chunked.laz")
+    write_laz(Exported(in_memory(street, karlsruhe)), tmp_path / "chunked.laz")
     whole, chunked = (laspy.read(tmp_path / name).points.array for name in ("whole.laz", "chunked.laz"))
     np.testing.assert_array_equal(whole, chunked)
 
@@ -151,7 +163,7 @@ def test_an_empty_map_gives_empty_files_that_still_open(
     street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
 ) -> None:
     empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
-    write_ply(empty, tmp_path / "map.ply")
-    write_laz(empty, karlsruhe, tmp_path / "map.laz")
+    write_ply(Exported(in_memory(empty)), tmp_path / "map.ply")
+    write_laz(Exported(in_memory(empty, karlsruhe)), tmp_path / "map.laz")
     assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == 0
     assert len(laspy.read(tmp_path / "map.laz").points) == 0

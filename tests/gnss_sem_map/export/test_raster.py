@@ -9,6 +9,7 @@ import rasterio
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.raster import (
     GEOTIFF_NODATA,
     GEOTIFF_UNLABELLED,
@@ -18,6 +19,7 @@ from gnss_sem_map.export.raster import (
 )
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import in_memory
 
 AT_THE_EDGE_OF_A_ZONE = LocalFrame(60.0, 6.02, 40.0)  # convergence -2.6 degrees
 
@@ -38,7 +40,7 @@ def seen(semantic_map: SemanticMap, per_cell: int) -> dict[tuple[int, int], tupl
 def test_the_top_view_is_the_highest_labelled_voxel_of_every_column_else_the_highest(
     street: SemanticMap, longest_side: int, per_cell: int
 ) -> None:
-    view = top_view(street, longest_side)
+    view = top_view(Exported(in_memory(street)), longest_side)
     expected = seen(street, per_cell)
     assert view.cell_m == pytest.approx(0.2 * per_cell)
     assert (view.labels != NOTHING).sum() == len(expected)
@@ -56,8 +58,8 @@ def test_the_top_view_is_the_highest_labelled_voxel_of_every_column_else_the_hig
 def test_rasterio_finds_every_class_where_pyproj_says_it_is(
     frame: LocalFrame, street: SemanticMap, tmp_path: Path
 ) -> None:
-    write_topview_geotiff(street, frame, tmp_path / "topview_class.tif")
-    view = top_view(street, 10_000)
+    write_topview_geotiff(Exported(in_memory(street, frame)), tmp_path / "topview_class.tif")
+    view = top_view(Exported(in_memory(street)), 10_000)
     rows, columns = np.nonzero(inside_one_class(view.labels))
     assert len(rows) > 5000
     east, north = view.west + (columns + 0.5) * 0.2, view.north - (rows + 0.5) * 0.2
@@ -82,16 +84,16 @@ def inside_one_class(labels: np.ndarray) -> np.ndarray:
 
 def test_what_lies_outside_the_labelled_part_is_left_out_of_the_frame(street: SemanticMap) -> None:
     only_the_car = np.where(street.labels == 2, street.labels, -1).astype(np.int8)
-    view = top_view(replace(street, labels=only_the_car), 10_000)
+    view = top_view(Exported(in_memory(replace(street, labels=only_the_car))), 10_000)
     assert view.labels.shape == (10, 20)
     assert (view.labels == 2).all()
 
 
 def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path: Path) -> None:
-    write_topview_geotiff(street, AT_THE_EDGE_OF_A_ZONE, tmp_path / "topview_class.tif")
+    write_topview_geotiff(Exported(in_memory(street, AT_THE_EDGE_OF_A_ZONE)), tmp_path / "topview_class.tif")
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
         classes = tiff.read(1)
-    labels = top_view(street, 10_000).labels
+    labels = top_view(Exported(in_memory(street)), 10_000).labels
     for label in range(5):
         assert (classes == label).sum() == pytest.approx((labels == label).sum(), rel=0.02)
     assert set(np.unique(classes)) == {0, 1, 2, 3, 4, GEOTIFF_UNLABELLED, GEOTIFF_NODATA}
@@ -100,7 +102,7 @@ def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path:
 def test_the_geotiff_says_what_its_values_mean(
     street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
 ) -> None:
-    write_topview_geotiff(street, karlsruhe, tmp_path / "topview_class.tif")
+    write_topview_geotiff(Exported(in_memory(street, karlsruhe)), tmp_path / "topview_class.tif")
     label_set = street.voxels.label_set
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
         assert (tiff.dtypes, tiff.nodata, tiff.compression.name) == (("uint8",), GEOTIFF_NODATA, "deflate")
@@ -116,7 +118,18 @@ def test_utm_there_and_back_is_the_identity(street: SemanticMap) -> None:
         np.testing.assert_allclose(from_utm(frame, to_utm(frame, centres)), centres, atol=1e-6)
 
 
+def test_the_blocks_of_a_large_raster_join_without_a_seam(
+    street: SemanticMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_topview_geotiff(Exported(in_memory(street, AT_THE_EDGE_OF_A_ZONE)), tmp_path / "whole.tif")
+    monkeypatch.setattr("gnss_sem_map.export.raster.BLOCK", 16)
+    monkeypatch.setattr("gnss_sem_map.export.raster.BLOCKS_AT_ONCE", 1)
+    write_topview_geotiff(Exported(in_memory(street, AT_THE_EDGE_OF_A_ZONE)), tmp_path / "blocks.tif")
+    with rasterio.open(tmp_path / "whole.tif") as whole, rasterio.open(tmp_path / "blocks.tif") as blocks:
+        np.testing.assert_array_equal(whole.read(1), blocks.read(1))
+
+
 def test_an_empty_map_has_no_top_view(street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path) -> None:
     empty = SemanticMap.of(street.voxels[np.zeros(len(street), bool)])
     with pytest.raises(DataError, match="no voxels to draw"):
-        write_topview_geotiff(empty, karlsruhe, tmp_path / "topview_class.tif")
+        write_topview_geotiff(Exported(in_memory(empty, karlsruhe)), tmp_path / "topview_class.tif")

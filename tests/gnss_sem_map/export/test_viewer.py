@@ -1,15 +1,16 @@
 """The viewer page: its structure always, its behaviour in a real browser where one is installed."""
 
 import base64
-import gzip
 import json
 import re
 import shutil
 import socket
 import subprocess
 import time
+import tracemalloc
 import urllib.error
 import urllib.request
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,10 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import in_memory
+from gnss_sem_map.voxels.voxel_map import pack
 
 
 def part(page: str, name: str) -> str:
@@ -33,18 +37,29 @@ def part(page: str, name: str) -> str:
 
 
 def decoded(page: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
-    """Meta, indices (v, 3) and label, confidence, state (v, 3), by the description in the page's script."""
+    """Meta, indices (v, 3) in voxels of the page's level and label, confidence, state (v, 3), by the description in
+    the page's script.
+    """
     meta = json.loads(part(page, "meta"))
-    planes = np.frombuffer(gzip.decompress(base64.b64decode(part(page, "voxels"))), np.uint8).reshape(12, -1)
-    assert planes.shape[1] == meta["count"]
-    low, middle, high = planes[:9].astype(np.int64).reshape(3, 3, -1).transpose(1, 0, 2)
-    zigzag = low | middle << 8 | high << 16
-    indices = np.cumsum((zigzag >> 1) ^ -(zigzag & 1), axis=1).T + meta["origin"]
-    return meta, indices, planes[9:].T
+    listed = [node for node in meta["nodes"] if node[0] == meta["level"]]
+    nodes = [unpacked(*each, meta) for each in zip(listed, part(page, "voxels").split("\n"), strict=True)]
+    return meta, np.concatenate([cells for cells, _ in nodes]), np.concatenate([about for _, about in nodes])
+
+
+def unpacked(listed: list[int], text: str, meta: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (v, 3) and label, confidence, state (v, 3) of a node."""
+    level, x, y, low, high, *quadrants = listed
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(9, -1)
+    assert planes.shape[1] == sum(quadrants)
+    lower, upper = planes[:6].astype(np.int64).reshape(3, 2, -1).transpose(1, 0, 2)
+    zigzag = lower | upper << 8
+    cells = np.cumsum((zigzag >> 1) ^ -(zigzag & 1), axis=1).T + np.array([512 * x, 512 * y, low])
+    assert cells[:, 2].max() == high
+    return cells + (np.array(meta["origin"]) >> level), planes[6:].T
 
 
 def written(tmp_path: Path, semantic_map: SemanticMap, *arguments: Any, **settings: Any) -> str:
-    write_viewer(semantic_map, *arguments, tmp_path / "viewer.html", **settings)
+    write_viewer(in_memory(semantic_map), *arguments, tmp_path / "viewer.html", **settings)
     return (tmp_path / "viewer.html").read_text("utf-8")
 
 
@@ -94,23 +109,130 @@ def test_names_cannot_leave_their_place(street: SemanticMap, track: Trajectory, 
     assert tuple(c["name"] for c in meta["classes"]) == hostile(street).voxels.label_set.names
 
 
-def test_a_map_above_the_budget_is_joined_and_says_so(street: SemanticMap, tmp_path: Path) -> None:
-    meta, indices, about = decoded(written(tmp_path, street, None, most_voxels=10_000))
-    assert 10_000 / 8 < meta["count"] <= 10_000
-    assert meta["voxel_m"] == 0.4
-    assert meta["about"].endswith("of 0.4 m, without the unlabelled ones, joined from 0.2 m")
-    coarse = {tuple(i): label for i, label in zip(indices.tolist(), about[:, 0].tolist(), strict=True)}
-    best: dict[tuple[int, ...], tuple[int, int]] = {}
-    for index, hits, label in zip(
-        (street.voxels.indices >> 1).tolist(),
-        street.voxels.hits.tolist(),
-        street.labels.tolist(),
-        strict=True,
-    ):
-        if label >= 0 and hits > best.get(tuple(index), (0, 0))[0]:
-            best[tuple(index)] = (hits, label)
-    assert coarse.keys() == best.keys()
-    assert np.mean([coarse[i] == best[i][1] for i in best]) > 0.999  # equal hits may go either way
+@pytest.fixture(scope="module")
+def town(street: SemanticMap) -> SemanticMap:
+    """Twelve copies of the street in eleven tiles, west and east, south and north of the origin."""
+    copies = [(dx, dy) for dx in (-900, -300, 400, 1100) for dy in (-700, 30, 600)]
+    voxels = street.voxels
+    keys = np.concatenate([pack(voxels.indices + np.array([dx, dy, 0])) for dx, dy in copies])
+    order = np.argsort(keys)
+    many = np.tile(np.arange(len(street)), len(copies))[order]
+    return SemanticMap(
+        replace(voxels, keys=keys[order], evidence=voxels.evidence[many], hits=voxels.hits[many]),
+        street.labels[many],
+        street.confidence[many],
+        street.states[many],
+    )
+
+
+def levels(tmp_path: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Indices (v, 3) in voxels of the level and label, confidence, state (v, 3) of the page and its folder."""
+    page = (tmp_path / "viewer.html").read_text("utf-8")
+    meta, indices, about = decoded(page)
+    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {meta["level"]: [(indices, about)]}
+    files = {file.name for file in (tmp_path / "viewer").iterdir()}
+    for listed in meta["nodes"]:
+        level, x, y = listed[:3]
+        if level != meta["level"]:
+            name = f"{level}_{x}_{y}"
+            files.remove(f"{name}.js")
+            script = (tmp_path / "viewer" / f"{name}.js").read_text("ascii")
+            text = script.removeprefix(f'voxels("{name}","').removesuffix('");\n')
+            found.setdefault(level, []).append(unpacked(listed, text, meta))
+    assert not files
+    return {
+        level: (np.concatenate([i for i, _ in nodes]), np.concatenate([a for _, a in nodes]))
+        for level, nodes in found.items()
+    }
+
+
+def test_a_map_above_the_budget_has_levels_of_which_each_shows_the_most_hit_of_the_voxels_it_joins(
+    town: SemanticMap, tmp_path: Path
+) -> None:
+    """Against a dictionary; a labelled voxel that stands goes before the others."""
+    written(tmp_path, town, None, most_voxels=20_000)
+    found = levels(tmp_path)
+    assert len(found) > 2
+    labels = np.where(town.labels < 0, 5, town.labels).tolist()
+    ranks = list(zip(town.shown.tolist(), town.voxels.hits.tolist(), strict=True))
+    for level, (indices, about) in found.items():
+        best: dict[tuple[int, ...], tuple[tuple[bool, int], set[tuple[int, int]]]] = {}
+        joined = map(tuple, (town.voxels.indices >> level).tolist())
+        for index, rank, label, state in zip(joined, ranks, labels, town.states.tolist(), strict=True):
+            highest, those = best.get(index, (rank, set()))
+            if rank >= highest:
+                best[index] = rank, {(label, state)} | (those if rank == highest else set())
+        shown = {
+            tuple(i): (label, state)
+            for i, (label, _, state) in zip(indices.tolist(), about.tolist(), strict=True)
+        }
+        assert len(shown) == len(indices)
+        assert shown.keys() == best.keys()
+        assert all(shown[index] in those for index, (_, those) in best.items())
+    assert len(found[max(found)][0]) <= 20_000 < len(found[max(found) - 1][0])
+
+
+def test_a_map_in_tiles_on_disk_gives_the_same_bytes_and_each_tile_is_read_once(
+    town: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    tiles.write(town, tmp_path / "map", None)
+    opened, read = tiles.open_map(tmp_path / "map"), list[tiles.Tile]()
+
+    def read_tile(tile: tiles.Tile) -> SemanticMap:
+        read.append(tile)
+        return opened.read_tile(tile)
+
+    for name, tiled_map in (("disk", replace(opened, read_tile=read_tile)), ("memory", in_memory(town))):
+        (tmp_path / name).mkdir()
+        write_viewer(tiled_map, track, tmp_path / name / "viewer.html", most_voxels=20_000)
+    assert sorted(read) == list(opened.tiles)
+    disk, memory = (
+        {file.relative_to(tmp_path / name): file.read_bytes() for file in (tmp_path / name).rglob("*.*")}
+        for name in ("disk", "memory")
+    )
+    assert disk == memory
+    assert len(disk) > 10
+
+
+def test_the_files_of_an_earlier_page_are_not_replaced(town: SemanticMap, tmp_path: Path) -> None:
+    written(tmp_path, town, None, most_voxels=20_000)
+    with pytest.raises(DataError, match=r"viewer: exists; move it away"):
+        written(tmp_path, town, None, most_voxels=20_000)
+
+
+def peak_memory(edge: int, piece: SemanticMap, page: Path) -> int:
+    """Bytes that writing a map of edge x edge such tiles takes at most."""
+    corners = tuple((x, y) for x in range(edge) for y in range(edge))
+    tiled_map = replace(in_memory(piece), tiles=corners, read_tile=lambda _: piece[np.arange(len(piece))])
+    tracemalloc.start()
+    write_viewer(tiled_map, None, page, most_voxels=20_000)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def test_memory_does_not_grow_with_the_map(street: SemanticMap, tmp_path: Path) -> None:
+    small, large = (peak_memory(edge, street, tmp_path / f"{edge}.html") for edge in (3, 9))
+    assert large < 1.2 * small
+
+
+def test_tiles_without_voxels_are_passed_over(street: SemanticMap, tmp_path: Path) -> None:
+    tiled_map, nothing = in_memory(street), street[np.zeros(len(street), bool)]
+    pages = []
+    for corners in (tiled_map.tiles, (*tiled_map.tiles, (2, 5))):
+        with_empty = replace(
+            tiled_map,
+            tiles=corners,
+            read_tile=lambda tile: nothing if tile == (2, 5) else tiled_map.read_tile(tile),
+        )
+        write_viewer(with_empty, None, tmp_path / "viewer.html")
+        pages.append(decoded((tmp_path / "viewer.html").read_text("utf-8"))[1])
+    np.testing.assert_array_equal(*pages)
+
+
+def test_a_page_needs_a_suffix_since_its_folder_has_none(street: SemanticMap, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"viewer: found no suffix, expected a name such as viewer.html"):
+        write_viewer(in_memory(street), None, tmp_path / "viewer")
 
 
 def test_an_empty_map_is_refused(street: SemanticMap, tmp_path: Path) -> None:
@@ -274,6 +396,31 @@ def test_a_click_tells_what_the_voxel_is(browser: Browser, street: SemanticMap, 
     assert place == pytest.approx([30, 1, 0.1], abs=0.3)
 
 
+def test_every_state_of_a_voxel_has_a_name_and_a_colour(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    assert browser.run("return [ORIGINS.length, ORIGIN_COLOURS.length]") == [len(State)] * 2
+
+
+def test_a_double_click_goes_to_the_voxel(browser: Browser, street: SemanticMap, tmp_path: Path) -> None:
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    look_at(browser, (30, 1, 0), 20)
+    browser.run("camera.elevation = 1.5; draw();")
+    press = {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}
+    move = {"type": "pointerMove", "duration": 0, "x": 450, "y": 200}
+    mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
+    browser.ask("/actions", actions=[mouse | {"actions": [move, *press, *press]}])
+    said = browser.run("return document.getElementById('picked').textContent")
+    place = [float(number) for number in re.findall(r"(-?\d+\.\d) m", said)]
+    target = browser.run("return camera.target.map((v, k) => (v + meta.origin[k]) * meta.voxel_m)")
+    assert place == pytest.approx(target, abs=0.06)
+    assert np.hypot(target[0] - 30, target[1] - 1) > 1
+    assert browser.run("return camera.distance * meta.voxel_m") == pytest.approx(20 / 3)
+
+
 def pointer(name: str, kind: str, *points: tuple[int, int]) -> dict[str, Any]:
     """Press at the first point, move to the others, release."""
     moves = [{"type": "pointerMove", "duration": 50, "x": x, "y": y} for x, y in points]
@@ -306,3 +453,105 @@ def test_mouse_and_fingers_turn_and_zoom(browser: Browser, street: SemanticMap, 
     fingers = [pointer("a", "touch", (500, 300), (450, 300)), pointer("b", "touch", (600, 300), (650, 300))]
     browser.ask("/actions", actions=fingers)
     assert browser.run(state) == pytest.approx([*turned[:2], nearer[2] / 2], rel=0.05)
+
+
+def settled(browser: Browser) -> dict[str, int]:
+    """Load what the view needs; returns the voxels that are held and drawn of each level."""
+    for _ in range(400):
+        if not browser.run("draw(); return waiting()"):
+            break
+        time.sleep(0.02)
+    ready = "[...scene.nodes.values()].filter(({ state }) => state === 'ready')"
+    return {
+        "held": browser.run(
+            f"return {ready}.reduce((sum, {{ level, count }}) => sum + (level < meta.level) * count, 0)"
+        ),
+        "finest": browser.run("return Math.min(...scene.drawn.map(([{ level }]) => level ?? 99))"),
+        "coarsest": browser.run("return Math.max(...scene.drawn.map(([{ level }]) => level ?? 0))"),
+    }
+
+
+def look_at(browser: Browser, metres: tuple[float, float, float], distance_m: float) -> None:
+    browser.run(
+        f"camera.target = {list(metres)}.map((m, k) => m / meta.voxel_m - meta.origin[k]);"
+        f"camera.distance = {distance_m} / meta.voxel_m;"
+    )
+
+
+def test_near_by_a_page_with_levels_shows_what_a_page_with_all_voxels_shows(
+    browser: Browser, town: SemanticMap, tmp_path: Path
+) -> None:
+    pictures = []
+    for name, most_voxels in (("whole", 10**6), ("levels", 20_000)):
+        (tmp_path / name).mkdir()
+        written(tmp_path / name, town, None, most_voxels=most_voxels)
+        assert browser.open((tmp_path / name / "viewer.html").as_uri()) == f"ready: {len(town)} voxels"
+        look_at(browser, (110, 6, 0), 30)
+        browser.run("camera.elevation = 1.2; most = 0")
+        settled(browser)
+        pictures.append(browser.screenshot())
+    whole, coarse = pictures
+    assert (coarse != whole).any(axis=2).mean() > 0.05
+    browser.run("most = 4e6")
+    assert settled(browser)["finest"] == 0
+    assert (browser.screenshot() != whole).any(axis=2).mean() < 0.001
+
+
+def test_from_afar_voxels_are_coarse_and_memory_is_bounded_wherever_the_camera_goes(
+    browser: Browser, town: SemanticMap, tmp_path: Path
+) -> None:
+    written(tmp_path, town, None, most_voxels=20_000)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    browser.run("most = 150000")
+    look_at(browser, (0, 0, 0), 4000)
+    far = settled(browser)
+    assert far["finest"] == far["coarsest"] > 1
+    seen = set()
+    for east in (-150, 110, 240):
+        for north in (-140, 6):
+            look_at(browser, (east, north, 0), 20)
+            near = settled(browser)
+            assert near["held"] <= 150_000
+            seen |= set(browser.run("return scene.drawn.map(([{ name }]) => name)"))
+    assert sum(name.startswith("0_") for name in seen) >= 6
+
+
+@pytest.mark.parametrize("fault", ["lost", "cut", "of another map"])
+def test_a_page_without_the_files_of_its_folder_shows_the_coarse_voxels_and_says_so(
+    fault: str, browser: Browser, town: SemanticMap, tmp_path: Path
+) -> None:
+    written(tmp_path, town, None, most_voxels=20_000)
+    for file in (tmp_path / "viewer").iterdir():
+        if fault == "lost":
+            file.unlink()
+        elif fault == "cut":
+            file.write_bytes(file.read_bytes()[:-1000])
+        else:
+            other = base64.b64encode(zlib.compress(bytes(900))).decode()
+            file.write_text(f'voxels("{file.stem}","{other}");')
+    browser.open((tmp_path / "viewer.html").as_uri())
+    look_at(browser, (110, 6, 0), 30)
+    settled(browser)
+    assert browser.run("return waiting()") == 0
+    assert browser.run("return scene.drawn.length") > 0
+    said = browser.run("return document.getElementById('about').textContent")
+    what = {
+        "lost": "is not beside this page",
+        "cut": "is damaged",
+        "of another map": "is damaged, or of another page",
+    }
+    pattern = rf"joined to [\d.]+ m where finer ones are missing: viewer/\d_\d_\d.js {what[fault]}"
+    assert re.search(pattern, said)
+
+
+def test_a_click_on_a_joined_voxel_says_so(browser: Browser, town: SemanticMap, tmp_path: Path) -> None:
+    written(tmp_path, town, None, most_voxels=20_000)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    look_at(browser, (110, 6, 0), 300)
+    browser.run("camera.elevation = 1.5;")
+    settled(browser)
+    browser.run("pick({ clientX: innerWidth / 2, clientY: innerHeight / 2 });")
+    said = browser.run("return document.getElementById('picked').textContent")
+    assert "the most hit voxel in 0.8 m" in said
+    place = [float(number) for number in re.findall(r"(-?\d+\.\d) m", said.split("\n")[1])]
+    assert place[:2] == pytest.approx([110, 6], abs=2.0)

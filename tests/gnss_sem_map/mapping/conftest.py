@@ -13,15 +13,18 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
 
+NOTHING_MOVES = Settings.model_validate({"dynamics": {"enabled": False}})
+
 
 @pytest.fixture(scope="module")
 def drive(small_drive: Street) -> Drive:
+    """Nothing moves in it, and nothing that does is sought."""
     log = open_drive(small_drive.drive)
     segmenter = open_segmenter(
         f"labels:{small_drive.labels}", open_label_set(), expected_size=log.calibration.image_size
     )
     assert log.reference is not None
-    return Drive(log, log.reference, segmenter, Settings())
+    return Drive(log, log.reference, segmenter, NOTHING_MOVES)
 
 
 @pytest.fixture(scope="module")

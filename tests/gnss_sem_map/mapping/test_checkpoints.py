@@ -23,7 +23,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.fusion import STATIC, Drive, Maps, build_maps, fingerprint, map_chunks
+from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
+from gnss_sem_map.mapping.fusion import Maps, fingerprint, map_scans
+from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -31,26 +33,32 @@ from gnss_sem_map.voxels.semantic_map import SemanticMap
 URBAN = open_label_set()
 
 
-@pytest.mark.parametrize(
-    ("chunk", "workers"), [(1, 1), (5, 1), (100, 1), pytest.param(5, 2, marks=pytest.mark.integration)]
-)
-def test_chunks_and_processes_give_the_same_map_and_stats(
-    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, chunk: int, workers: int
-) -> None:
-    stats = RunStats()
-    maps = build_maps(by_chunks(drive, chunk), stats, work=tmp_path / "work", workers=workers)
-    assert_same(maps.static, at_once[0].static)
-    assert len(maps.removed) == 0
+def assert_same_as(at_once: tuple[Maps, RunStats], store: ChunkStore, stats: RunStats) -> None:
+    """Fail where chunks say something else than the maps and counts of a drive mapped at once."""
+    assert_same(store.whole(STATIC), at_once[0].static)
+    assert_same(store.whole(REMOVED), at_once[0].removed)
     assert stats.counts == at_once[1].counts
     assert stats.skips == at_once[1].skips
+
+
+@pytest.mark.parametrize(
+    ("window", "workers"), [(1, 1), (2, 1), (100, 1), pytest.param(2, 2, marks=pytest.mark.integration)]
+)
+def test_chunks_and_processes_give_the_same_map_and_stats(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, window: int, workers: int
+) -> None:
+    stats = RunStats()
+    store = map_scans(by_chunks(drive, window), tmp_path / "work", stats, workers=workers)
+    assert store.count == {1: 6, 2: 3, 100: 1}[window]
+    assert_same_as(at_once, store, stats)
 
 
 def test_tiles_come_from_the_chunks_one_by_one(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
     """The folder written tile by tile, never holding the map, has the bytes of the one written at once."""
-    store = map_chunks(by_chunks(drive, 3), tmp_path / "work", RunStats())
-    pieces = ((tile, SemanticMap.of(part)) for tile, part in store.tiles(STATIC))
+    store = map_scans(by_chunks(drive, 2), tmp_path / "work", RunStats())
+    pieces = ((tile, SemanticMap.of(store.tile(STATIC, tile))) for tile in store.tiles())
     tiles.write_tiles(pieces, tmp_path / "a", drive.log.frame, store.voxel_size_m, URBAN)
     tiles.write(SemanticMap.of(at_once[0].static), tmp_path / "b", drive.log.frame)
     names = sorted(path.name for path in (tmp_path / "a").iterdir())
@@ -74,10 +82,10 @@ if __name__ == "__main__":
     drive, probabilities, work = map(Path, sys.argv[1:])
     log = open_drive(drive)
     segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
-    job = Drive(log, log.reference, segmenter, Settings(mapping={"scans_per_chunk": 1}))
-    fusion.fuse_scans(job, log.scans[:1], RunStats())  # compiled code is loaded: the kills fall into the mapping
+    job = Drive(log, log.reference, segmenter, Settings(dynamics={"enabled": False, "window_scans": 1}))
+    fusion.build_maps(job, RunStats())  # compiled code is loaded: the kills fall into the mapping
     print("ready", flush=True)
-    fusion.map_chunks(job, work, RunStats(), resume=True)
+    fusion.map_scans(job, work, RunStats(), resume=True)
     print("done", flush=True)
 """
 
@@ -114,10 +122,9 @@ def resumed_after_kills(
 ) -> list[int]:
     done = kill_at_random(small_drive, work, times, seed)
     stats = RunStats()
-    maps = build_maps(by_chunks(drive, 1), stats, work=work, resume=True)
-    assert_same(maps.static, at_once[0].static)
-    assert stats.counts == at_once[1].counts
-    assert not list(work.glob(".*.part"))
+    store = map_scans(by_chunks(drive, 1), work, stats, resume=True)
+    assert_same_as(at_once, store, stats)
+    assert [path.name for path in work.glob(".*.*.*")] == [], "what the killed processes left stays"
     return done
 
 
@@ -135,57 +142,61 @@ def test_a_run_killed_many_times_goes_on_to_the_same_map(
     partly = 0
     for seed in range(8):
         done = resumed_after_kills(drive, small_drive, at_once, tmp_path / f"work{seed}", 4, seed)
-        partly += sum(0 < n < len(drive.log.scans) for n in done)
+        partly += sum(0 < n < len(drive.log.scans) // 2 for n in done)
     assert partly > 0, "no kill fell into the mapping: this test showed nothing"
 
 
 def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> None:
-    work, drive = tmp_path / "work", by_chunks(drive, 4)
-    build_maps(drive, RunStats(), work=work)
+    work, drive = tmp_path / "work", by_chunks(drive, 2)
+    map_scans(drive, work, RunStats())
     other = Settings.model_validate({"mapping": {"voxel_size_m": 0.3}})
     for changed in (
         replace(drive, settings=other),
         replace(drive, log=replace(drive.log, scans=drive.log.scans[2:])),
-        replace(drive, moving={3: np.array([5])}),
+        replace(drive, from_lidar_odometry=True),
+        by_chunks(drive, 1),
     ):
         with pytest.raises(DataError, match="another drive, trajectory, labels or settings"):
-            build_maps(changed, RunStats(), work=work, resume=True)
+            map_scans(changed, work, RunStats(), resume=True)
     with pytest.raises(DataError, match="another drive"):
-        build_maps(drive, RunStats(), work=work, resume=True, labels_from="labels:elsewhere")
+        map_scans(drive, work, RunStats(), resume=True, labels_from="labels:elsewhere")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.txt").write_text("important")
     with pytest.raises(DataError, match="holds no interrupted run"):
-        build_maps(drive, RunStats(), work=tmp_path / "mine")
+        map_scans(drive, tmp_path / "mine", RunStats())
     assert (tmp_path / "mine/thesis.txt").exists()
 
 
 def doubled(path: Path) -> None:
-    tile = next(path.parent.rglob("*.npy"))
-    tile.with_name("77_77.npy").write_bytes(tile.read_bytes())
+    tile = next(path.parent.rglob("*.parquet"))
+    tile.with_name("77_77.parquet").write_bytes(tile.read_bytes())
 
 
 @pytest.mark.parametrize("damage", [flipped, halved, doubled, Path.unlink])
-@pytest.mark.parametrize("what", ["static/*.npy", "record.json"])
+@pytest.mark.parametrize("what", ["static/*.parquet", MOVING_POINTS, "record.json"])
 def test_a_damaged_chunk_is_mapped_again(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, damage: Callable[[Path], None], what: str
 ) -> None:
-    drive = by_chunks(drive, 4)
-    build_maps(drive, RunStats(), work=tmp_path / "work")
+    drive = by_chunks(drive, 2)
+    map_scans(drive, tmp_path / "work", RunStats())
     others = {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
     damage(sorted((tmp_path / "work/1").glob(what))[0])
     stats = RunStats()
-    maps = build_maps(drive, stats, work=tmp_path / "work", resume=True)
-    assert_same(maps.static, at_once[0].static)
-    assert stats.counts == at_once[1].counts
+    store = map_scans(drive, tmp_path / "work", stats, resume=True)
+    assert_same_as(at_once, store, stats)
     assert others == {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
 
 
 def test_a_chunk_that_is_damaged_under_way_is_named_and_never_used(drive: Drive, tmp_path: Path) -> None:
-    store = map_chunks(by_chunks(drive, 4), tmp_path / "work", RunStats())
-    part = sorted((tmp_path / "work/1").glob("static/*.npy"))[0]
-    flipped(part)
-    with pytest.raises(DataError, match=rf"{part.name}: damaged voxels .*--resume maps them again"):
-        store.whole(STATIC)
+    store = map_scans(by_chunks(drive, 2), tmp_path / "work", RunStats())
+    tile = sorted((tmp_path / "work/1").glob("static/*.parquet"))[0]
+    for file, use in (
+        (tile, lambda: store.whole(STATIC)),
+        (tmp_path / "work/1" / MOVING_POINTS, lambda: list(store.contents(MOVING_POINTS))),
+    ):
+        flipped(file)
+        with pytest.raises(DataError, match=rf"1/.*{file.name}: damaged .*--resume maps the chunk again"):
+            use()
     shutil.rmtree(tmp_path / "work/2")
     with pytest.raises(DataError, match="damaged chunk"):
         replace(store).records()
@@ -199,7 +210,7 @@ def test_an_input_that_was_changed_since_is_noticed(
     shutil.copytree(small_drive.drive.parents[1], street_copy)
     opened = open_drive(next(street_copy.glob("*/*_sync")))
     labels_from = f"labels:{street_copy / 'probabilities'}"
-    copied = by_chunks(replace(drive, log=opened), 4)
+    copied = by_chunks(replace(drive, log=opened), 2)
     before = fingerprint(copied, labels_from)
     assert fingerprint(copied, labels_from) == before
     for changed in (
@@ -228,9 +239,7 @@ class Unsendable:
 
 def test_a_segmenter_that_cannot_be_shared_is_refused_before_any_work(drive: Drive, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot work in several processes"):
-        build_maps(
-            by_chunks(replace(drive, segmenter=Unsendable()), 2), RunStats(), work=tmp_path / "w", workers=2
-        )
+        map_scans(by_chunks(replace(drive, segmenter=Unsendable()), 1), tmp_path / "w", RunStats(), workers=2)
 
 
 FILL = """
@@ -240,6 +249,8 @@ sys.path.insert(0, sys.argv[1])
 from gnss_sem_map.errors import DataError
 from test_tiles import random_map, FRAME
 from gnss_sem_map.mapping import checkpoints
+from gnss_sem_map.mapping.chunks import MappedChunk
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.labels.label_set import open_label_set
 
@@ -248,7 +259,7 @@ store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_s
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),
-    lambda: store.write(0, {"static": written.voxels}, {}),
+    lambda: store.write(MappedChunk(0, written.voxels, written.voxels - written.voxels, {}, (), None, RunStats())),
 ):
     try:
         attempt()

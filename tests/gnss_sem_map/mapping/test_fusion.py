@@ -9,7 +9,7 @@ import numpy as np
 import numpy_chain
 import pytest
 import street
-from chunks import assert_same, by_chunks
+from chunks import assert_same
 from numpy.typing import NDArray
 from street import Street
 
@@ -84,7 +84,7 @@ class Refusing:
 def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
     drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
-    """A live network's answers are remembered between the two passes; so is nothing that it refused."""
+    """A live network's answers are kept; so is nothing that it refused."""
     assert drive.segmenter is not None
     size = drive.log.calibration.image_size
     assert size is not None
@@ -136,23 +136,6 @@ def test_every_reader_says_which_files_it_reads(small_drive: Street, tmp_path: P
         assert int(file.stem) == item.number
 
 
-def test_what_moved_goes_into_a_map_of_its_own_and_nothing_is_lost(
-    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
-) -> None:
-    """Everything that its image calls a vehicle is taken out: by chunks and at once alike."""
-    vehicle = URBAN.index("vehicle")
-    moving = {seen.scan.number: np.flatnonzero(seen.labels == vehicle) for seen in labelled_scans(drive)}
-    taken = replace(drive, moving=moving)
-    maps = build_maps(taken, RunStats())
-    assert maps.removed.hits.sum() == sum(map(len, moving.values())) > 100
-    assert set(maps.removed.labels) == {vehicle}
-    assert not (maps.static.labels == vehicle).any()
-    assert_same(maps.static + maps.removed, at_once[0].static)
-    chunked = build_maps(by_chunks(taken, 5), RunStats(), work=tmp_path / "work")
-    assert_same(chunked.static, maps.static)
-    assert_same(chunked.removed, maps.removed)
-
-
 def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: tuple[Maps, RunStats]) -> None:
     """Deskewing, keys, projection, occlusion and fusion, scan by scan and as a map."""
     settings, log = drive.settings, drive.log
@@ -174,7 +157,9 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
         )
         np.testing.assert_array_equal(seen.pixels >= 0, pixels >= 0)
         np.testing.assert_array_equal(seen.classes, classes.rows[pixels[pixels >= 0]])
-        plain.add(numpy_chain.keys_of(p_map, settings.mapping.voxel_size_m), pixels, classes.rows)
+        voxel_size_m = settings.mapping.voxel_size_m
+        keys, heights = (of(p_map, voxel_size_m) for of in (numpy_chain.keys_of, numpy_chain.heights_of))
+        plain.add(keys, pixels, classes.rows, heights)
     assert_same(plain.to_map(), at_once[0].static)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from chunks import assert_same
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -13,13 +15,13 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.merging import align, into_frame, merge, merge_runs
+from gnss_sem_map.mapping.raw_map import MAP, open_raw
+from gnss_sem_map.refinement.by_tile import refine
 from gnss_sem_map.refinement.state import Evidence
-from gnss_sem_map.refinement.steps import refine
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, heights_in_voxels, keys_of
 
 URBAN = open_label_set()
 HERE, THERE = LocalFrame(49.011, 8.423, 112.0), LocalFrame(49.0135, 8.4275, 120.0)
@@ -33,8 +35,15 @@ def street(frame: LocalFrame, seed: int = 0, size: float = 0.2) -> VoxelMap:
     p_map = frame.to_map(*HERE.to_geodetic(np.vstack([ground, wall])))
     classes = np.array([[250, 1, 1, 1, 1, 1], [1, 1, 1, 250, 1, 1]], np.uint8)
     table = VoxelTable(size, URBAN)
-    table.add(keys_of(p_map, size), np.repeat([0, 1], [40_000, 20_000]).astype(np.int32), classes)
+    pixels = np.repeat([0, 1], [40_000, 20_000]).astype(np.int32)
+    table.add(keys_of(p_map, size), pixels, classes, heights_in_voxels(p_map[:, 2], size))
     return table.to_map()
+
+
+def write_run(run: Path, static: VoxelMap, moved: VoxelMap, frame: LocalFrame) -> None:
+    """The raw map of a run folder."""
+    tiles.write(SemanticMap.of(static + moved), run / MAP, frame)
+    tiles.write(SemanticMap.of(moved), run / evidence.FOLDER / evidence.MOVED, frame)
 
 
 def test_two_frames_become_one() -> None:
@@ -47,6 +56,8 @@ def test_two_frames_become_one() -> None:
     for voxels in (first, moved):
         wall = voxels.centres[voxels.labels == URBAN.index("building")]
         assert np.abs(wall[:, 1] - 20.0).max() < 0.31
+        road = voxels.surface_heights[voxels.labels == URBAN.index("road")]
+        assert np.percentile(np.abs(road), 99) < 0.04
     far = second.centres[second.labels == URBAN.index("building")]
     assert np.abs(far[:, 1] - 20.0).min() > 100, "the frames must differ, or this test shows nothing"
 
@@ -65,10 +76,9 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
         moved = voxels.labels == URBAN.index("building")
         refined, _ = refine(voxels[~moved], beside=Evidence(moved=voxels[moved]))
         assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
-        tiles.write(SemanticMap.of(voxels), tmp_path / name / "map", frame)
-        evidence.write(RunEvidence(voxels[moved]), tmp_path / name, frame)
+        write_run(tmp_path / name, voxels[~moved], voxels[moved], frame)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    static, removed = runs.static, runs.evidence.moved
+    static, removed = runs.static, runs.moved
     assert runs.frame == HERE
     assert static.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
@@ -83,18 +93,24 @@ def test_merged_runs_keep_moving_points_in_static_voxels_apart(tmp_path: Path) -
     """The same run twice: twice the evidence of static points and of moving points, also in voxels of both."""
     static, moved = street(HERE, 0), street(HERE, 1)
     for name in ("a", "b"):
-        tiles.write(SemanticMap.of(static + moved), tmp_path / name / "map", HERE)
-        evidence.write(RunEvidence(moved), tmp_path / name, HERE)
+        write_run(tmp_path / name, static, moved, HERE)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
-    for found, once in ((runs.static, static), (runs.evidence.moved, moved)):
+    for found, once in ((runs.static, static), (runs.moved, moved)):
         np.testing.assert_array_equal(found.keys, once.keys)
         np.testing.assert_array_equal(found.hits, 2 * once.hits)
         np.testing.assert_array_equal(found.evidence, 2 * once.evidence)
+    (tmp_path / "merged").mkdir()
+    runs.write_raw(tmp_path / "merged")
+    raw = open_raw(tmp_path / "merged", URBAN)
+    assert_same(raw.fused.whole().voxels, runs.static + runs.moved)
+    assert_same(raw.evidence.moved.whole().voxels, runs.moved)
 
 
 def test_maps_of_different_runs_in_one_folder_are_refused(tmp_path: Path) -> None:
-    tiles.write(SemanticMap.of(street(HERE, 0)), tmp_path / "a" / "map", HERE)
-    evidence.write(RunEvidence(street(HERE, 1)), tmp_path / "a", HERE)
+    write_run(tmp_path / "a", street(HERE, 0), street(HERE, 1), HERE)
+    write_run(tmp_path / "b", street(HERE, 2), street(HERE, 0), HERE)
+    shutil.rmtree(tmp_path / "a" / "map")
+    (tmp_path / "b" / "map").rename(tmp_path / "a" / "map")
     with pytest.raises(DataError, match="not of one run"):
         merge_runs(tmp_path / "a", tmp_path / "a")
 

@@ -15,6 +15,7 @@ from gnss_sem_map.refinement.count_grid import (
     evidence_log_odds,
     paper_log_odds,
 )
+from gnss_sem_map.refinement.figures import column_error_rate
 from gnss_sem_map.voxels.voxel_map import pack
 
 BUILDING, VEGETATION = 3, 4
@@ -64,23 +65,20 @@ def test_the_papers_rule_is_bayes_with_a_binomial_likelihood():
     indices = np.array([(0, 0, z) for z in range(5)] + [(9, 9, z) for z in range(4)])
     labels = np.array([3, 3, 3, 4, 3, 4, 4, 4, 3], np.int8)
     settings = CountGridSettings(error_rate=0.1)
-    odds = paper_log_odds(pack(indices), labels, (BUILDING, VEGETATION), settings)
+    prior = log(6 / 5)  # 5 and 4 voxels, one pseudo-count each
+    odds = paper_log_odds(pack(indices), labels, (BUILDING, VEGETATION), settings, prior)
 
     def likelihood(right, wrong):
         return comb(right + wrong, right) * 0.9**right * 0.1**wrong
 
-    prior = log(6 / 5)  # 5 and 4 voxels, one pseudo-count each
     np.testing.assert_allclose(odds[:5], prior + log(likelihood(4, 1) / likelihood(1, 4)))
     np.testing.assert_allclose(odds[5:], prior + log(likelihood(1, 3) / likelihood(3, 1)))
 
 
-def test_the_columns_likelihood_is_beta_binomial_in_the_other_voxels(monkeypatch):
-    monkeypatch.setattr(grids, "_beta_of", lambda counts, pseudo_counts: (2.5, 0.5))
+def test_the_columns_likelihood_is_beta_binomial_in_the_other_voxels():
     indices = np.array([(0, 0, z) for z in range(5)])
     labels = np.array([3, 3, 3, 4, 3], np.int8)
-    odds = evidence_log_odds(
-        pack(indices), labels, np.zeros(5, np.float32), (3, 4), CountGridSettings(), voxel_size_m=0.2
-    )
+    odds = evidence_log_odds(pack(indices), labels, np.zeros(5, np.float32), (3, 4), (5, 5, 4), 0.5 / 3)
 
     def likelihood(building, vegetation, a, b):
         return beta(building + a, vegetation + b) / beta(a, b)
@@ -98,10 +96,8 @@ def test_a_thousand_agreeing_voxels_are_not_a_thousand_witnesses():
     for count in (10, 100, 1000):
         indices = np.array([(0, 0, z) for z in range(count)])
         labels = np.full(count, BUILDING, np.int8)
-        settings = CountGridSettings(reach_m=1e6)
-        odds.append(
-            evidence_log_odds(pack(indices), labels, np.zeros(count, np.float32), (3, 4), settings, 0.2)[0]
-        )
+        own = np.zeros(count, np.float32)
+        odds.append(evidence_log_odds(pack(indices), labels, own, (3, 4), (5, 5, 10**6), 0.05)[0])
     assert odds[2] - odds[1] == pytest.approx(odds[1] - odds[0], rel=0.05)
 
 
@@ -112,8 +108,8 @@ def test_the_error_rate_is_found_in_the_map_itself(a, b):
     building = rng.random(20_000) < 0.5
     right = rng.binomial(20, share)
     first = np.where(building, right, 20 - right)
-    counts = np.repeat(np.stack([first, 20 - first], 1), 20, axis=0).astype(float)
-    assert grids._beta_of(counts, 3.0) == pytest.approx((a, b), abs=0.06)
+    counts = np.repeat(np.stack([first, 20 - first], 1), 20, axis=0).astype(np.int32)
+    assert 3.0 * column_error_rate(grids.pairs(counts)) == pytest.approx(b, abs=0.06)
 
 
 def test_a_tree_before_a_facade_keeps_its_crown_and_the_facade_its_wall():
@@ -123,8 +119,7 @@ def test_a_tree_before_a_facade_keeps_its_crown_and_the_facade_its_wall():
     order = np.argsort(pack(indices))
     keys, labels = pack(indices)[order], labels[order]
     own = np.where(labels == BUILDING, 0.5, -0.5).astype(np.float32)
-    settings = CountGridSettings(reach_m=2.0)
-    odds = evidence_log_odds(keys, labels, own, (BUILDING, VEGETATION), settings, 0.2)
+    odds = evidence_log_odds(keys, labels, own, (BUILDING, VEGETATION), (5, 5, 2), 0.05)
     assert ((odds > 0) == (labels == BUILDING)).all()
 
 

@@ -17,12 +17,14 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.label_files import read_labels
 from gnss_sem_map.evaluation.metrics import Tables, confusion
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import PointLabels, label_points
 from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.kerbs import KerbSettings, find_kerbs
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.simulation import simulate
+from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
@@ -40,8 +42,12 @@ class Scene:
     semantic_map: SemanticMap
 
     @property
+    def keys(self) -> NDArray[np.int64]:
+        return keys_of(self.p_map, SIZE_M)
+
+    @property
     def places(self) -> NDArray[np.int64]:
-        return self.semantic_map.voxels.indices_of(keys_of(self.p_map, SIZE_M))
+        return self.semantic_map.voxels.indices_of(self.keys)
 
     @property
     def heights(self) -> NDArray[np.float64]:
@@ -55,7 +61,7 @@ class Scene:
     def mistakes(self) -> tuple[int, int]:
         """Of the map's voxels, and with kerbs told apart."""
         called = self.semantic_map.labels[self.places]
-        inside, chosen, _ = self.kerbs().decide(self.places, self.p_map)
+        inside, chosen, _ = self.kerbs().decide(self.keys, self.p_map)
         told = called.copy()
         told[inside] = chosen
         return int((called != self.truth).sum()), int((told != self.truth).sum())
@@ -112,7 +118,7 @@ def test_the_odds_are_those_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
     street = scene(low_m=low, confidence=confidence, heading=0.0)
     monkeypatch.setattr(kerb_points, "POINT_STDDEV_M", stddev)
     monkeypatch.setattr(kerb_points, "FACE_BEGINS", 0.5)
-    inside, chosen, probability = street.kerbs().decide(street.places, street.p_map)
+    inside, chosen, probability = street.kerbs().decide(street.keys, street.p_map)
     x, y = (np.arange(n) * SIZE_M for n in (50, 20))
     grid = np.where(street.semantic_map.labels.reshape(50, 20) == ROAD, confidence, 1 - confidence)
     of_road = RegularGridInterpolator((x + SIZE_M / 2, y - 2 + SIZE_M / 2), grid)
@@ -130,10 +136,10 @@ def test_the_odds_are_those_of_scipy(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_points_far_from_a_kerb_or_in_no_voxel_are_left_alone() -> None:
     street = scene()
-    places = street.places
-    places[::7] = -1
-    inside, _, _ = street.kerbs().decide(places, street.p_map)
-    assert (places[inside] >= 0).all()
+    keys = street.keys
+    keys[::7] += 50  # far above
+    inside, _, _ = street.kerbs().decide(keys, street.p_map)
+    assert (inside % 7 != 0).all()
     off = np.abs(street.p_map[inside, 1] - 0.3 * (street.p_map[inside, 0] - 5) - 0.07)
     assert 0 < off.max() < 0.6
 
@@ -148,19 +154,20 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(street: Path) -> Told:
+def told(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
     """Setting -> scan -> what the raw map and the refined one say of its points."""
     log = open_drive(street)
     segmenter = open_segmenter(
         f"labels:{street / 'truth' / 'train_ids'}", URBAN, expected_size=log.calibration.image_size
     )
-    result = pipeline.run(log, segmenter, config.Settings())
-    maps = (result.raw, result.refined)
+    folder, settings = tmp_path_factory.mktemp("run"), config.Settings()
+    mapped = pipeline.run(log, segmenter, settings, folder, folder / "work")
+    kerbs = pipeline.refine(folder, settings, mapped.stats).kerbs
+    maps = [tiles.open_map(folder / name) for name in ("map", "refined")]
+    moving = evidence.read(folder, URBAN).moving_points
     found = {
-        "on": label_points(
-            log, result.trajectory, maps, config.Settings(), result.evidence.moving, result.kerbs
-        ),
-        "off": label_points(log, result.trajectory, maps, config.Settings(), result.evidence.moving),
+        name: label_points(mapped.log, mapped.trajectory, maps, settings, moving, told_apart)
+        for name, told_apart in (("on", kerbs), ("off", None))
     }
     return {name: {scan.name: both for scan, both in scans} for name, scans in found.items()}
 

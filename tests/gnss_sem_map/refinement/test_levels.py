@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 from sklearn.linear_model import LinearRegression
+from surfaces import with_heights
 
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement import kerbs, levels
 from gnss_sem_map.refinement.levels import LevelSettings, split_levels
 from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable
-from gnss_sem_map.refinement.surface_heights import SurfaceHeights
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of
 
@@ -201,10 +201,8 @@ def test_states_say_where_a_label_comes_from() -> None:
 
 def state_of(semantic_map: SemanticMap, heights: Floats) -> MapState:
     """The map as the steps before left it."""
-    known = np.isfinite(heights)
-    keys, counts = semantic_map.voxels.keys[known], np.ones(known.sum(), np.int64)
-    beside = Evidence(surface_heights=SurfaceHeights(keys, heights[known], counts))
-    return replace(MapState.of(semantic_map.voxels, beside), decided=semantic_map)
+    voxels = with_heights(semantic_map.voxels, heights)
+    return replace(MapState.of(voxels, Evidence()), decided=replace(semantic_map, voxels=voxels))
 
 
 def test_steps_change_the_decision_and_mark_where_points_are_told_apart() -> None:
@@ -217,7 +215,8 @@ def test_steps_change_the_decision_and_mark_where_points_are_told_apart() -> Non
     found = kerbs.apply(after, kerbs.KerbSettings())
     assert found.kerbs is not None
     assert found.decided is not None
-    np.testing.assert_array_equal(found.decided.states == State.SPLIT, found.kerbs.rows >= 0)
+    split = found.decided.states == State.SPLIT
+    np.testing.assert_array_equal(found.decided.voxels.keys[split], found.kerbs.keys)
     for name in ("labels", "confidence"):
         np.testing.assert_array_equal(getattr(found.decided, name), getattr(after.decided, name))
 

@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.steps import RefinementSettings, refine
-from gnss_sem_map.refinement.systematic_error import MOST, doubted, systematic_errors
+from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.figures import MOST_SYSTEMATIC, systematic_errors
+from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.refinement.systematic_error import counted, doubted
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 URBAN = open_label_set("urban")
@@ -26,27 +28,27 @@ def test_two_witnesses_that_each_find_some_errors_tell_how_many_there_are(share,
     n, looks = 50_000, rng.integers(1, 50, 50_000).astype(np.float32)
     wrong = rng.random(n) < share
     found = [wrong & (rng.random(n) < chance) for chance in (first, second)]
-    estimate = systematic_errors(found[0], found[1], looks)
+    estimate = systematic_errors(counted(found[0], found[1], looks))
     drawn = looks[wrong].sum() / looks.sum()  # what there is to find: itself a draw around `share`
     # variance of Lincoln and Petersen's estimate, for voxels that weigh alike; looks that differ add a third
     spread = np.sqrt((1 - first) * (1 - second) / (n * share * first * second)) * np.sqrt(1.4)
     assert abs(estimate / drawn - 1) < 5 * spread + 0.01
-    assert systematic_errors(found[0], found[1], 7 * looks) == pytest.approx(estimate, rel=1e-4)
+    assert systematic_errors(counted(found[0], found[1], 7 * looks)) == pytest.approx(estimate, rel=1e-4)
 
 
 def test_a_place_counts_as_often_as_it_is_looked_at():
     wrong = np.arange(1000) < 100
-    assert systematic_errors(wrong, wrong, np.ones(1000)) == pytest.approx(0.1)
-    assert systematic_errors(wrong, wrong, np.where(wrong, 9.0, 1.0)) == pytest.approx(0.5)
-    assert systematic_errors(wrong, wrong, np.where(wrong, 1.0, 9.0)) == pytest.approx(100 / 8200)
+    assert systematic_errors(counted(wrong, wrong, np.ones(1000))) == pytest.approx(0.1)
+    assert systematic_errors(counted(wrong, wrong, np.where(wrong, 9.0, 1.0))) == pytest.approx(0.5)
+    assert systematic_errors(counted(wrong, wrong, np.where(wrong, 1.0, 9.0))) == pytest.approx(100 / 8200)
 
 
 def test_a_witness_alone_is_believed_no_witness_finds_nothing_and_no_estimate_passes_the_half():
     none, some = np.zeros(1000, np.bool_), np.arange(1000) < 30
-    assert systematic_errors(none, some, np.ones(1000)) == pytest.approx(0.03)
-    assert systematic_errors(none, none, np.ones(1000)) == 0
-    assert systematic_errors(none[:0], none[:0], np.ones(0)) == 0
-    assert systematic_errors(some, some[::-1], np.ones(1000)) == MOST
+    assert systematic_errors(counted(none, some, np.ones(1000))) == pytest.approx(0.03)
+    assert systematic_errors(counted(none, none, np.ones(1000))) == 0
+    assert systematic_errors(counted(none[:0], none[:0], np.ones(0))) == 0
+    assert systematic_errors(counted(some, some[::-1], np.ones(1000))) == MOST_SYSTEMATIC
 
 
 def test_doubt_keeps_the_order_of_classes_and_full_doubt_knows_nothing():

@@ -116,6 +116,24 @@ def test_a_box_gives_the_voxels_inside_and_opens_only_its_tiles(tmp_path: Path) 
         tiles.read(tmp_path / "map")
 
 
+@pytest.mark.parametrize("margin_m", [0.0, 3.3, 150.0])
+def test_around_a_tile_are_its_voxels_and_those_of_a_margin_on_disk_and_in_memory(
+    tmp_path: Path, margin_m: float
+) -> None:
+    written = random_map(count=20_000)
+    tiles.write(written, tmp_path / "map", FRAME)
+    margin = np.ceil(margin_m / written.voxels.voxel_size_m)
+    for opened in (tiles.open_map(tmp_path / "map", URBAN), tiles.in_memory(written, FRAME)):
+        np.testing.assert_array_equal(opened.whole().voxels.keys, written.voxels.keys)
+        for tile in opened.tiles:
+            low = np.array(tile) * 512 - margin
+            xy = written.voxels.indices[:, :2]
+            inside = ((xy >= low) & (xy < low + 512 + 2 * margin)).all(axis=1)
+            around = opened.around(tile, margin_m)
+            np.testing.assert_array_equal(around.voxels.keys, written.voxels.keys[inside])
+            np.testing.assert_array_equal(around.states, written.states[inside])
+
+
 def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:
     tiles.write(random_map(), tmp_path / "map", FRAME)
     path = sorted((tmp_path / "map").glob("*.parquet"))[2]

@@ -88,4 +88,10 @@ def test_run_is_checked_from_python_too(small_drive: Street, tmp_path: Path) -> 
     from gnss_sem_map.datasets import open_drive
 
     with pytest.raises(PreflightError, match="imu_axes"):
-        run(open_drive(upside_down(small_drive, tmp_path)), None, config.load())
+        run(
+            open_drive(upside_down(small_drive, tmp_path)),
+            None,
+            config.load(),
+            tmp_path / "out",
+            tmp_path / "work",
+        )

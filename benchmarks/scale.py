@@ -1,0 +1,261 @@
+"""Memory, time and disk of whole runs, short and long, on one process, two, and Dask; and whether bytes are the same.
+
+    python benchmarks/scale.py DRIVE PROBABILITIES [--work FOLDER] [--only memory reads ...]
+
+DRIVE is a long simulated drive in KITTI raw format (`gnss-sem-map simulate --seconds 600 --seed 7`), PROBABILITIES its
+class probabilities (`gnss-sem-map segment`). It is cut into shorter drives (`cut_drive.py`). Prints the figures and
+writes benchmarks/results/scale.json. Every run is a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from cut_drive import cut_all
+
+RESULTS = Path(__file__).parent / "results" / "scale.json"
+COUNT_READS = """
+import sys, threading
+counts, lock = {}, threading.Lock()
+def look(event, details):
+    if event == "open" and isinstance(details[0], str) and details[0].endswith(".bin"):
+        with lock:
+            counts[details[0]] = counts.get(details[0], 0) + 1
+sys.addaudithook(look)
+from gnss_sem_map.cli import main
+try:
+    main()
+finally:
+    import json
+    print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
+"""
+Figures = dict[str, Any]
+DASK = Path(sys.executable).with_name("dask")
+
+
+def run(words: Sequence[str | Path], *, program: str | None = None, threads: int | None = None) -> Figures:
+    """Run `gnss-sem-map` with these words: wall and CPU seconds, peak memory in MB, and what it said."""
+    command = [sys.executable, "-c", program] if program else [sys.executable, "-m", "gnss_sem_map.cli"]
+    environment = dict(os.environ)
+    if threads is not None:
+        environment |= {
+            name: str(threads) for name in ("GNSS_SEM_MAP_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
+        }
+    begun = time.perf_counter()
+    process = subprocess.Popen(
+        [*command, *map(str, words)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    assert process.stderr is not None
+    said = process.stderr.read()
+    _, status, used = os.wait4(process.pid, 0)
+    if os.waitstatus_to_exitcode(status) != 0:
+        raise SystemExit(f"{' '.join(map(str, words))}: {said}")
+    return {
+        "wall_s": time.perf_counter() - begun,
+        "cpu_s": used.ru_utime + used.ru_stime,
+        "peak_mb": used.ru_maxrss / 1024,
+        "said": said,
+    }
+
+
+def checksums(out: Path) -> dict[str, str]:
+    """Of all products that do not tell the time."""
+    told = {"run.json", "report.html", ".gnss-sem-map.json"}
+    return {
+        path.relative_to(out).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path.name not in told
+    }
+
+
+class Drives:
+    """The drives of the benchmark, cut from a long one when they are first needed."""
+
+    def __init__(self, drive: Path, probabilities: Path, work: Path) -> None:
+        self.drive, self.probabilities, self.work = drive, probabilities, work
+
+    def of(self, seconds: float) -> list[Path]:
+        """All drives of this length."""
+        folder = self.work / f"drives_{seconds:g}"
+        if not folder.exists():
+            cut_all(self.drive, self.probabilities, folder, seconds)
+        return sorted(folder.glob("*/*_sync"))
+
+    def words(self, drives: Sequence[Path], out: Path, *more: str | Path) -> list[str | Path]:
+        """A run of them."""
+        labels = f"labels:{drives[0].parents[1] / 'probabilities'}/{{drive}}"
+        if len(drives) == 1:
+            labels = labels.replace("{drive}", drives[0].name)
+        return ["run", *drives, "-o", out, "--segmenter", labels, "--force", *more]
+
+
+def memory(drives: Drives, out: Path) -> Figures:
+    """Peak memory and time of a short and of a long drive, one worker."""
+    found: Figures = {}
+    for seconds in (60, 480):
+        words = drives.words(drives.of(seconds)[:1], out / f"{seconds}", "--workers", "1")
+        figures = run(words)
+        about = json.loads((out / f"{seconds}" / "run.json").read_text())
+        found |= {
+            f"peak_mb_{seconds}_s": round(figures["peak_mb"]),
+            f"peak_mb_by_stage_{seconds}_s": about["peak_memory_mb"],
+            f"real_time_factor_{seconds}_s": seconds / figures["wall_s"],
+            f"cpu_ms_per_scan_{seconds}_s": 1000 * figures["cpu_s"] / about["counts"]["scans"],
+            f"seconds_by_stage_{seconds}_s": about["seconds"],
+            f"voxels_{seconds}_s": about["map"]["voxels"],
+        }
+    found["peak_480_over_60"] = found["peak_mb_480_s"] / found["peak_mb_60_s"]
+    return found
+
+
+def reads(drives: Drives, out: Path) -> Figures:
+    """How often a run opens the file of a scan."""
+    words = drives.words(drives.of(60)[:1], out / "reads", "--workers", "1")
+    told = run(words, program=COUNT_READS)["said"].rpartition("READS ")[2]
+    counts = json.loads(told)
+    return {"reads_of_a_scan_mean": sum(counts) / len(counts), "reads_of_a_scan_most": max(counts)}
+
+
+def disk(drives: Drives, out: Path) -> Figures:
+    """Bytes on disk of the layers of a map, per voxel."""
+    run(drives.words(drives.of(30)[:1], out / "disk", "--workers", "1"))
+    folder = out / "disk"
+    found: Figures = {}
+    for layer in ("map", "refined", "evidence/moved"):
+        voxels = json.loads((folder / layer / "map.json").read_text())["voxels"]
+        found[f"bytes_per_voxel_{layer}"] = _bytes_in(folder / layer) / max(voxels, 1)
+    found["bytes_per_second_keyframes"] = _bytes_in(folder / "evidence/keyframes") / 30
+    found["bytes_per_second_moving_points"] = _bytes_in(folder / "evidence/moving_points") / 30
+    return found
+
+
+def _bytes_in(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def refinement(drives: Drives, out: Path) -> Figures:
+    """Microseconds per voxel of a refinement alone, on one thread."""
+    run(drives.words(drives.of(30)[:1], out / "refined", "--workers", "1"))
+    program = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from tempfile import TemporaryDirectory\n"
+        "from gnss_sem_map import config, pipeline\n"
+        "from gnss_sem_map.labels.label_set import open_label_set\n"
+        "from gnss_sem_map.mapping.raw_map import open_raw\n"
+        "from gnss_sem_map.mapping.refining import refine_map\n"
+        "run = Path(sys.argv[1])\n"
+        "settings = config.load(run / 'config.yaml')\n"
+        "for again in range(2):\n"
+        "    with TemporaryDirectory() as folder:\n"
+        "        raw, begun = open_raw(run, open_label_set(settings.classes)), time.process_time()\n"
+        "        refine_map(raw, Path(folder), settings)\n"
+        "        took = time.process_time() - begun\n"
+        "print('TOOK', took, file=sys.stderr)\n"
+    )
+    told = run([out / "refined"], program=program, threads=1)["said"]
+    voxels = json.loads((out / "refined/map/map.json").read_text())["voxels"]
+    return {"refinement_us_per_voxel": 1e6 * float(told.rpartition("TOOK ")[2]) / voxels}
+
+
+def workers(drives: Drives, out: Path) -> Figures:
+    """Two processes over one, and Dask over processes; the same bytes from all."""
+    some = drives.of(30)[:2]
+    found, sums = {}, {}
+    for count in (1, 2):
+        figures = run(drives.words(some, out / f"workers{count}", "--workers", str(count)))
+        found[f"wall_s_{count}_workers"], sums[count] = figures["wall_s"], checksums(out / f"workers{count}")
+    with _dask(2) as (address, _):
+        figures = run(drives.words(some, out / "dask", "--scheduler", address))
+        found["wall_s_dask"], sums["dask"] = figures["wall_s"], checksums(out / "dask")
+    found["two_workers_over_one"] = found["wall_s_1_workers"] / found["wall_s_2_workers"]
+    found["dask_over_processes"] = found["wall_s_2_workers"] / found["wall_s_dask"]
+    found["same_bytes"] = sums[1] == sums[2] == sums["dask"]
+    return found
+
+
+def twenty(drives: Drives, out: Path) -> Figures:
+    """Twenty drives, one map: one process, two processes, and Dask with a worker killed on the way."""
+    some, sums, found = drives.of(30)[:20], [], {"drives": len(drives.of(30)[:20])}
+    for count in (1, 2):
+        run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        sums.append(checksums(out / f"twenty{count}"))
+    with _dask(2) as (address, processes):
+        killer = subprocess.Popen(["sh", "-c", f"sleep 60; pkill -KILL -P {processes[1].pid}"])
+        run(drives.words(some, out / "twenty_dask", "--scheduler", address))
+        sums.append(checksums(out / "twenty_dask"))
+        killer.wait()
+    return found | {"twenty_same_bytes": sums[0] == sums[1] == sums[2], "files": len(sums[0])}
+
+
+@contextmanager
+def _dask(count: int) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
+    """A scheduler and workers, each in a process of its own with one thread."""
+    address = "tcp://127.0.0.1:8786"
+    words = (
+        ["scheduler", "--port", "8786", "--no-dashboard"],
+        *[["worker", address, "--nthreads", "1", "--no-dashboard"]] * count,
+    )
+    quiet = subprocess.DEVNULL
+    processes = [
+        subprocess.Popen([DASK, *each], stdout=quiet, stderr=quiet, text=True, start_new_session=True)
+        for each in words
+    ]
+    try:
+        time.sleep(5)
+        yield address, processes
+    finally:
+        for process in processes:
+            os.killpg(process.pid, signal.SIGTERM)
+            process.wait()
+
+
+CASES: dict[str, Callable[[Drives, Path], Figures]] = {
+    one.__name__: one for one in (memory, reads, disk, refinement, workers, twenty)
+}
+
+
+def main() -> None:
+    """All cases, or those that are asked for; figures of the others stay as they are."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("drive", type=Path)
+    parser.add_argument("probabilities", type=Path)
+    parser.add_argument("--work", type=Path)
+    parser.add_argument("--only", nargs="*", choices=sorted(CASES), default=sorted(CASES))
+    given = parser.parse_args()
+    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    with tempfile.TemporaryDirectory() as temporary:
+        work = given.work or Path(temporary)
+        drives = Drives(given.drive.resolve(), given.probabilities.resolve(), work)
+        for name in given.only:
+            with tempfile.TemporaryDirectory(dir=work) as out:
+                known[name] = CASES[name](drives, Path(out))
+            print(name, json.dumps(known[name], indent=1), flush=True)
+            known["machine"] = {
+                "cores": os.cpu_count(),
+                "python": platform.python_version(),
+                "gnss-sem-map": version("gnss-sem-map"),
+            }
+            RESULTS.write_text(json.dumps(known, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

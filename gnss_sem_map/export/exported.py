@@ -1,0 +1,101 @@
+"""What is exported: a map in tiles, and what of the whole map must be known before its first tile is written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import TiledMap
+
+NO_VOXELS = "the map has no voxels to draw; run.json lists what was skipped"
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """A refined map and what its files say beside it."""
+
+    map: TiledMap
+    driven: Trajectory | None = None
+    """The track from which pictures show the map."""
+    title: str | None = None
+
+    @cached_property
+    def extent(self) -> Extent:
+        """Reads every tile once."""
+        return Extent.of(self.map)
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """Which voxels files show, and how far these reach.
+
+    `drawable` voxels may be seen in a picture, `visible` ones define where it ends.
+    """
+
+    has_standing: bool
+    """Whether any voxel was not removed; if not, the removed ones are shown."""
+    has_labels: bool
+    """Whether any of those has a label; if not, all of them are visible."""
+    labels: NDArray[np.int64]
+    """(c + 1,) drawable voxels of every class, and those without."""
+    count: int
+    """Visible voxels."""
+    low: NDArray[np.int64]
+    """(3,) lowest index of the visible voxels along each axis."""
+    high: NDArray[np.int64]
+    """(3,) highest index."""
+    mean: NDArray[np.float64]
+    """(3,) mean index."""
+
+    @classmethod
+    def of(cls, tiled_map: TiledMap) -> Extent:
+        classes = len(tiled_map.label_set.names)
+        labelled, standing, removed = _Sums(classes), _Sums(classes), _Sums(classes)
+        for piece in tiled_map:
+            was_removed = piece.states == State.REMOVED
+            indices = piece.voxels.indices
+            for sums, chosen in ((labelled, piece.shown), (standing, ~was_removed), (removed, was_removed)):
+                sums.add(indices[chosen], piece.labels[chosen])
+        drawable = standing if standing.count else removed
+        visible = labelled if labelled.count else drawable
+        return cls(
+            has_standing=standing.count > 0,
+            has_labels=labelled.count > 0,
+            labels=drawable.labels,
+            count=visible.count,
+            low=visible.low,
+            high=visible.high,
+            mean=visible.total / max(visible.count, 1),
+        )
+
+    def drawable(self, piece: SemanticMap) -> NDArray[np.bool_]:
+        """Voxels that a picture may show: all but the removed ones, or the removed ones if there are no others."""
+        return np.asarray((piece.states != State.REMOVED) == self.has_standing)
+
+    def visible(self, piece: SemanticMap) -> NDArray[np.bool_]:
+        """Voxels that define where a picture ends: the labelled ones, or all drawable ones in a map without labels."""
+        return piece.shown if self.has_labels else self.drawable(piece)
+
+
+class _Sums:
+    """Number, bounds and labels of voxels."""
+
+    def __init__(self, classes: int) -> None:
+        self.count = 0
+        self.low, self.high = np.full(3, 1 << 40, np.int64), np.full(3, -(1 << 40), np.int64)
+        self.total = np.zeros(3, np.int64)
+        self.labels = np.zeros(classes + 1, np.int64)
+
+    def add(self, indices: NDArray[np.int32], labels: NDArray[np.int8]) -> None:
+        if not len(labels):
+            return
+        self.count += len(labels)
+        self.low = np.minimum(self.low, indices.min(axis=0))
+        self.high = np.maximum(self.high, indices.max(axis=0))
+        self.total += indices.sum(axis=0, dtype=np.int64)
+        self.labels += np.roll(np.bincount(labels + 1, minlength=len(self.labels)), -1)

@@ -1,0 +1,175 @@
+"""One pass over the scans of a drive, chunk by chunk: all points are fused, and those that moved are subtracted.
+
+A chunk is two windows of scans (`dynamics.window_scans`). What moved in it is decided by its own scans, the range
+images of a window of scans before it, and the segments of a window of scans after it. So no chunk depends on what was
+decided elsewhere: the map is the same for any division of the chunks among processes, and after any interruption.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.config import Settings
+from gnss_sem_map.dynamics.motion_state import TrackedObject
+from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, decide, moved_points
+from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSelector, RangeImage
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_scan
+from gnss_sem_map.mapping.moving_points import observe_scan, range_images
+from gnss_sem_map.mapping.waiting_points import WaitingPoints
+from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.sensor_log import Scan
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
+
+WINDOWS = 2
+"""Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed."""
+
+
+@dataclass(frozen=True, eq=False)
+class MappedChunk:
+    """What one chunk of scans says."""
+
+    number: int
+    static: VoxelMap
+    removed: VoxelMap
+    """The points that moved; none of them is in `static`."""
+    moving: Mapping[int, NDArray[np.int64]]
+    """Frame number -> indices of the points that moved among the usable points of the scan."""
+    objects: tuple[TrackedObject, ...]
+    """Those that are first seen in this chunk."""
+    keyframes: KeyframeScans | None
+    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
+    stats: RunStats
+    """Its counts and skips."""
+
+
+def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
+    """The scans of every chunk; the last one has up to a window more, so that every other has a window after it."""
+    scans, window = drive.log.scans, drive.settings.dynamics.window_scans
+    count = 1 + max(0, len(scans) - window) // (WINDOWS * window)
+    edges = [*range(0, count * WINDOWS * window, WINDOWS * window), len(scans)]
+    return [scans[start:end] for start, end in pairwise(edges)]
+
+
+def map_chunks(
+    drive: Drive, numbers: range, folder: Path, progress: Progress = silent
+) -> Iterator[MappedChunk]:
+    """Map consecutive chunks; each scan of them is read once. `folder` is for points that wait for a decision.
+
+    Raises DataError when the stamps of the scans do not increase, or `folder` cannot be written.
+    """
+    chunks, window = chunks_of(drive), drive.settings.dynamics.window_scans
+    start = sum(map(len, chunks[: numbers.start]))
+    total = sum(len(chunks[number]) for number in numbers)
+    is_sought = drive.settings.dynamics.enabled
+    before = range_images(drive, drive.log.scans[max(start - window, 0) : start]) if is_sought else []
+    undecided: _Chunk | None = None
+    done = 0
+    for number in numbers:
+        chunk = _Chunk(drive, number, folder)
+        for place, seen in enumerate(_observed(drive, chunks[number], chunk.stats), 1):
+            if seen is not None:
+                chunk.add(*seen)
+            if undecided is not None and place == window:
+                yield undecided.decided(before, chunk.observations)
+                before, undecided = undecided.last_images(window), None
+            done += 1
+            progress("mapping", done, total)
+        undecided = chunk
+    if undecided is not None:
+        after = chunks[numbers.stop][:window] if numbers.stop < len(chunks) and is_sought else []
+        yield undecided.decided(before, _observations(drive, after))
+
+
+Seen = tuple[LabelledScan, tuple[Observation, NearPoints] | None]
+
+
+def _observed(drive: Drive, scans: Sequence[Scan], stats: RunStats) -> Iterator[Seen | None]:
+    """Every scan, with what it tells of motion if that is sought; None for one that cannot be used."""
+    is_sought = drive.settings.dynamics.enabled
+    labelled = label_each_scan(drive, scans, stats, keep_points=is_sought)
+    if not is_sought:
+        return (None if seen is None else (seen, None) for seen in labelled)
+    observing = prefetch(lambda seen: None if seen is None else observe_scan(seen), labelled, THREADS)
+    return (None if seen is None else (seen, observed) for seen, observed in observing)
+
+
+def _observations(drive: Drive, scans: Sequence[Scan]) -> list[Observation]:
+    """What scans of another chunk tell of motion; they are counted there."""
+    seen = _observed(drive, scans, RunStats())
+    return [one[1][0] for one in seen if one is not None and one[1] is not None]
+
+
+class _Chunk:
+    """A chunk under way: its points in a table, and those that may have moved on disk."""
+
+    def __init__(self, drive: Drive, number: int, folder: Path) -> None:
+        self._drive, self._number, self._folder = drive, number, folder
+        self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
+        self.observations: list[Observation] = []
+        self.stats = RunStats()
+
+    def add(self, seen: LabelledScan, observed: tuple[Observation, NearPoints] | None) -> None:
+        self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)
+        if observed is None:
+            return
+        observation, near = observed
+        try:
+            WaitingPoints.of(seen, near).write(self._waiting(observation.number))
+        except OSError as error:
+            raise DataError(
+                f"{self._folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+            ) from None
+        self._keyframes.add(observation.stamp, observation.seen)
+        self.observations.append(observation)
+
+    def decided(self, before: Sequence[RangeImage], after: Sequence[Observation]) -> MappedChunk:
+        """The chunk, once the scans before and after it are known."""
+        settings, count = self._drive.settings, len(self.observations)
+        decision = decide(
+            [*self.observations, *after], count, before, settings.dynamics, self._drive.from_lidar_odometry
+        )
+
+        def taken(place: int) -> tuple[WaitingPoints, NDArray[np.bool_]]:
+            points = WaitingPoints.take(self._waiting(self.observations[place].number))
+            return points, moved_points(points.near, decision.moved[place], settings.dynamics.grow_m)
+
+        removed, moving = new_table(settings), {}
+        for place, (points, moved) in prefetch(taken, range(count), THREADS):
+            removed.add(points.keys[moved], points.pixels[moved], points.classes, points.heights[moved])
+            moving[self.observations[place].number] = points.near.indices[moved].astype(np.int64)
+        gone = removed.to_map()
+        self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
+        keyframes = self._keyframes.keyframes() if self._drive.from_lidar_odometry else None
+        static = self._all.to_map() - gone
+        return MappedChunk(self._number, static, gone, moving, decision.objects, keyframes, self.stats)
+
+    def last_images(self, window: int) -> list[RangeImage]:
+        """Range images of the last `window` scans."""
+        last = {scan.number for scan in chunks_of(self._drive)[self._number][-window:]}
+        return [one.seen for one in self.observations if one.number in last]
+
+    def _waiting(self, number: int) -> Path:
+        return self._folder / f"{number}.npy"
+
+
+def new_table(settings: Settings) -> VoxelTable:
+    """An empty table for the points of a drive."""
+    label_set = open_label_set(settings.classes)
+    calibration = sensor_model.opened(settings.calibration, label_set)
+    return VoxelTable(
+        settings.mapping.voxel_size_m,
+        label_set,
+        settings.labelling.probability_floor,
+        None if calibration is None else calibration.log_likelihoods,
+        settings.labelling.abstain,
+    )

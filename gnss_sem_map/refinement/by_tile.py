@@ -1,0 +1,208 @@
+"""Refinement tile by tile: a tile is refined from its voxels, those in a halo around it, and figures of the whole map.
+
+A map is refined in two passes. The first adds up `sums_of` every tile, in any order; `figures_of` the sums are what a
+tile must know of the whole map. The second refines every tile for itself. All maps are refined so, those in memory
+too: what comes out depends neither on the order of the tiles nor on who refines which.
+
+Before a step, the tile is cut down to what this step and the later ones reach. So the steps see the same in a map of
+any size, and the work in the halo shrinks from step to step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.refinement import (
+    count_grid,
+    geometric_prior,
+    height_above_ground,
+    kerb_points,
+    systematic_error,
+    vehicles,
+)
+from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
+from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, VehicleObject
+from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings, do
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tiles import TILE_BITS, Tile, joined, joined_voxels
+from gnss_sem_map.voxels.voxel_map import VoxelMap, unpack
+
+WORTH_CUTTING_M = 2.0
+"""The halo is cut down by no less than this at a time: cutting is work, too."""
+
+
+def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
+    """How far around a tile voxels are read, m: for its height over ground, and for all steps or for the sums."""
+    reaches = _reach_from(0, settings, voxel_size_m), _sums_reach_m(settings, voxel_size_m)
+    return height_above_ground.REACH_M + max(reaches)
+
+
+def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
+    """What a tile adds to the figures of the whole map, from the voxels of the tile and its halo."""
+    reach = _sums_reach_m(settings, around.voxel_size_m)
+    state = MapState.of(around[_places(around, tile, reach + height_above_ground.REACH_M)], beside)
+    state = state[_places(state.voxels, tile, reach)]
+    state, _ = do(STEPS[0], state, settings)
+    images = state.scores
+    state, _ = do(STEPS[1], state, settings)
+    own, sums = _inside(state.voxels, tile), Sums()
+    measured = (
+        (
+            settings.systematic_error,
+            lambda: systematic_error.measure(state, images, settings.systematic_error, own),
+        ),
+        (settings.count_grid, lambda: count_grid.measure(state, settings.count_grid, own)),
+        (settings.vehicles, lambda: vehicles.measure(state, settings.vehicles, own)),
+    )
+    for section, measure in measured:
+        try:
+            sums += measure() if section.enabled else Sums()
+        except NotApplicable:
+            continue  # the step will say so
+    return sums
+
+
+def refine_tile(
+    tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings, figures: Figures
+) -> tuple[MapState, RefinementReport]:
+    """Refine a tile, from the static voxels of the tile and of its halo: the last state of the tile alone, decided.
+
+    Of what is `around` and `beside` the tile there may be more than its halo. The report counts changes and objects of
+    the tile alone; reports of tiles add up.
+    """
+    size, halo, reports = around.voxel_size_m, halo_m(settings, around.voxel_size_m), []
+    if beside.moved is not None:
+        beside = replace(beside, moved=beside.moved[_places(beside.moved, tile, 0)])
+    state = MapState.of(around[_places(around, tile, halo)], beside, figures)
+    own = _inside(state.voxels, tile)
+    for i, step in enumerate(STEPS):
+        needed = _reach_from(i, settings, size)
+        if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
+            state, halo = state[_places(state.voxels, tile, needed)], needed
+            own = _inside(state.voxels, tile)
+        state, report = do(step, state, settings, own if halo else slice(None))
+        reports.append(report)
+    assert state.decided is not None
+    state = replace(state, vehicles=tuple(thing for thing in state.vehicles if _holds(tile, thing, size)))
+    return state, RefinementReport(tuple(reports), state.vehicles, systematic_errors=state.systematic_error)
+
+
+def refine(
+    voxels: VoxelMap, settings: RefinementSettings | None = None, beside: Evidence | None = None
+) -> tuple[SemanticMap, RefinementReport]:
+    """Refine a map in memory; no voxel is deleted, and what no camera saw stays unlabelled unless it is inferred."""
+    state, report = run_steps(voxels, settings, beside)
+    assert state.decided is not None
+    return state.decided, report
+
+
+def run_steps(
+    voxels: VoxelMap, settings: RefinementSettings | None = None, beside: Evidence | None = None
+) -> tuple[MapState, RefinementReport]:
+    """Refine a map in memory, tile by tile: the last state, decided, and what each step changed."""
+    settings, beside = settings or RefinementSettings(), beside or Evidence()
+    tiles = tiles_of(voxels, *([] if beside.moved is None else [beside.moved])) or [(0, 0)]
+    sums = sum((sums_of(tile, voxels, beside, settings) for tile in tiles), Sums())
+    figures = figures_of(sums)
+    parts = [refine_tile(tile, voxels, beside, settings, figures) for tile in tiles]
+    report = reduce(add, (report for _, report in parts))
+    return replace(_joined([state for state, _ in parts]), vehicles=report.objects), report
+
+
+def tiles_of(*maps: VoxelMap) -> list[Tile]:
+    """The tiles in which one of the maps has a voxel, in order."""
+    columns = np.unique(
+        np.concatenate([unpack(_first_of_tiles(voxels.keys))[:, :2] for voxels in maps]), axis=0
+    )
+    return [(x, y) for x, y in np.unique(columns >> TILE_BITS, axis=0).tolist()]
+
+
+def _first_of_tiles(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of the sorted packed voxels those whose tile is not that of the one before."""
+    x, y = keys >> (2 * AXIS_BITS + TILE_BITS), keys >> (AXIS_BITS + TILE_BITS)
+    changes = np.ones(len(keys), np.bool_)
+    changes[1:] = (np.diff(x) != 0) | (np.diff(y) != 0)
+    return keys[changes]
+
+
+def _sums_reach_m(settings: RefinementSettings, voxel_size_m: float) -> float:
+    measured = (
+        systematic_error.measure_reach_m(voxel_size_m),
+        count_grid.reach_m(settings.count_grid, voxel_size_m),
+    )
+    return geometric_prior.reach_m(settings.geometric_prior, voxel_size_m) + max(measured)
+
+
+def _reach_from(first: int, settings: RefinementSettings, voxel_size_m: float) -> float:
+    """How far a step and those after it reach, of those that are switched on."""
+    reaches = ((step.settings(settings), step.reach_m) for step in STEPS[first:])
+    return sum((reach(section, voxel_size_m) for section, reach in reaches if section.enabled), 0.0)
+
+
+def _places(voxels: VoxelMap, tile: Tile, margin_m: float) -> NDArray[np.int64]:
+    """The places of the voxels of a tile and of a margin around it."""
+    low_x, high_x, low_y, high_y = _limits(tile, math.ceil(margin_m / voxels.voxel_size_m))
+    start, end = np.searchsorted(voxels.keys, [low_x << 2 * AXIS_BITS, high_x << 2 * AXIS_BITS])
+    y = voxels.keys[start:end] >> AXIS_BITS & AXIS_MASK
+    return np.asarray(np.flatnonzero((y >= low_y) & (y < high_y)) + start, np.int64)
+
+
+def _inside(voxels: VoxelMap, tile: Tile) -> NDArray[np.bool_]:
+    """Which voxels (v,) lie in a tile."""
+    inside = np.zeros(len(voxels), np.bool_)
+    inside[_places(voxels, tile, 0)] = True
+    return inside
+
+
+def _limits(tile: Tile, margin_voxels: int) -> tuple[int, int, int, int]:
+    """First and past the last column in x and in y of a tile and its margin, in the numbers of packed keys."""
+    (x, y), edge = tile, 1 << TILE_BITS
+    low_x, low_y = (AXIS_OFFSET + axis * edge - margin_voxels for axis in (x, y))
+    return low_x, low_x + edge + 2 * margin_voxels, low_y, low_y + edge + 2 * margin_voxels
+
+
+def _holds(tile: Tile, thing: VehicleObject, voxel_size_m: float) -> bool:
+    """Whether the centre of an object lies in a tile."""
+    return tuple(np.floor(thing.centre[:2] / voxel_size_m / (1 << TILE_BITS)).tolist()) == tile
+
+
+def _joined(parts: Sequence[MapState]) -> MapState:
+    """The state of a map, of those of its tiles."""
+    if len(parts) == 1:
+        return parts[0]
+    keys = np.concatenate([part.voxels.keys for part in parts])
+    order = np.argsort(keys, kind="stable")  # quick: sorted parts
+
+    def column(of: Callable[[MapState], NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate([of(part) for part in parts])[order]
+
+    first = parts[0].voxels
+    voxels = joined_voxels([part.voxels for part in parts], first.voxel_size_m, first.label_set)
+    return replace(
+        parts[0],
+        voxels=voxels,
+        heights=column(lambda part: part.heights),
+        scores=column(lambda part: part.scores),
+        removed=column(lambda part: part.removed),
+        inferred=column(lambda part: part.inferred),
+        kerbs=kerb_points.joined([part.kerbs for part in parts if part.kerbs is not None]),
+        decided=_map_of([part.decided for part in parts if part.decided is not None]),
+    )
+
+
+def _map_of(parts: Sequence[SemanticMap]) -> SemanticMap:
+    voxels = parts[0].voxels
+    order = np.argsort(np.concatenate([part.voxels.keys for part in parts]), kind="stable")
+    entropy = [part.entropy for part in parts if part.entropy is not None]
+    return replace(
+        joined(parts, voxels.voxel_size_m, voxels.label_set), entropy=np.concatenate(entropy)[order]
+    )

@@ -1,0 +1,312 @@
+"""Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
+
+OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive
+OUT/map, ...        their sum, refined and exported as the map of one drive is
+
+Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once.
+A drive is a task of `mapping.execution`: the name of a function, paths and settings.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from factor_graphs.errors import FactorGraphError
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.files import ownership, work_folder
+from gnss_sem_map.files.atomic import link_or_copy
+from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
+from gnss_sem_map.files.run_json import inputs_of, read_run
+from gnss_sem_map.files.untrusted import is_file, is_folder, shown
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.dask_cluster import Cluster
+from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
+from gnss_sem_map.mapping.raw_map import DRIVES, MAP, write_sum
+from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.segmentation import open_segmenter
+from gnss_sem_map.voxels import tiles
+
+SETTINGS = "config.yaml"
+LONGEST_DRIVE_S = 86_400.0
+"""A worker that maps one drive for longer is replaced."""
+OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
+"""Files of a drive beside its map, evidence and trajectory."""
+
+
+@dataclass(frozen=True)
+class HowMapped:
+    """What is the same for all drives; `{drive}` in the segmenter stands for the name of the drive."""
+
+    segmenter: str | None = "none"
+    frames: str | None = None
+    drive_format: str | None = None
+    device: str = "auto"
+    force: bool = False
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class ManyDrives:
+    """The drives of a map, and those that failed."""
+
+    folder: Path
+    about: dict[str, Any]
+    """The content of run.json."""
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Name -> reason of the drives that were left out of this run."""
+        return dict(self.about["failed"])
+
+
+def run_drives(
+    drives: Sequence[Path],
+    out: Path,
+    settings: Settings,
+    how: HowMapped,
+    *,
+    origin: LocalFrame | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Progress = silent,
+) -> ManyDrives:
+    """Map several drives into one map, in the frame `origin`, by default that of the first drive.
+
+    Drives are shared among `workers` processes, or the workers of the Dask scheduler at the address `scheduler`.
+    A drive that fails is left out, and named in run.json. Raises DataError when all fail, when two drives have one
+    name or are the same, or the first has no georeference.
+    """
+    drives = [_absolute(drive) for drive in drives]
+    _check_distinct([(drive.name, drive) for drive in drives])
+    with run_folder.claimed_run(out, drives) as claim:
+        frame = origin or _frame_of(drives, how.drive_format)
+        failed = _map_all(drives, claim, settings, how, frame, _executor(workers, scheduler, claim), progress)
+        names = [drive.name for drive in drives if drive.name not in failed]
+        done = {name: claim.work / DRIVES / name for name in names}
+        if not done:
+            raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
+        about = _write(out, done, settings, frame, failed, progress)
+    return ManyDrives(out, about)
+
+
+def add_drive(
+    out: Path,
+    drive: Path,
+    how: HowMapped,
+    *,
+    progress: Progress = silent,
+) -> ManyDrives:
+    """Add a drive to a finished map, with its settings and in its frame; raises DataError when the drive fails."""
+    settings, frame, there = _opened(out)
+    drive = _absolute(drive)
+    known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
+    _check_distinct([*known, (drive.name, drive)])
+    with run_folder.claimed_run(out, [drive]) as claim:
+        failed = _map_all([drive], claim, settings, how, frame, InProcess(), progress)
+        if failed:
+            raise DataError(f"{out}: stays as it was; {_first(failed)}")
+        added = {drive.name: claim.work / DRIVES / drive.name}
+        about = _write(out, there | added, settings, frame, {}, progress)
+    return ManyDrives(out, about)
+
+
+def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrives:
+    """Take a drive out of a finished map; raises DataError when it is not there, or the only one."""
+    settings, frame, there = _opened(out)
+    stay = {known: folder for known, folder in there.items() if known != name}
+    if len(stay) == len(there):
+        raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
+    if not stay:
+        raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
+    with run_folder.claimed_run(out):
+        about = _write(out, stay, settings, frame, {}, progress)
+    return ManyDrives(out, about)
+
+
+def map_one(drive: str, folder: str, settings: str, origin: Sequence[float], how: Mapping[str, Any]) -> str:
+    """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
+    try:
+        _map_one(Path(drive), Path(folder), Path(settings), LocalFrame(*origin), HowMapped(**how))
+    except (SemMapError, FactorGraphError) as error:
+        return str(error)
+    return ""
+
+
+def _map_one(drive: Path, folder: Path, file: Path, frame: LocalFrame, how: HowMapped) -> None:
+    settings = config.load(file)
+    spec = run_folder.segmenter_of(drive, how.segmenter)
+    inputs = run_folder.inputs_of_run(drive, spec, how.frames)
+    if _is_done(folder, settings, inputs, frame):  # what is not to be used was removed before the first task
+        return
+    with run_folder.claimed_run(folder, run_folder.places_read(drive, settings, spec)) as claim:
+        log = open_drive(drive, how.drive_format).between(how.frames)
+        refuse_inputs(claim.out, sorted(log.folders))
+        network = None
+        if spec not in (None, "none"):
+            label_set = open_label_set(settings.classes)
+            network = open_segmenter(str(spec), label_set, how.device, log.calibration.image_size)
+        with new_folder(folder) as part:
+            mapped = pipeline.run(
+                log, network, settings, part, claim.work,
+                origin=frame, resume=True, labels_from=str(spec), force=how.force,
+            )  # fmt: skip
+            run_folder.write_drive(part, drive, mapped, settings, inputs)
+
+
+def _is_done(folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame) -> bool:
+    """Whether a folder holds this drive, mapped from the same inputs in the same way."""
+    if not is_file(folder / "run.json"):
+        return False
+    try:
+        about = read_run(folder)
+        same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
+        return bool(same and config.load(folder / SETTINGS) == settings)
+    except (SemMapError, KeyError):
+        return False
+
+
+def _executor(workers: int, scheduler: str | None, claim: Claim) -> Executor:
+    if scheduler is not None:
+        return Cluster(scheduler, claim.work, timeout_s=LONGEST_DRIVE_S)
+    return Processes(workers, timeout_s=LONGEST_DRIVE_S) if workers > 1 else InProcess()
+
+
+def _map_all(
+    drives: Sequence[Path],
+    claim: Claim,
+    settings: Settings,
+    how: HowMapped,
+    frame: LocalFrame,
+    executor: Executor,
+    progress: Progress,
+) -> dict[str, str]:
+    """Map every drive into the work folder; name -> reason of those that fail."""
+    if not how.resume:
+        work_folder.remove_drives(claim.work)
+    work_folder.make(claim.work)
+    (claim.work / DRIVES).mkdir(exist_ok=True)
+    file = claim.work / DRIVES / SETTINGS
+    file.write_text(settings.to_yaml(), "utf-8")
+    origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
+    tasks = [
+        Task(
+            drive.name,
+            "gnss_sem_map.runs.many_drives:map_one",
+            (str(drive), str(claim.work / DRIVES / drive.name), str(file), origin, asdict(how)),
+        )
+        for drive in drives
+    ]
+    found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total))
+    return {task.name: reason for task, reason in found if reason}
+
+
+def _write(
+    out: Path,
+    drives: Mapping[str, Path],
+    settings: Settings,
+    frame: LocalFrame,
+    failed: Mapping[str, str],
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the map of these drives, whose folders are linked into it."""
+    stats = RunStats()
+    with new_folder(out) as folder:
+        parts = [folder / DRIVES / name for name in sorted(drives)]
+        for part in parts:
+            _link_all(drives[part.name], part)
+        with stats.stage("mapping"):
+            write_sum(parts, folder, frame, open_label_set(settings.classes), out)
+        refined = pipeline.refine(folder, settings, stats, progress, out)
+        about = {
+            "name": " + ".join(part.name for part in parts),
+            "merged": [part.name for part in parts],
+            "failed": dict(failed),
+            "local_frame": asdict(frame),
+            "map": run_folder.about_map(folder, refined.report),
+        }
+        write_merged(folder, parts[0] / "trajectory.parquet", settings, about)
+    return about
+
+
+def _link_all(drive: Path, part: Path) -> None:
+    """Link what belongs to one drive, out of its own folder or out of a run of this drive alone."""
+    part.mkdir(parents=True)
+    for name in (MAP, evidence.FOLDER):
+        ignore = shutil.ignore_patterns(ownership.MARKER)
+        shutil.copytree(drive / name, part / name, copy_function=link_or_copy, ignore=ignore)
+    for file in (*drive.glob("trajectory*"), *(drive / name for name in OF_ONE_DRIVE)):
+        link_or_copy(file, part / file.name)
+
+
+def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
+    """Settings, frame and drives of a finished map, which may be that of one drive; raises DataError."""
+    about, settings = read_run(out), config.load(out / SETTINGS)
+    frame = tiles.read_frame(out / MAP)
+    if frame is None:
+        raise DataError(f"{shown(out)}: its map has no georeference, so no other drive fits to it")
+    if is_folder(out / DRIVES):
+        return settings, frame, {path.name: path for path in sorted((out / DRIVES).iterdir())}
+    if "merged" in about:
+        raise DataError(
+            f"{shown(out)}: was merged by `merge` and keeps no drives; expected a map of `gnss-sem-map run`"
+        )
+    name = about.get("drive")
+    if not isinstance(name, str) or Path(name).name != name or name in ("", ".."):
+        raise DataError(f"{shown(out / 'run.json')}: damaged (drive: found {name!r}, expected a name)")
+    return settings, frame, {name: out}
+
+
+def _absolute(drive: Path) -> Path:
+    """The folder of a drive under the name that was given, links included; that of `.` is the current folder."""
+    return Path(os.path.abspath(drive))
+
+
+def _check_distinct(drives: Sequence[tuple[str, Path]]) -> None:
+    """Raise DataError when two drives, each a name and its folder, have one name, or are one."""
+    names: set[str] = set()
+    places: dict[Path, str] = {}
+    for name, folder in drives:
+        if name in names:
+            raise DataError(
+                f"{folder}: two drives have the name {name}, and all evidence of one drive counts once; leave one out,"
+                " or give the other a name of its own"
+            )
+        place = folder.resolve()
+        if place in places:
+            raise DataError(
+                f"{folder}: is the drive {places[place]}, whose evidence counts once; leave one of them out"
+            )
+        names.add(name)
+        places[place] = name
+
+
+def _frame_of(drives: Sequence[Path], drive_format: str | None) -> LocalFrame:
+    """The frame of the first drive that can be read and has one."""
+    for drive in drives:
+        try:
+            frame = open_drive(drive, drive_format).frame
+        except (SemMapError, FactorGraphError):
+            continue  # its own task says why
+        if frame is not None:
+            return frame
+    raise DataError(
+        f"{drives[0]}: neither it nor another drive has a georeference; expected drives with GNSS"
+    )
+
+
+def _first(failed: Mapping[str, str]) -> str:
+    name, reason = next(iter(failed.items()))
+    return f"{name}: {reason}"

@@ -1,0 +1,235 @@
+"""A map that changes in one place is refined again there, and nobody can tell it from one refined from scratch."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from long_street import keyframes, street
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import evidence, refining
+from gnss_sem_map.mapping.raw_map import open_raw, write_sum
+from gnss_sem_map.mapping.refining import Refined, refine_map
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tiles import Tile
+from gnss_sem_map.voxels.voxel_map import VoxelMap
+
+FRAME = LocalFrame(49.011, 8.423, 112.0)
+VOXELS = street()
+MOVED = VOXELS[np.flatnonzero(VOXELS.centres[:, 0] > 350.0)[::9]]
+"""Of the fourth tile and those after it."""
+EVERY = [(x, 0) for x in range(7)]
+SETTINGS = Settings()
+WITHOUT_FREE_SPACE = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
+
+
+def write_raw(
+    run: Path,
+    voxels: VoxelMap = VOXELS,
+    scans: bool = False,
+    moved: VoxelMap = MOVED,
+    frame: LocalFrame = FRAME,
+) -> Path:
+    """The raw map of a run folder, and its evidence, with or without keyframe scans between x = 325 and 350 m."""
+    tiles.write(SemanticMap.of(voxels), run / "map", frame)
+    tiles.write(SemanticMap.of(moved), run / "evidence" / "moved", frame)
+    file = io.BytesIO()
+    evidence.write_keyframes(keyframes(), file)
+    evidence.write([], [file.getvalue()] if scans else [], run)
+    return run
+
+
+def seen_again(voxels: VoxelMap, tile: Tile) -> VoxelMap:
+    """The same map with 40 voxels of a tile seen once more."""
+    inside = (voxels.indices[:, :2] >> tiles.TILE_BITS == tile).all(axis=1)
+    more = np.zeros(len(voxels), np.uint32)
+    more[np.flatnonzero(inside)[1000:1040]] = 1
+    return replace(
+        voxels, hits=voxels.hits + more, evidence=voxels.evidence - 7 * more[:, None].astype(np.int32)
+    )
+
+
+@pytest.fixture
+def refine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Refined, list[Tile]]]:
+    """Refine a run folder; also says which tiles were refined for it, in order."""
+
+    def refined(
+        run: Path, earlier: Path | None = None, settings: Settings = SETTINGS
+    ) -> tuple[Refined, list[Tile]]:
+        called, original = [], refining.refine_tile
+
+        def watched(tile: Tile, *rest: Any) -> Any:
+            called.append(tile)
+            return original(tile, *rest)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(refining, "refine_tile", watched)
+            found = refine_map(open_raw(run, open_label_set()), run, settings, earlier=earlier)
+        return found, sorted(called)
+
+    return refined
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The street, refined; read only."""
+    run = write_raw(tmp_path_factory.mktemp("street") / "run")
+    refine_map(open_raw(run, open_label_set()), run, SETTINGS)
+    return run
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def linked(run: Path, earlier: Path, layer: str = "refined") -> list[Tile]:
+    """The tiles of a layer that are files of an earlier run as well."""
+    names = {tile: tiles.name_of(tile) for tile in EVERY}
+    return [tile for tile in EVERY if (run / layer / names[tile]).samefile(earlier / layer / names[tile])]
+
+
+def assert_as_from_scratch(
+    run: Path, found: Refined, scratch: Path, refine: Callable[..., tuple[Refined, list[Tile]]]
+) -> None:
+    """`scratch` holds the same raw map."""
+    whole, called = refine(scratch)
+    assert called == EVERY
+    assert content(run / "refined") == content(scratch / "refined")
+    assert found.report.to_json() == whole.report.to_json()
+
+
+@pytest.mark.parametrize(("changed", "near"), [((0, 0), EVERY[:2]), ((5, 0), EVERY[4:])])
+def test_only_tiles_within_the_halo_of_a_change_are_refined_again(
+    changed: Tile, near: list[Tile], before: Path, tmp_path: Path, refine: Any
+) -> None:
+    voxels = seen_again(VOXELS, changed)
+    found, called = refine(write_raw(tmp_path / "run", voxels), before)
+    assert called == near
+    assert linked(tmp_path / "run", before) == [tile for tile in EVERY if tile not in near]
+    assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch", voxels), refine)
+
+
+def test_only_tiles_near_a_new_keyframe_scan_are_refined_again(
+    before: Path, tmp_path: Path, refine: Any
+) -> None:
+    found, called = refine(write_raw(tmp_path / "run", scans=True), before)
+    assert called == EVERY[2:5]
+    assert linked(tmp_path / "run", before) == [*EVERY[:2], *EVERY[5:]]
+    assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch", scans=True), refine)
+
+
+def test_a_map_that_stays_is_not_refined_again(before: Path, tmp_path: Path, refine: Any) -> None:
+    found, called = refine(write_raw(tmp_path / "run"), before)
+    assert called == []
+    assert linked(tmp_path / "run", before) == EVERY
+    assert content(tmp_path / "run/refined") == content(before / "refined")
+    assert found.kerbs is None
+    assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch"), refine)
+
+
+def test_other_settings_refine_every_tile_again(before: Path, tmp_path: Path, refine: Any) -> None:
+    _, called = refine(write_raw(tmp_path / "run"), before, WITHOUT_FREE_SPACE)
+    assert called == EVERY
+    assert linked(tmp_path / "run", before) == []
+
+
+def without(said: dict[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in said.items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("damage", "again"),
+    [
+        (lambda said: None, True),
+        (lambda said: [said], True),
+        (lambda said: without(said, "report"), True),
+        (lambda said: said | {"report": {"steps": [{"name": "x"}]}}, True),
+        (lambda said: said | {"report": [1]}, True),
+        (lambda said: said | {"report": said["report"] | {"steps": []}}, True),
+        (lambda said: said | {"report": said["report"] | {"steps": said["report"]["steps"][::-1]}}, True),
+        (lambda said: said | {"report": said["report"] | {"systematic_errors": "x"}}, True),
+        (lambda said: said | {"around": 3}, False),
+        (lambda said: without(said, "sums"), False),
+        (lambda said: said | {"sums": said["sums"] | {"roads": -1}}, False),
+        (lambda said: said | {"sums": 5}, False),
+        (lambda said: said | {"sums": "roads"}, False),
+        (lambda said: said | {"sums": [said["sums"]]}, False),
+    ],
+)  # fmt: skip
+def test_what_an_earlier_map_says_is_made_anew_where_it_cannot_be_read(
+    damage: Callable[[dict[str, Any]], Any], again: bool, before: Path, tmp_path: Path, refine: Any
+) -> None:
+    """Without a report the tile is refined again; without sums these are added up again."""
+    earlier, damaged = tmp_path / "earlier", (3, 0)
+    (earlier / "refined").mkdir(parents=True)
+    for path in (before / "refined").iterdir():
+        (earlier / "refined" / path.name).write_bytes(path.read_bytes())
+    about = json.loads((earlier / "refined/map.json").read_text())
+    of_tile = about["files"][tiles.name_of(damaged)]
+    of_tile["said"] = damage(of_tile["said"])
+    (earlier / "refined/map.json").write_text(json.dumps(about))
+    _, called = refine(write_raw(tmp_path / "run"), earlier)
+    assert called == ([damaged] if again else [])
+    assert content(tmp_path / "run/refined") == content(before / "refined")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1}'])
+def test_an_earlier_map_that_cannot_be_read_is_as_none(
+    text: str, before: Path, tmp_path: Path, refine: Any
+) -> None:
+    (tmp_path / "earlier/refined").mkdir(parents=True)
+    (tmp_path / "earlier/refined/map.json").write_text(text)
+    _, called = refine(write_raw(tmp_path / "run"), tmp_path / "earlier")
+    assert called == EVERY
+    assert content(tmp_path / "run/refined") == content(before / "refined")
+
+
+def summed(run: Path, drives: list[Path], earlier: Path | None = None) -> dict[str, bytes]:
+    run.mkdir()
+    write_sum(drives, run, FRAME, open_label_set(), earlier)
+    return {str(path.relative_to(run)): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def test_a_drive_that_comes_or_goes_changes_the_sum_in_its_tiles_only(tmp_path: Path) -> None:
+    long, short, other = (
+        write_raw(tmp_path / name, voxels, moved=moved)
+        for name, voxels, moved in (
+            ("long", VOXELS, MOVED),
+            ("short", VOXELS[np.arange(9000)], MOVED[:0]),
+            ("other", VOXELS[-9000:], MOVED[-500:]),
+        )
+    )
+    two = summed(tmp_path / "two", [long, short])
+    three = summed(tmp_path / "three", [long, other, short])
+    assert summed(tmp_path / "added", [long, other, short], tmp_path / "two") == three
+    assert summed(tmp_path / "removed", [long, short], tmp_path / "three") == two
+    of_other = set(tiles.open_map(other / "map").tiles)
+    assert 0 < len(of_other) < len(EVERY) - 1
+    for later, earlier in (("added", "two"), ("removed", "three")):
+        assert linked(tmp_path / later, tmp_path / earlier, "map") == [t for t in EVERY if t not in of_other]
+    voxels = tiles.read(tmp_path / "three/map").voxels
+    expected = VOXELS + VOXELS[np.arange(9000)] + VOXELS[-9000:]
+    for name in ("keys", "evidence", "hits", "heights"):
+        np.testing.assert_array_equal(getattr(voxels, name), getattr(expected, name))
+
+
+def test_drives_of_another_voxel_size_or_frame_do_not_add_up(tmp_path: Path) -> None:
+    fine = write_raw(tmp_path / "fine")
+    coarse = write_raw(
+        tmp_path / "coarse", replace(VOXELS, voxel_size_m=0.4), moved=replace(MOVED, voxel_size_m=0.4)
+    )
+    elsewhere = write_raw(tmp_path / "elsewhere", frame=LocalFrame(49.0, 8.4, 112.0))
+    for other in (coarse, elsewhere):
+        with pytest.raises(DataError, match=r"voxels of .* m, or another frame; map them again$"):
+            write_sum([fine, other], tmp_path / "out", FRAME, open_label_set())

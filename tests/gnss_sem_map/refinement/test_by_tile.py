@@ -1,0 +1,127 @@
+"""A map is refined tile by tile: nobody needs the whole map, and nobody can tell the order."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import reduce
+from operator import add
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from long_street import SIZE_M, keyframes, street
+
+from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, run_steps, sums_of, tiles_of
+from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
+from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
+
+VOXELS = street()
+ALL = RefinementSettings.model_validate({"unobserved": {"enabled": True}})
+PAPER = RefinementSettings.model_validate(
+    {"count_grid": {"method": "paper"}, "vehicles": {"method": "paper"}}
+)
+MOVED = replace(VOXELS, keys=VOXELS.keys + 3)[np.arange(0, len(VOXELS), 7)]
+BESIDE = Evidence(moved=MOVED, keyframes=keyframes())
+PER_VOXEL = ("heights", "scores", "removed", "inferred")
+OF_MAP = ("labels", "confidence", "states", "entropy", "removed_hits")
+
+
+def assert_same(found: MapState, expected: MapState) -> None:
+    for name in PER_VOXEL:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    assert found.decided is not None
+    assert expected.decided is not None
+    np.testing.assert_array_equal(found.decided.voxels.keys, expected.decided.voxels.keys)
+    for name in OF_MAP:
+        np.testing.assert_array_equal(getattr(found.decided, name), getattr(expected.decided, name), name)
+    assert (found.kerbs is None) == (expected.kerbs is None)
+    if found.kerbs is not None and expected.kerbs is not None:
+        for name in ("keys", "leaning", "known", "levels"):
+            np.testing.assert_array_equal(getattr(found.kerbs, name), getattr(expected.kerbs, name), name)
+
+
+def near(voxels: VoxelMap, tile: tuple[int, int], margin_m: float) -> VoxelMap:
+    """The voxels of a tile and of a margin, by their centres."""
+    low, high = np.array(tile) * 102.4 - margin_m, (np.array(tile) + 1) * 102.4 + margin_m
+    xy = voxels.centres[:, :2]
+    return voxels[((xy > low) & (xy < high)).all(axis=1)]
+
+
+@pytest.mark.parametrize("settings", [ALL, PAPER], ids=["evidence", "paper"])
+def test_a_tile_needs_no_more_of_the_map_than_its_halo(settings: RefinementSettings) -> None:
+    tile, margin = (3, 0), halo_m(settings, SIZE_M)
+    assert margin < 30
+    part = near(VOXELS, tile, margin)
+    assert len(part) < len(VOXELS) / 3
+    beside = replace(BESIDE, moved=near(MOVED, tile, 0))
+    sums = sums_of(tile, VOXELS, BESIDE, settings)
+    assert sums == sums_of(tile, part, beside, settings)
+    assert sums.roads > 0
+    whole, report = refine_tile(tile, VOXELS, BESIDE, settings, figures_of(sums))
+    cut, of_cut = refine_tile(tile, part, beside, settings, figures_of(sums))
+    assert_same(cut, whole)
+    assert report.steps == of_cut.steps
+    assert len(cut.voxels) == len(near(VOXELS, tile, 0))
+
+
+def test_the_map_is_the_sum_of_its_tiles_in_any_order() -> None:
+    tiles = tiles_of(VOXELS, MOVED)
+    assert len(tiles) == 7
+    sums = reduce(add, (sums_of(tile, VOXELS, BESIDE, ALL) for tile in reversed(tiles)))
+    parts = [refine_tile(tile, VOXELS, BESIDE, ALL, figures_of(sums)) for tile in reversed(tiles)]
+    state, report = run_steps(VOXELS, ALL, BESIDE)
+    of_parts = reduce(add, (report for _, report in parts))
+    assert of_parts.steps == report.steps
+    assert of_parts.systematic_errors == report.systematic_errors > 0
+    assert [thing.voxels for thing in of_parts.objects] == [thing.voxels for thing in report.objects]
+    assert [thing.number for thing in report.objects] == list(range(len(report.objects)))
+    assert state.decided is not None
+    for tile, (part, _) in zip(reversed(tiles), parts, strict=True):
+        assert part.decided is not None
+        places = state.decided.voxels.indices_of(part.decided.voxels.keys)
+        assert (places >= 0).all()
+        for name in OF_MAP:
+            np.testing.assert_array_equal(getattr(part.decided, name), getattr(state.decided, name)[places])
+        assert len(part.decided) == len(near(state.decided.voxels, tile, 0))
+    changed = {step.name: step.changed for step in report.steps}
+    assert changed["removed_layer"] == len(MOVED) - (VOXELS.indices_of(MOVED.keys) >= 0).sum()
+
+
+def test_nobody_sees_where_tiles_meet() -> None:
+    """The same street half a tile farther on: seams lie elsewhere, and cells of a metre lie the same."""
+    moved_on = pack(VOXELS.indices + np.array([250, 0, 0]))
+    here = run_steps(VOXELS, ALL)[0]
+    there = run_steps(replace(VOXELS, keys=moved_on), ALL)[0]
+    assert here.decided is not None
+    assert there.decided is not None
+    assert (here.decided.labels == there.decided.labels).mean() > 0.999
+    np.testing.assert_allclose(here.decided.confidence, there.decided.confidence, atol=0.05)
+
+
+counts = st.integers(0, 2**60)
+
+
+@given(st.lists(counts, min_size=20, max_size=20))
+def test_sums_add_exactly_and_come_back_from_json(numbers: list[int]) -> None:
+    a, b = (Sums(*some) for some in (numbers[:10], numbers[10:]))
+    assert a + b == b + a
+    assert a + Sums() == a
+    assert Sums.from_json(json.loads(json.dumps((a + b).to_json()))) == a + b
+
+
+@pytest.mark.parametrize("change", [{"roads": -1}, {"roads": 1.5}, {"roads": True}, {"paths": 1}])
+def test_sums_that_are_none_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="refine the map again"):
+        Sums.from_json(Sums().to_json() | change)
+
+
+def test_a_little_more_of_the_same_changes_no_figure() -> None:
+    sums = Sums(100_000, 300_000_000, 9_100_000, 6_000_000, 1_200_000, 10**6, 200 * 10**6, 50_000, 30_000, 9)
+    more = Sums(900, 2_800_000, 80_000, 60_000, 11_000, 10**4, 2 * 10**6, 480, 310, 5)
+    assert figures_of(sums) == figures_of(sums + more)
+    assert figures_of(sums) != figures_of(sums + reduce(add, [replace(more, by_both=0)] * 50))
+    assert figures_of(Sums()) == Figures(has_road=False)

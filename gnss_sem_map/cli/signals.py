@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import signal
+import sys
+from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TRY_AGAIN_S = 0.01
+LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset")
+"""Modules whose functions take locks: one that is left between taking a lock and giving it back blocks all threads."""
+WAITING = ("wait", "_wait_for_tstate_lock")
+"""Their functions that wait for other threads: they may be left while they do."""
 
 
 class Stopped(BaseException):
@@ -16,7 +23,11 @@ class Stopped(BaseException):
 
 
 def stop_on_signals() -> None:
-    """Raise Stopped from now on when a signal arrives; one that is ignored, as by `nohup`, stays ignored."""
+    """Raise Stopped from now on when a signal arrives; one that is ignored, as by `nohup`, stays ignored.
+
+    Python drops exceptions in finalizers and in callbacks of compiled code: there Stopped is raised again later.
+    """
+    sys.unraisablehook = _dropped
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _stop)
@@ -24,9 +35,36 @@ def stop_on_signals() -> None:
 
 def ignore_signals() -> None:
     """Ignore signals while the program ends."""
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _stop(number: int, _: object) -> None:
-    raise Stopped(number)
+def _stop(number: int, frame: FrameType | None) -> None:
+    if not _takes_locks(frame):
+        raise Stopped(number)
+    _stop_later(number, frame)
+
+
+def _stop_later(number: int, seen: FrameType | None = None) -> None:
+    """Look again soon; a function that waits is left when it still stands where it was seen."""
+    place = None if seen is None else (seen.f_code, seen.f_lasti)
+
+    def look_again(_: int, frame: FrameType | None) -> None:
+        if frame and place == (frame.f_code, frame.f_lasti) and frame.f_code.co_name in WAITING:
+            raise Stopped(number)
+        _stop(number, frame)
+
+    signal.signal(signal.SIGALRM, look_again)
+    signal.setitimer(signal.ITIMER_REAL, TRY_AGAIN_S)
+
+
+def _takes_locks(frame: FrameType | None) -> bool:
+    return frame is not None and str(frame.f_globals.get("__name__")).startswith(LOCKING)
+
+
+def _dropped(dropped: sys.UnraisableHookArgs) -> None:
+    if isinstance(dropped.exc_value, Stopped):
+        _stop_later(dropped.exc_value.number)
+    else:
+        sys.__unraisablehook__(dropped)

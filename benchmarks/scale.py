@@ -25,6 +25,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from cut_drive import cut_all
 
 RESULTS = Path(__file__).parent / "results" / "scale.json"
@@ -120,10 +121,41 @@ def memory(drives: Drives, out: Path) -> Figures:
             f"real_time_factor_{seconds}_s": seconds / figures["wall_s"],
             f"cpu_ms_per_scan_{seconds}_s": 1000 * figures["cpu_s"] / about["counts"]["scans"],
             f"seconds_by_stage_{seconds}_s": about["seconds"],
-            f"voxels_{seconds}_s": about["map"]["voxels"],
+            f"sizes_{seconds}_s": sizes(out / f"{seconds}"),
         }
     found["peak_480_over_60"] = found["peak_mb_480_s"] / found["peak_mb_60_s"]
     return found
+
+
+def sizes(run: Path) -> Figures:
+    """What the result of one drive holds: its length, its voxels, and the bytes of each part."""
+    about, refined = (
+        json.loads((run / "run.json").read_text()),
+        json.loads((run / "refined/map.json").read_text()),
+    )
+    stamps_and_positions = np.loadtxt(run / "trajectory.tum", usecols=(0, 1, 2, 3))
+    steps = np.linalg.norm(np.diff(stamps_and_positions[:, 1:], axis=0), axis=1)
+    parts = ("map", "refined", "evidence/moved", "evidence/keyframes", "evidence/moving_points")
+    products = [path for path in run.glob("*") if path.name.startswith(("map.", "viewer", "topview"))]
+    return {
+        "seconds": stamps_and_positions[-1, 0] - stamps_and_positions[0, 0],
+        "km": steps.sum() / 1000,
+        "scans": about["counts"]["scans"],
+        "voxels": about["map"]["voxels"],
+        "tiles": refined["tiles"],
+        "bytes": {part: bytes_in(run / part) for part in parts}
+        | {
+            "products": sum(map(bytes_in, products)),
+            "trajectory": sum(map(bytes_in, run.glob("trajectory.*"))),
+            "run.json": bytes_in(run / "run.json"),
+            "refined/map.json": bytes_in(run / "refined/map.json"),
+        },
+    }
+
+
+def bytes_in(path: Path) -> int:
+    """Of a file, or of all files of a folder."""
+    return sum(each.stat().st_size for each in [path, *path.rglob("*")] if each.is_file())
 
 
 def reads(drives: Drives, out: Path) -> Figures:
@@ -141,14 +173,8 @@ def disk(drives: Drives, out: Path) -> Figures:
     found: Figures = {}
     for layer in ("map", "refined", "evidence/moved"):
         voxels = json.loads((folder / layer / "map.json").read_text())["voxels"]
-        found[f"bytes_per_voxel_{layer}"] = _bytes_in(folder / layer) / max(voxels, 1)
-    found["bytes_per_second_keyframes"] = _bytes_in(folder / "evidence/keyframes") / 30
-    found["bytes_per_second_moving_points"] = _bytes_in(folder / "evidence/moving_points") / 30
+        found[f"bytes_per_voxel_{layer}"] = bytes_in(folder / layer) / max(voxels, 1)
     return found
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def refinement(drives: Drives, out: Path) -> Figures:

@@ -45,6 +45,8 @@ finally:
     print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
 """
 Figures = dict[str, Any]
+TILING = ("drives", "mapping", "refinement")
+"""Stages of a run of many drives that workers share: drives, the sum of their maps, and its refinement."""
 DASK = Path(sys.executable).with_name("dask")
 
 
@@ -203,31 +205,41 @@ def refinement(drives: Drives, out: Path) -> Figures:
 
 
 def workers(drives: Drives, out: Path) -> Figures:
-    """Two processes over one, and Dask over processes; the same bytes from all."""
-    some = drives.of(30)[:2]
-    found, sums = {}, {}
-    for count in (1, 2):
-        figures = run(drives.words(some, out / f"workers{count}", "--workers", str(count)))
-        found[f"wall_s_{count}_workers"], sums[count] = figures["wall_s"], checksums(out / f"workers{count}")
+    """Two processes over one, and Dask over processes, for six drives; the same bytes from all."""
+    some = drives.of(30)[:6]
+    found: Figures = {"drives": len(some)}
+    sums = {}
     with _dask(2) as (address, _):
-        figures = run(drives.words(some, out / "dask", "--scheduler", address))
-        found["wall_s_dask"], sums["dask"] = figures["wall_s"], checksums(out / "dask")
-    found["two_workers_over_one"] = found["wall_s_1_workers"] / found["wall_s_2_workers"]
-    found["dask_over_processes"] = found["wall_s_2_workers"] / found["wall_s_dask"]
-    found["same_bytes"] = sums[1] == sums[2] == sums["dask"]
+        for name, how in (
+            ("1", ["--workers", "1"]),
+            ("2", ["--workers", "2"]),
+            ("dask", ["--scheduler", address]),
+        ):
+            figures = run(drives.words(some, out / name, *how), threads=1)
+            seconds = json.loads((out / name / "run.json").read_text())["seconds"]
+            found[f"wall_s_{name}"] = figures["wall_s"]
+            found[f"seconds_by_stage_{name}"] = seconds
+            found[f"tiling_s_{name}"] = sum(seconds[stage] for stage in TILING)
+            sums[name] = checksums(out / name)
+    found["two_workers_over_one"] = found["wall_s_1"] / found["wall_s_2"]
+    found["two_workers_over_one_tiling"] = found["tiling_s_1"] / found["tiling_s_2"]
+    found["dask_over_processes"] = found["wall_s_2"] / found["wall_s_dask"]
+    found["same_bytes"] = sums["1"] == sums["2"] == sums["dask"]
     return found
 
 
 def twenty(drives: Drives, out: Path) -> Figures:
     """Twenty drives, one map: one process, two processes, and Dask with a worker killed on the way."""
-    some, sums, found = drives.of(30)[:20], [], {"drives": len(drives.of(30)[:20])}
+    some, sums = drives.of(30)[:20], []
+    found: Figures = {"drives": len(some)}
     for count in (1, 2):
-        run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        figures = run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        found[f"wall_s_{count}"] = figures["wall_s"]
         sums.append(checksums(out / f"twenty{count}"))
     with _dask(2) as (address, processes):
         killer = subprocess.Popen(["sh", "-c", f"sleep 60; pkill -KILL -P {processes[1].pid}"])
-        run(drives.words(some, out / "twenty_dask", "--scheduler", address))
-        sums.append(checksums(out / "twenty_dask"))
+        found["wall_s_dask"] = run(drives.words(some, out / "dask", "--scheduler", address))["wall_s"]
+        sums.append(checksums(out / "dask"))
         killer.wait()
     return found | {"twenty_same_bytes": sums[0] == sums[1] == sums[2], "files": len(sums[0])}
 

@@ -32,7 +32,8 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import DRIVES, MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.merged_run import TRACK, write_merged
+from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -144,13 +145,13 @@ class Run:
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
-            for part in (MAP, evidence.FOLDER, DRIVES):
+            for part in (MAP, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / part):
                     shutil.copytree(self.folder / part, folder / part, copy_function=link_or_copy)
             refined = pipeline.refine(folder, settings, stats)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
-                write_merged(folder, self.folder / TRACK, settings, about)
+                write_merged(folder, settings, about)
             else:
                 known = self.folder / run_folder.RAW_LABELS
                 run_folder.write_again(
@@ -203,7 +204,7 @@ class Run:
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
         refined = tiles.open_map(self.folder / "refined", self.label_set)
-        exported = Exported(refined, self._driven, str(self.about["name"]))
+        exported = Exported(refined, tracks_of(self.folder), str(self.about["name"]))
         if to is None:
             return [self._amended(known[name], exported) for name in chosen]
         files = [Path(to) / known[name].file for name in chosen]
@@ -227,18 +228,6 @@ class Run:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
         log = open_drive(Path(inputs["drive"])).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
-
-    @property
-    def _driven(self) -> Trajectory:
-        if self.is_merged:
-            return self._track
-        first, last = self.about["scans_s"]
-        return run_folder.between(self.trajectory, first, last)
-
-    @property
-    def _track(self) -> Trajectory:
-        """The trajectory for pictures."""
-        return Trajectory.load(self.folder / TRACK) if self.is_merged else self.trajectory
 
     def _refuse_merged(self, what: str) -> None:
         if self.is_merged:

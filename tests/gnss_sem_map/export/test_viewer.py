@@ -58,8 +58,9 @@ def unpacked(listed: list[int], text: str, meta: dict[str, Any]) -> tuple[np.nda
     return cells + (np.array(meta["origin"]) >> level), planes[6:].T
 
 
-def written(tmp_path: Path, semantic_map: SemanticMap, *arguments: Any, **settings: Any) -> str:
-    write_viewer(in_memory(semantic_map), *arguments, tmp_path / "viewer.html", **settings)
+def written(tmp_path: Path, semantic_map: SemanticMap, track: Trajectory | None, **settings: Any) -> str:
+    tracks = [] if track is None else [track]
+    write_viewer(in_memory(semantic_map), tracks, tmp_path / "viewer.html", **settings)
     return (tmp_path / "viewer.html").read_text("utf-8")
 
 
@@ -77,7 +78,8 @@ def test_the_page_holds_every_voxel_with_its_class_confidence_and_state(
         int((street.labels[street.shown] == i).sum()) for i in range(5)
     ]
     assert meta["removed"] == (street.states == State.REMOVED).sum()
-    path = (np.array(meta["track"]) + meta["origin"]) * meta["voxel_m"]
+    (line,) = meta["tracks"]
+    path = (np.array(line) + meta["origin"]) * meta["voxel_m"]
     np.testing.assert_allclose(path, track.positions, atol=0.002)
 
 
@@ -184,7 +186,7 @@ def test_a_map_in_tiles_on_disk_gives_the_same_bytes_and_each_tile_is_read_once(
 
     for name, tiled_map in (("disk", replace(opened, read_tile=read_tile)), ("memory", in_memory(town))):
         (tmp_path / name).mkdir()
-        write_viewer(tiled_map, track, tmp_path / name / "viewer.html", most_voxels=20_000)
+        write_viewer(tiled_map, [track], tmp_path / name / "viewer.html", most_voxels=20_000)
     assert sorted(read) == list(opened.tiles)
     disk, memory = (
         {file.relative_to(tmp_path / name): file.read_bytes() for file in (tmp_path / name).rglob("*.*")}
@@ -205,7 +207,7 @@ def peak_memory(edge: int, piece: SemanticMap, page: Path) -> int:
     corners = tuple((x, y) for x in range(edge) for y in range(edge))
     tiled_map = replace(in_memory(piece), tiles=corners, read_tile=lambda _: piece[np.arange(len(piece))])
     tracemalloc.start()
-    write_viewer(tiled_map, None, page, most_voxels=20_000)
+    write_viewer(tiled_map, (), page, most_voxels=20_000)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak
@@ -225,14 +227,14 @@ def test_tiles_without_voxels_are_passed_over(street: SemanticMap, tmp_path: Pat
             tiles=corners,
             read_tile=lambda tile: nothing if tile == (2, 5) else tiled_map.read_tile(tile),
         )
-        write_viewer(with_empty, None, tmp_path / "viewer.html")
+        write_viewer(with_empty, (), tmp_path / "viewer.html")
         pages.append(decoded((tmp_path / "viewer.html").read_text("utf-8"))[1])
     np.testing.assert_array_equal(*pages)
 
 
 def test_a_page_needs_a_suffix_since_its_folder_has_none(street: SemanticMap, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"viewer: found no suffix, expected a name such as viewer.html"):
-        write_viewer(in_memory(street), None, tmp_path / "viewer")
+        write_viewer(in_memory(street), (), tmp_path / "viewer")
 
 
 def test_an_empty_map_is_refused(street: SemanticMap, tmp_path: Path) -> None:

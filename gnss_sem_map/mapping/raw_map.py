@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
@@ -18,8 +16,11 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import files_of, name_of
+from gnss_sem_map.voxels.reuse import Reuse, digest
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import Reuse, Tile, TiledMap, name_of
+from gnss_sem_map.voxels.tile_files import Tile
+from gnss_sem_map.voxels.tiles import TiledMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 MAP, DRIVES = "map", "drives"
@@ -88,9 +89,12 @@ def write_sum(
                 f"{run}: its drives have voxels of {sorted(sizes)} m, or another frame; map them again"
             )
         (run / place).parent.mkdir(exist_ok=True)
-        files = [tiles.files_of(drive / place) for drive in drives]
+        files = [files_of(drive / place) for drive in drives]
         every = sorted({tile for one in maps for tile in one.tiles})
-        made_from = {tile: _digest([of_drive.get(name_of(tile)) for of_drive in files]) for tile in every}
+        made_from = {}
+        for tile in every:
+            parts = [of_drive.get(name_of(tile)) for of_drive in files]
+            made_from[tile] = digest([part["sha256"] for part in parts if part is not None])
         reuse = Reuse(made_from, None if earlier is None else earlier / place)
         changed = [tile for tile in every if tile not in reuse.same]
         tiles.write_tiles(_summed(maps, changed), run / place, frame, maps[0].voxel_size_m, label_set, reuse)
@@ -100,9 +104,3 @@ def _summed(maps: Sequence[TiledMap], chosen: Sequence[Tile]) -> Iterator[tuple[
     for tile in chosen:
         parts = [one.read_tile(tile).voxels for one in maps if tile in one.tiles]
         yield tile, SemanticMap.of(reduce(add, parts))
-
-
-def _digest(files: Sequence[dict[str, Any] | None]) -> str:
-    """Of the files that a tile is summed from, of those drives that have one."""
-    checksums = [about["sha256"] for about in files if about is not None]
-    return hashlib.sha256(" ".join(checksums).encode()).hexdigest()

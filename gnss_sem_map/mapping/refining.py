@@ -7,13 +7,11 @@ drive that is added to a large map touches the tiles around it only.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -31,8 +29,10 @@ from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import files_of, name_of
+from gnss_sem_map.voxels.reuse import Reuse, digest
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import TILE_BITS, Reuse, Tile
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 
 REFINED = "refined"
 
@@ -107,16 +107,16 @@ class _Refinement:
     def _digests(self) -> dict[Tile, str]:
         """Digest of the settings, and of the raw map in and around each tile."""
         moved = self._run / evidence.FOLDER / evidence.MOVED
-        files = tiles.files_of(self._run / MAP), tiles.files_of(moved)
+        files = files_of(self._run / MAP), files_of(moved)
         sums = [{name: about["sha256"] for name, about in of_layer.items()} for of_layer in files]
         said = [self._settings.refinement.model_dump_json(), self._settings.classes, self._halo]
         model = None if self._model is None else repr(self._model.to_yaml())
         reach = range(-self._tiles_in_halo, self._tiles_in_halo + 1)
         found = {}
         for x, y in self._tiles:
-            near = [tiles.name_of((x + i, y + j)) for i in reach for j in reach]
+            near = [name_of((x + i, y + j)) for i in reach for j in reach]
             around = [[of_layer.get(name) for name in near] for of_layer in sums]
-            found[x, y] = _digest([said, model, around])
+            found[x, y] = digest([said, model, around])
         return found
 
     @property
@@ -125,10 +125,10 @@ class _Refinement:
 
     def _sums(self, around: dict[Tile, str]) -> dict[Tile, Sums]:
         """What every tile adds to the figures of the map."""
-        known, earlier = {}, tiles.files_of(self._earlier)
+        known, earlier = {}, files_of(self._earlier)
         for tile in self._tiles:
             try:
-                said = earlier[tiles.name_of(tile)]["said"]
+                said = earlier[name_of(tile)]["said"]
                 if said["around"] == around[tile]:
                     known[tile] = Sums.from_json(said["sums"])
             except (KeyError, TypeError, ValueError):
@@ -156,7 +156,7 @@ class _Refinement:
             near = poses[((at > low - reach) & (at < low + edge + reach)).all(axis=1)]
             # to 1 um: poses that were saved as quaternions come back with other last bits; + 0.0 makes -0.0 a 0.0
             keyframes = hashlib.sha256((near.round(6) + 0.0).tobytes()).hexdigest()
-            found[tile] = _digest([around[tile], asdict(figures), keyframes])
+            found[tile] = digest([around[tile], asdict(figures), keyframes])
         return found
 
     def _evidence(self, tile: Tile) -> Evidence:
@@ -177,10 +177,6 @@ def _reports(reuse: Reuse) -> dict[Tile, RefinementReport]:
         except (KeyError, TypeError, ValueError):
             del reuse.same[tile]
     return found
-
-
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def opened_sensor_model(settings: Settings) -> LabelCalibration | None:

@@ -33,7 +33,8 @@ from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, Veh
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings, do
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import TILE_BITS, Tile, joined, joined_voxels
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
+from gnss_sem_map.voxels.tiles import joined, joined_voxels
 from gnss_sem_map.voxels.voxel_map import VoxelMap, unpack
 
 WORTH_CUTTING_M = 2.0

@@ -37,6 +37,7 @@ from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 __all__ = ["Run", "Settings", "open_drive", "run"]
@@ -124,7 +125,7 @@ class Run:
     @cached_property
     def frame(self) -> LocalFrame | None:
         """The local frame of the map; None for a map without a georeference."""
-        return tiles.read_frame(self.folder / "map")
+        return read_frame(self.folder / "map")
 
     @cached_property
     def label_set(self) -> LabelSet:

@@ -40,7 +40,7 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 
 SETTINGS = "config.yaml"
 LONGEST_DRIVE_S = 86_400.0
@@ -270,7 +270,7 @@ def _link_all(drive: Path, part: Path) -> None:
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     """Settings, frame and drives of a finished map, which may be that of one drive; raises DataError."""
     about, settings = read_run(out), config.load(out / SETTINGS)
-    frame = tiles.read_frame(out / MAP)
+    frame = read_frame(out / MAP)
     if frame is None:
         raise DataError(f"{shown(out)}: its map has no georeference, so no other drive fits to it")
     if is_folder(out / DRIVES):

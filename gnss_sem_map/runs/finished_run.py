@@ -26,10 +26,12 @@ from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.mapping.raw_map import DRIVES, MAP
+from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.merged_run import write_merged
@@ -80,7 +82,10 @@ def run(
                 log, network, settings, folder, claim.work, progress,
                 origin=origin, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
             )  # fmt: skip
-            refined = pipeline.refine(folder, settings, mapped.stats, progress)
+            executor = Processes(workers) if workers > 1 else None
+            refined = pipeline.refine(
+                folder, settings, mapped.stats, progress, executor=executor, work=claim.work
+            )
             inputs = run_folder.inputs_of_run(drive, segmenter, frames)
             run_folder.write_run(folder, drive, mapped, refined, settings, write_labels, inputs)
     return Run(out)
@@ -149,7 +154,7 @@ class Run:
             for part in (MAP, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / part):
                     shutil.copytree(self.folder / part, folder / part, copy_function=link_or_copy)
-            refined = pipeline.refine(folder, settings, stats)
+            refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)

@@ -29,11 +29,12 @@ from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.dask_cluster import Cluster
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
-from gnss_sem_map.mapping.raw_map import DRIVES, MAP, write_sum
+from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
@@ -96,12 +97,13 @@ def run_drives(
     _check_distinct([(drive.name, drive) for drive in drives])
     with run_folder.claimed_run(out, drives) as claim:
         frame = origin or _frame_of(drives, how.drive_format)
-        failed = _map_all(drives, claim, settings, how, frame, _executor(workers, scheduler, claim), progress)
+        executor = _executor(workers, scheduler, claim)
+        failed = _map_all(drives, claim, settings, how, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
-        about = _write(out, done, settings, frame, failed, progress)
+        about = _write(out, done, settings, frame, failed, claim, executor, progress)
     return ManyDrives(out, about)
 
 
@@ -122,7 +124,7 @@ def add_drive(
         if failed:
             raise DataError(f"{out}: stays as it was; {_first(failed)}")
         added = {drive.name: claim.work / DRIVES / drive.name}
-        about = _write(out, there | added, settings, frame, {}, progress)
+        about = _write(out, there | added, settings, frame, {}, claim, InProcess(), progress)
     return ManyDrives(out, about)
 
 
@@ -134,8 +136,8 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
         raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
     if not stay:
         raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
-    with run_folder.claimed_run(out):
-        about = _write(out, stay, settings, frame, {}, progress)
+    with run_folder.claimed_run(out) as claim:
+        about = _write(out, stay, settings, frame, {}, claim, InProcess(), progress)
     return ManyDrives(out, about)
 
 
@@ -222,6 +224,8 @@ def _write(
     settings: Settings,
     frame: LocalFrame,
     failed: Mapping[str, str],
+    claim: Claim,
+    executor: Executor,
     progress: Progress,
 ) -> dict[str, Any]:
     """Write the map of these drives, whose folders are linked into it."""
@@ -231,8 +235,8 @@ def _write(
         for part in parts:
             _link_all(drives[part.name], part)
         with stats.stage("mapping"):
-            write_sum(parts, folder, frame, open_label_set(settings.classes), out)
-        refined = pipeline.refine(folder, settings, stats, progress, out)
+            write_sum(parts, folder, frame, settings.classes, out, executor=executor, work=claim.work)
+        refined = pipeline.refine(folder, settings, stats, progress, out, executor=executor, work=claim.work)
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],

@@ -117,7 +117,14 @@ def _is_list_of_words(value: Any) -> bool:
 
 
 def _is_table_of_files(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        isinstance(about, dict) and type(about.get("voxels")) is int and isinstance(about.get("sha256"), str)
-        for about in value.values()
+    return isinstance(value, dict) and all(map(is_about_a_tile, value.values()))
+
+
+def is_about_a_tile(value: Any) -> bool:
+    """Whether this is what `map.json` says of a tile."""
+    numbers = ("voxels", "points")
+    return (
+        isinstance(value, dict)
+        and all(type(value.get(name)) is int for name in numbers)
+        and isinstance(value.get("sha256"), str)
     )

@@ -42,6 +42,15 @@ def encode(piece: SemanticMap) -> bytes:
     return _as_parquet(columns)
 
 
+def describe(piece: SemanticMap, content: bytes) -> dict[str, Any]:
+    """What `map.json` says of a tile, which has this content as a file."""
+    return {
+        "voxels": len(piece),
+        "points": int(piece.voxels.hits.sum(dtype=np.int64)),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+
+
 def read(
     path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
 ) -> SemanticMap:

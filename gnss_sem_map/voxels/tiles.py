@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -22,13 +21,14 @@ from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.voxels import tile_files
-from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_OFFSET
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
 from gnss_sem_map.voxels.map_json import MAP_JSON, describe, name_of, read_description, read_frame, tile_of
-from gnss_sem_map.voxels.reuse import Reuse
+from gnss_sem_map.voxels.reuse import Made
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile, encode
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
+Z_ORDER_BITS = AXIS_BITS - TILE_BITS
 TILES_HELD = 16
 """Tiles of a map in memory at a time: each is read again with its neighbours."""
 
@@ -41,17 +41,16 @@ def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> 
 
 
 def write_tiles(
-    pieces: Iterable[tuple[Tile, SemanticMap]],
+    pieces: Iterable[tuple[Tile, SemanticMap | Made]],
     folder: Path,
     frame: LocalFrame | None,
     voxel_size_m: float,
     label_set: LabelSet,
-    reuse: Reuse | None = None,
 ) -> None:
     """Write a map tile by tile, each tile once, into a new folder: one tile at a time is in memory.
 
-    Tiles of an earlier map that `reuse` says to stay are linked, and are not among the pieces. Raises DataError when
-    the folder exists, the disk is full, or a voxel is more than 2^13 above or below the origin.
+    Tiles that are made already are linked. Raises DataError when the folder exists, the disk is full, or a voxel is
+    more than 2^13 above or below the origin.
     """
     if folder.exists():
         raise DataError(f"{folder}: exists; remove it or choose another folder")
@@ -59,19 +58,15 @@ def write_tiles(
     files: dict[str, dict[str, Any]] = {}
     try:
         beside.mkdir(parents=True)
-        if reuse is not None and reuse.earlier is not None:
-            for tile, about in reuse.same.items():
-                link_or_copy(reuse.earlier / name_of(tile), beside / name_of(tile))
-                files[name_of(tile)] = about | reuse.about(tile)
         for tile, piece in pieces:
-            content, name = encode(piece), name_of(tile)
-            (beside / name).write_bytes(content)
-            files[name] = {
-                "voxels": len(piece),
-                "points": int(piece.voxels.hits.sum(dtype=np.int64)),
-                "sha256": hashlib.sha256(content).hexdigest(),
-                **({} if reuse is None else reuse.about(tile)),
-            }
+            name = name_of(tile)
+            if isinstance(piece, Made):
+                link_or_copy(piece.file, beside / name)
+                files[name] = piece.about
+            else:
+                content = tile_files.encode(piece)
+                (beside / name).write_bytes(content)
+                files[name] = tile_files.describe(piece, content)
         about = describe(voxel_size_m, label_set, frame, dict(sorted(files.items())))
         (beside / MAP_JSON).write_text(json.dumps(about, indent=1) + "\n", "utf-8")
         beside.rename(folder)
@@ -99,18 +94,15 @@ class TiledMap:
     def __iter__(self) -> Iterator[SemanticMap]:
         return map(self.read_tile, self.tiles)
 
-    def around(self, tile: Tile, margin_m: float) -> SemanticMap:
+    def around(self, tile: Tile, margin_m: float) -> VoxelMap:
         """The voxels of a tile and those within a margin around it; empty where the map has none."""
-        margin, edge = math.ceil(margin_m / self.voxel_size_m), 1 << TILE_BITS
-        low = np.array(tile) * edge - margin
-        high, tiles = low + edge + 2 * margin, -(-margin // edge)
+        tiles = math.ceil(margin_m / (self.voxel_size_m * (1 << TILE_BITS)))
         reach, parts = range(-tiles, tiles + 1), []
         for near in ((tile[0] + i, tile[1] + j) for i in reach for j in reach):
             if near in self._known:
-                part = self.read_tile(near)
-                xy = part.voxels.indices[:, :2]
-                parts.append(part[np.flatnonzero(((xy >= low) & (xy < high)).all(axis=1))])
-        return joined(parts, self.voxel_size_m, self.label_set)
+                part = self.read_tile(near).voxels
+                parts.append(part if near == tile else part[places_around(part, tile, margin_m)])
+        return parts[0] if len(parts) == 1 else joined_voxels(parts, self.voxel_size_m, self.label_set)
 
     @cached_property
     def _known(self) -> frozenset[Tile]:
@@ -225,6 +217,26 @@ def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSe
         states=column(lambda part: part.states, np.empty(0, np.uint8)),
         hits_removed=column(lambda part: part.removed_hits, np.empty(0, np.uint32)) if are_told else None,
     )
+
+
+def places_around(voxels: VoxelMap, tile: Tile, margin_m: float) -> NDArray[np.int64]:
+    """The places of the voxels of a tile and of a margin around it."""
+    margin, edge = math.ceil(margin_m / voxels.voxel_size_m), 1 << TILE_BITS
+    low_x, low_y = (AXIS_OFFSET + axis * edge - margin for axis in tile)
+    high_x, high_y = low_x + edge + 2 * margin, low_y + edge + 2 * margin
+    start, end = np.searchsorted(voxels.keys, [low_x << 2 * AXIS_BITS, high_x << 2 * AXIS_BITS])
+    y = voxels.keys[start:end] >> AXIS_BITS & AXIS_MASK
+    return np.asarray(np.flatnonzero((y >= low_y) & (y < high_y)) + start, np.int64)
+
+
+def z_order(tiles: Iterable[Tile]) -> list[Tile]:
+    """Tiles in Morton order, in which neighbours are near each other: what one has read the next finds in memory."""
+
+    def interleaved(tile: Tile) -> int:
+        x, y = (axis + (1 << Z_ORDER_BITS - 1) for axis in tile)
+        return sum((x >> bit & 1) << 2 * bit + 1 | (y >> bit & 1) << 2 * bit for bit in range(Z_ORDER_BITS))
+
+    return sorted(tiles, key=interleaved)
 
 
 def _touches(tile: Tile, box: tuple[ArrayLike, ArrayLike], voxel_size_m: float) -> bool:

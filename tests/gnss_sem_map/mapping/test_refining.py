@@ -223,7 +223,7 @@ def test_an_earlier_map_that_cannot_be_read_is_as_none(
 
 def summed(run: Path, drives: list[Path], earlier: Path | None = None) -> dict[str, bytes]:
     run.mkdir()
-    write_sum(drives, run, FRAME, open_label_set(), earlier)
+    write_sum(drives, run, FRAME, earlier=earlier)
     return {str(path.relative_to(run)): path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
@@ -258,4 +258,4 @@ def test_drives_of_another_voxel_size_or_frame_do_not_add_up(tmp_path: Path) -> 
     elsewhere = write_raw(tmp_path / "elsewhere", frame=LocalFrame(49.0, 8.4, 112.0))
     for other in (coarse, elsewhere):
         with pytest.raises(DataError, match=r"voxels of .* m, or another frame; map them again$"):
-            write_sum([fine, other], tmp_path / "out", FRAME, open_label_set())
+            write_sum([fine, other], tmp_path / "out", FRAME)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,44 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from long_street import keyframes, street
+from raw_street import EVERY, FRAME, MOVED, SETTINGS, VOXELS, content, write_raw
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import evidence, refining
+from gnss_sem_map.mapping import refining
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.voxels import reuse, tiles
 from gnss_sem_map.voxels.map_json import name_of
-from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-FRAME = LocalFrame(49.011, 8.423, 112.0)
-VOXELS = street()
-MOVED = VOXELS[np.flatnonzero(VOXELS.centres[:, 0] > 350.0)[::9]]
-"""Of the fourth tile and those after it."""
-EVERY = [(x, 0) for x in range(7)]
-SETTINGS = Settings()
 WITHOUT_FREE_SPACE = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
-
-
-def write_raw(
-    run: Path,
-    voxels: VoxelMap = VOXELS,
-    scans: bool = False,
-    moved: VoxelMap = MOVED,
-    frame: LocalFrame = FRAME,
-) -> Path:
-    """The raw map of a run folder, and its evidence, with or without keyframe scans between x = 325 and 350 m."""
-    tiles.write(SemanticMap.of(voxels), run / "map", frame)
-    tiles.write(SemanticMap.of(moved), run / "evidence" / "moved", frame)
-    file = io.BytesIO()
-    evidence.write_keyframes(keyframes(), file)
-    evidence.write([], [file.getvalue()] if scans else [], run)
-    return run
 
 
 def seen_again(voxels: VoxelMap, tile: Tile) -> VoxelMap:
@@ -88,10 +64,6 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = write_raw(tmp_path_factory.mktemp("street") / "run")
     refine_map(open_raw(run, open_label_set()), run, SETTINGS)
     return run
-
-
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 def linked(run: Path, earlier: Path, layer: str = "refined") -> list[Tile]:

@@ -191,14 +191,14 @@ def _indices_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np
 def joined_voxels(parts: Sequence[VoxelMap], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
     """The voxels of parts that share none."""
     keys = np.concatenate([np.empty(0, np.int64), *(part.keys for part in parts)])
-    order = np.argsort(keys)
+    order = np.argsort(keys, kind="stable")  # quick: the keys of each part are sorted
     evidence = np.concatenate(
         [np.empty((0, len(label_set.names)), np.int32), *(part.evidence for part in parts)]
     )
     hits = np.concatenate([np.empty(0, np.uint32), *(part.hits for part in parts)])
     heights = [part.heights for part in parts if part.heights is not None]
     of_all = np.concatenate([np.empty(0, np.int64), *heights])[order] if len(heights) == len(parts) else None
-    return VoxelMap(voxel_size_m, label_set, keys[order], evidence[order], hits[order], of_all)
+    return VoxelMap(voxel_size_m, label_set, keys[order], evidence.take(order, axis=0), hits[order], of_all)
 
 
 def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSet) -> SemanticMap:

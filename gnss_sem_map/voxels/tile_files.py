@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -164,8 +165,7 @@ def local_keys(voxels: VoxelMap) -> NDArray[np.uint32]:
 
 def _global(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Keys of a tile's voxels."""
-    wide = local.astype(np.int64)
-    mask = (1 << TILE_BITS) - 1
-    x = (wide >> (TILE_BITS + Z_BITS)) + (tile[0] << TILE_BITS)
-    y = (wide >> Z_BITS & mask) + (tile[1] << TILE_BITS)
-    return pack(np.stack([x, y, (wide & ((1 << Z_BITS) - 1)) - Z_OFFSET], axis=1))
+    wide, mask = local.astype(np.int64), (1 << TILE_BITS) - 1
+    first = pack(np.array([[tile[0] << TILE_BITS, tile[1] << TILE_BITS, -Z_OFFSET]]))
+    x, y, z = wide >> (TILE_BITS + Z_BITS), wide >> Z_BITS & mask, wide & ((1 << Z_BITS) - 1)
+    return np.asarray(first + (x << 2 * AXIS_BITS | y << AXIS_BITS | z), np.int64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cache, reduce
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -102,36 +102,41 @@ def write_sum(
                 f"{run}: its drives have voxels of {sorted(sizes)} m, or another frame; map them again"
             )
         (run / place).parent.mkdir(exist_ok=True)
-        made_from, voxels = _parts(folders)
+        parts = _parts(folders)
+        made_from = {
+            tile: digest([about["sha256"] for about in parts[tile].values()]) for tile in sorted(parts)
+        }
+        voxels = {tile: sum(about["voxels"] for about in parts[tile].values()) for tile in parts}
         with folder_of_tiles(work, run, place.name) as made_in:
             made = of_map(earlier and earlier / place, made_from) | of_work(made_in, made_from)
-            new = {tile: known for tile, known in made_from.items() if tile not in made}
-            shared = [str(folder) for folder in folders], classes, str(made_in)
-            for _ in on_tiles(SUM_TILES, shared, new, voxels, executor or InProcess()):
+            new = {
+                tile: {"made_from": made_from[tile], "folders": list(parts[tile])}
+                for tile in parts
+                if tile not in made
+            }
+            for _ in on_tiles(SUM_TILES, (classes, str(made_in)), new, voxels, executor or InProcess()):
                 pass
-            made |= of_work(made_in, new)
+            made |= of_work(made_in, {tile: made_from[tile] for tile in new})
             tiles.write_tiles(sorted(made.items()), run / place, frame, maps[0].voxel_size_m, label_set)
 
 
-def sum_tiles(
-    folders: list[str], classes: str, made_in: str, of_tiles: list[tuple[int, int, str]]
-) -> list[None]:
-    """Save the sums of tiles of several maps, each with the digest of what it is made from: a task."""
-    maps = [tiles.open_map(Path(folder), open_label_set(classes), held=0) for folder in folders]
-    for x, y, made_from in of_tiles:
-        parts = [one.read_tile((x, y)).voxels for one in maps if (x, y) in one.tiles]
-        save((x, y), SemanticMap.of(reduce(add, parts)), {"made_from": made_from}, None, Path(made_in))
+def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[str, Any]]]) -> list[None]:
+    """Save the sums of tiles, each with the digest of what it is made from: a task."""
+    opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), held=0))
+    for x, y, of_tile in of_tiles:
+        parts = [opened(folder).read_tile((x, y)).voxels for folder in of_tile["folders"]]
+        about = {"made_from": of_tile["made_from"]}
+        save((x, y), SemanticMap.of(reduce(add, parts)), about, None, Path(made_in))
     return [None] * len(of_tiles)
 
 
 SUM_TILES = f"{sum_tiles.__module__}:{sum_tiles.__name__}"
 
 
-def _parts(folders: Sequence[Path]) -> tuple[dict[Tile, str], dict[Tile, int]]:
-    """Of every tile the digest of the files that it is summed from, and their number of voxels."""
-    parts: dict[Tile, list[dict[str, Any]]] = {}
+def _parts(folders: Sequence[Path]) -> dict[Tile, dict[str, dict[str, Any]]]:
+    """Tile -> folder of a map that has it -> what its `map.json` says of it."""
+    parts: dict[Tile, dict[str, dict[str, Any]]] = {}
     for folder in folders:
         for name, about in files_of(folder).items():
-            parts.setdefault(tile_of(name), []).append(about)
-    made_from = {tile: digest([about["sha256"] for about in parts[tile]]) for tile in sorted(parts)}
-    return made_from, {tile: sum(about["voxels"] for about in parts[tile]) for tile in parts}
+            parts.setdefault(tile_of(name), {})[str(folder)] = about
+    return parts

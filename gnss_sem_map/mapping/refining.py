@@ -11,12 +11,13 @@ import base64
 import hashlib
 import io
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import partial, reduce
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache, partial, reduce
 from operator import add
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +72,13 @@ def refine_map(
     change, tiles that were refined from the same are taken, and so are those that an interrupted call left in the
     folder `work`. Raises DataError.
     """
-    with folder_of_tiles(work, run, REFINED) as made_in:
-        return _Refinement(raw, run, settings, progress, earlier, executor or InProcess(), made_in).write()
+    try:
+        with folder_of_tiles(work, run, REFINED) as made_in:
+            return _Refinement(
+                raw, run, settings, progress, earlier, executor or InProcess(), made_in
+            ).write()
+    finally:
+        _inputs.cache_clear()
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +92,8 @@ class _Refinement:
     earlier: Path | None
     executor: Executor
     made_in: Path
+    call: str = field(default_factory=lambda: uuid4().hex)
+    """Sets its tasks apart from those of another call, which may have changed the files."""
 
     def write(self) -> Refined:
         fused = self.raw.fused
@@ -107,8 +115,8 @@ class _Refinement:
 
     def _on_tiles(
         self, stage: str, function: str, more: tuple[Any, ...], of_tiles: Mapping[Tile, Any]
-    ) -> Any:
-        shared = str(self.run), self.settings.model_dump_json(), str(self.made_in), *more
+    ) -> Iterator[tuple[Tile, Any]]:
+        shared = str(self.run), self.settings.model_dump_json(), self.call, str(self.made_in), *more
         return on_tiles(
             function, shared, of_tiles, self._voxels, self.executor, partial(self.progress, stage)
         )
@@ -187,7 +195,7 @@ class _Refinement:
 
 
 class _Inputs:
-    """What tasks read of a run."""
+    """What tasks read of a run; several tasks of one call share the tiles that are in memory."""
 
     def __init__(self, run: str, settings: str) -> None:
         opened = Settings.model_validate_json(settings)
@@ -206,11 +214,16 @@ class _Inputs:
         return Evidence(moved, self.model, keyframes)
 
 
+@lru_cache(1)
+def _inputs(run: str, settings: str, call: str) -> _Inputs:
+    return _Inputs(run, settings)
+
+
 def measure_tiles(
-    run: str, settings: str, made_in: str, of_tiles: list[tuple[int, int, str]]
+    run: str, settings: str, call: str, made_in: str, of_tiles: list[tuple[int, int, str]]
 ) -> list[dict[str, int]]:
     """Sums of tiles, saved with the digest of what is around each: a task."""
-    inputs, found = _Inputs(run, settings), []
+    inputs, found = _inputs(run, settings, call), []
     for x, y, around in of_tiles:
         voxels, _ = inputs.raw.around((x, y), inputs.halo)
         sums = sums_of((x, y), voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
@@ -220,10 +233,15 @@ def measure_tiles(
 
 
 def refine_tiles(
-    run: str, settings: str, made_in: str, figures: dict[str, Any], of_tiles: list[tuple[int, int, Any]]
+    run: str,
+    settings: str,
+    call: str,
+    made_in: str,
+    figures: dict[str, Any],
+    of_tiles: list[tuple[int, int, Any]],
 ) -> list[None]:
     """Refine tiles, and save each with what `map.json` is to say of it and its report: a task."""
-    inputs = _Inputs(run, settings)
+    inputs = _inputs(run, settings, call)
     for x, y, about in of_tiles:
         voxels, moved = inputs.raw.around((x, y), inputs.halo)
         beside = inputs.beside((x, y), voxels, moved)

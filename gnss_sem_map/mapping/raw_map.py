@@ -18,7 +18,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.execution import Executor, InProcess
-from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, on_tiles
+from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest, of_map, of_work, save
@@ -114,9 +114,8 @@ def write_sum(
                 for tile in parts
                 if tile not in made
             }
-            for _ in on_tiles(SUM_TILES, (classes, str(made_in)), new, voxels, executor or InProcess()):
-                pass
-            made |= of_work(made_in, {tile: made_from[tile] for tile in new})
+            shared = classes, str(made_in)
+            made |= make_tiles(SUM_TILES, shared, new, voxels, executor or InProcess(), made_in)
             tiles.write_tiles(sorted(made.items()), run / place, frame, maps[0].voxel_size_m, label_set)
 
 

@@ -11,7 +11,7 @@ import base64
 import hashlib
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial, reduce
 from operator import add
@@ -29,7 +29,7 @@ from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
-from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, on_tiles
+from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles, on_tiles
 from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
@@ -104,22 +104,20 @@ class _Refinement:
         said = {tile: {"around": around[tile], "sums": sums[tile].to_json()} for tile in sums}
         made = self._made(made_from, said)
         new = {tile: {"made_from": made_from[tile], "said": said[tile]} for tile in sums if tile not in made}
-        for _ in self._on_tiles("refinement", REFINE_TILES, (asdict(figures),), new):
-            pass
-        made |= of_work(self.made_in, {tile: made_from[tile] for tile in new})
+        made |= make_tiles(
+            REFINE_TILES, (*self._shared, asdict(figures)), new, self._voxels, self.executor, self.made_in,
+            partial(self.progress, "refinement"),
+        )  # fmt: skip
         pieces = [(tile, made[tile]) for tile in fused.tiles]
         tiles.write_tiles(pieces, self.run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set)
         reports = [RefinementReport.from_json(made[tile].about["said"]["report"]) for tile in sums]
         kerbs = [_kerbs(made[tile].beside) for tile in sums if made[tile].beside is not None]
         return Refined(reduce(add, reports), kerb_points.joined(kerbs) if kerbs else None)
 
-    def _on_tiles(
-        self, stage: str, function: str, more: tuple[Any, ...], of_tiles: Mapping[Tile, Any]
-    ) -> Iterator[tuple[Tile, Any]]:
-        shared = str(self.run), self.settings.model_dump_json(), self.call, str(self.made_in), *more
-        return on_tiles(
-            function, shared, of_tiles, self._voxels, self.executor, partial(self.progress, stage)
-        )
+    @property
+    def _shared(self) -> tuple[Any, ...]:
+        """What all tasks are told."""
+        return str(self.run), self.settings.model_dump_json(), self.call, str(self.made_in)
 
     @property
     def _tiles(self) -> list[Tile]:
@@ -161,7 +159,10 @@ class _Refinement:
                 except (KeyError, TypeError, ValueError):
                     continue  # there is none that can be read
         new = {tile: around[tile] for tile in self._tiles if tile not in known}
-        for tile, sums in self._on_tiles("figures", MEASURE_TILES, (), new):
+        found = on_tiles(
+            MEASURE_TILES, self._shared, new, self._voxels, self.executor, partial(self.progress, "figures")
+        )
+        for tile, sums in found:
             known[tile] = Sums.from_json(sums)
         return {tile: known[tile] for tile in self._tiles}
 

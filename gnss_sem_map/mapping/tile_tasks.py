@@ -11,6 +11,8 @@ from typing import Any
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import TILES
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
+from gnss_sem_map.voxels.map_json import name_of
+from gnss_sem_map.voxels.reuse import Made, of_work
 from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.tiles import z_order
 
@@ -41,6 +43,30 @@ def on_tiles(
         done += len(group_of[task])
         progress(done, len(of_tiles))
         yield from zip(group_of[task], results, strict=True)
+
+
+def make_tiles(
+    function: str,
+    shared: tuple[Any, ...],
+    of_tiles: Mapping[Tile, dict[str, Any]],
+    voxels: Mapping[Tile, int],
+    executor: Executor,
+    made_in: Path,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[Tile, Made]:
+    """The tiles that tasks saved in a folder, see `on_tiles`; `of_tiles` says what each is `made_from`.
+
+    Raises DataError where one is not found.
+    """
+    for _ in on_tiles(function, shared, of_tiles, voxels, executor, progress):
+        pass
+    made = of_work(made_in, {tile: of_tile["made_from"] for tile, of_tile in of_tiles.items()})
+    if lost := of_tiles.keys() - made.keys():
+        raise DataError(
+            f"{made_in}: {len(lost)} of {len(of_tiles)} tiles that were saved are not there, or damaged, such as"
+            f" {name_of(min(lost))}; do all workers see this folder?"
+        )
+    return made
 
 
 @contextmanager

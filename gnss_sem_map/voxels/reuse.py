@@ -53,8 +53,10 @@ def of_map(folder: Path | None, made_from: Mapping[Tile, str]) -> dict[Tile, Mad
 def of_work(folder: Path, made_from: Mapping[Tile, str]) -> dict[Tile, Made]:
     """The whole tiles in a work folder that were made from the same, by `digest`."""
     known = {}
+    there = {path.name for path in folder.iterdir()}  # NFS remembers for a while that a file was not there
     for tile in made_from:
-        record = read_record(_record_of(tile, folder))
+        path = _record_of(tile, folder)
+        record = read_record(path) if path.name in there else None
         if record is not None and is_about_a_tile(record.get("about")):
             known[tile] = Made(folder / name_of(tile), record["about"], record.get("beside"))
     return _same(known, made_from)

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +14,11 @@ import pytest
 from raw_street import EVERY, FRAME, SETTINGS, VOXELS, content, write_raw
 
 from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import TILES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import refining, tile_tasks
-from gnss_sem_map.mapping.execution import InProcess
+from gnss_sem_map.mapping.execution import InProcess, Task
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.mapping.tile_tasks import on_tiles
@@ -183,3 +184,16 @@ def test_one_task_is_done_in_this_process() -> None:
             raise AssertionError
 
     assert list(on_tiles("gnss_sem_map.x:y", (), {}, {}, Unused())) == []  # type: ignore[arg-type]
+
+
+def test_tiles_that_a_worker_saved_elsewhere_are_an_error(tmp_path: Path, small_tasks: None) -> None:
+    class Elsewhere:
+        def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, object]]:
+            yield from ((task, [None] * len(task.arguments[-1])) for task in tasks)
+
+    drives = [write_raw(tmp_path / name) for name in ("a", "b")]
+    (tmp_path / "out").mkdir()
+    with pytest.raises(
+        DataError, match=r"7 of 7 tiles .* such as 0_0.parquet; do all workers see this folder\?$"
+    ):
+        write_sum(drives, tmp_path / "out", FRAME, executor=Elsewhere())

@@ -20,7 +20,6 @@ from typing import Any
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.labels import sensor_model
@@ -42,7 +41,7 @@ from gnss_sem_map.voxels.map_json import files_of, name_of
 from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.tiles import places_around
-from gnss_sem_map.voxels.voxel_map import VoxelMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, limits_of
 
 REFINED = "refined"
 
@@ -208,9 +207,7 @@ class _Inputs:
         own = around.indices[places_around(around, tile, 0)]
         keyframes = None
         if len(own) and self.steps.free_space.enabled:
-            box: NDArray[np.float64] = (
-                np.stack([own.min(axis=0), own.max(axis=0)]) + 0.5
-            ) * around.voxel_size_m
+            box = (np.stack(limits_of(own)) + 0.5) * around.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
         return Evidence(moved, self.model, keyframes)
 

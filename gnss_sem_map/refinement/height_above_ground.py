@@ -7,6 +7,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from gnss_sem_map.voxels.voxel_map import limits_of
+
 CELL_M = 1.0
 QUANTILE = 0.05
 """A cell's ground is this quantile of its heights: the lowest returns are often reflections from below."""
@@ -27,8 +29,9 @@ def height_over_ground(centres: NDArray[np.float64]) -> NDArray[np.float32]:
     """
     heights = np.empty(len(centres), np.float32)
     if len(centres):
-        origin = np.floor(centres[:, :2].min(axis=0) / CELL_M) - 1
-        shape = np.floor(centres[:, :2].max(axis=0) / CELL_M) - origin + 2
+        low, high = limits_of(centres[:, :2])
+        origin = np.floor(low / CELL_M) - 1
+        shape = np.floor(high / CELL_M) - origin + 2
         ground = np.full(shape.astype(np.int64), np.inf)
         _lowest(centres, origin, CELL_M, QUANTILE, ground)
         _heights(centres, origin, CELL_M, _smoothed(ground), heights)

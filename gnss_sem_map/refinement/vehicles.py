@@ -20,6 +20,7 @@ from gnss_sem_map.refinement.state import (
     classes_of,
 )
 from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
+from gnss_sem_map.voxels.voxel_map import limits_of
 
 LOWEST_M, HIGHEST_M = 0.1, 3.5
 """Heights over the ground between which a voxel may be a vehicle: lower is the ground, higher no truck reaches."""
@@ -184,8 +185,9 @@ def _over(indices: NDArray[np.int32], road: NDArray[np.int32], reach_voxels: flo
     x, y = (one.ravel() for one in np.meshgrid(*2 * [np.arange(-reach, reach + 1)], indexing="ij"))
     order = np.argsort(np.hypot(x, y), kind="stable")  # the nearest first: most have road there
     disc = np.stack([x, y], axis=1)[order][np.hypot(x, y)[order] <= reach_voxels + TIE]
-    origin = np.minimum(indices.min(axis=0), road.min(axis=0))[:2] - reach
-    is_road = np.zeros(np.maximum(indices.max(axis=0), road.max(axis=0))[:2] - origin + reach + 1, np.bool_)
+    low, high = zip(limits_of(indices[:, :2]), limits_of(road[:, :2]), strict=True)
+    origin = np.minimum(*low) - reach
+    is_road = np.zeros(np.maximum(*high) - origin + reach + 1, np.bool_)
     is_road[tuple((road[:, :2] - origin).T)] = True
     found = np.zeros(len(indices), np.bool_)
     _near_marked(is_road, indices[:, :2] - origin, disc, found)

@@ -21,6 +21,7 @@ from gnss_sem_map.voxels.voxel_map import (
     VoxelTable,
     heights_in_voxels,
     keys_of,
+    limits_of,
     log_table,
     pack,
     unpack,
@@ -263,3 +264,10 @@ def test_adding_maps_that_would_overflow_is_an_error() -> None:
     many = VoxelMap(0.2, URBAN, keys, np.zeros((1, 5), np.int32), np.full(1, (1 << 31) - 1, np.uint32))
     with pytest.raises(DataError, match="overflow"):
         many + many
+
+
+def test_limits_are_those_of_every_column() -> None:
+    rows = np.random.default_rng(0).integers(-99, 99, (50, 3))
+    low, high = limits_of(rows)
+    np.testing.assert_array_equal(low, rows.min(axis=0))
+    np.testing.assert_array_equal(high, rows.max(axis=0))

@@ -39,7 +39,7 @@ Workers = Annotated[
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(help="Address of a Dask scheduler whose workers map the drives (docs/cluster.md)."),
+    typer.Option(help="Address of a Dask scheduler whose workers map instead (docs/cluster.md)."),
 ]
 Resume = Annotated[bool, typer.Option(help="Continue an interrupted run of the same drives and settings.")]
 
@@ -80,6 +80,8 @@ def run(
     from gnss_sem_map.segmentation import no_segmenter_message
 
     settings, frame, found = settings_of(config, set_), frame_of(origin), drives_of(drives)
+    if scheduler is not None and workers is not None:
+        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     if len(found) > 1:
         if write_labels:
             raise typer.BadParameter("works for one drive at a time", param_hint="--write-labels")
@@ -89,8 +91,6 @@ def run(
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)
         _run_many(found, out, settings, how, frame, workers, scheduler, as_json)
         return
-    if scheduler is not None:
-        raise typer.BadParameter("a cluster maps several drives; found one", param_hint="--scheduler")
     [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config)):
         log = open_log(drive, drive_format, frames)
@@ -100,8 +100,9 @@ def run(
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
-                log=log, frames=frames, device=device, origin=frame, workers=workers or default_workers(),
-                resume=resume, write_labels=write_labels, force=force, progress=progress,
+                log=log, frames=frames, drive_format=drive_format, device=device, origin=frame,
+                workers=workers or default_workers(), scheduler=scheduler, resume=resume,
+                write_labels=write_labels, force=force, progress=progress,
             )  # fmt: skip
     about = finished.about
     warn(about["warnings"])
@@ -120,8 +121,6 @@ def _run_many(
 ) -> None:
     from gnss_sem_map.runs.many_drives import run_drives
 
-    if scheduler is not None and workers is not None:
-        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     with progress_bars() as progress:
         made = run_drives(
             drives, out, settings, how,

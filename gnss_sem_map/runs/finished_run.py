@@ -32,7 +32,10 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import DRIVES, MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.chunk_tasks import ChunkTasks
+from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import TRACK, write_merged
+from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -53,6 +56,7 @@ def run(
     device: str = "auto",
     origin: LocalFrame | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
     resume: bool = False,
     write_labels: bool = False,
     force: bool = False,
@@ -61,26 +65,25 @@ def run(
     """Map one drive into a run folder, as `gnss-sem-map run` does.
 
     `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only, and `{drive}` in it the name of
-    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. Raises PreflightError where the drive
+    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. The scans are shared among `workers`
+    processes, or the workers of the Dask scheduler at the address `scheduler`. Raises PreflightError where the drive
     looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
-    segmenter = run_folder.segmenter_of(drive, segmenter)
-    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
-        log = log or open_drive(drive, drive_format).between(frames)
+    source = source_of(drive, segmenter, frames, drive_format, device)
+    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, source.segmenter)) as claim:
+        log = log or source.open_log()
         refuse_inputs(claim.out, sorted(log.folders))
-        network = None
-        if segmenter not in (None, "none"):
-            label_set = open_label_set(settings.classes)
-            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
+        network = source.open_network(settings, log)
+        executor = executor_of(workers, scheduler, claim.work)
+        elsewhere = None if executor is None else ChunkTasks(source, executor)
         with new_folder(out) as folder:
             mapped = pipeline.run(
                 log, network, settings, folder, claim.work, progress,
-                origin=origin, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
+                origin=origin, resume=resume, elsewhere=elsewhere, labels_from=source.labels_from, force=force,
             )  # fmt: skip
             refined = pipeline.refine(folder, settings, mapped.stats, progress)
-            inputs = run_folder.inputs_of_run(drive, segmenter, frames)
-            run_folder.write_run(folder, drive, mapped, refined, settings, write_labels, inputs)
+            run_folder.write_run(folder, source, mapped, refined, settings, write_labels)
     return Run(out)
 
 
@@ -175,7 +178,7 @@ class Run:
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
-        inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
+        inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
         stats = RunStats()
         with self._rewritten(out) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:

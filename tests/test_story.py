@@ -226,7 +226,7 @@ def test_damaged_scans_and_missing_labels_are_skipped_and_counted(
         (("run", "DRIVE", "-o", "out", "--segmenter", "none", "--frames", "100:200"), 1, "none of 0 scans can be used"),
         (("run", "DRIVE", "-o", "DRIVE"), 1, "which is read; choose another -o"),
         (("run", "DRIVE", "other", "-o", "out", "--write-labels"), 2, "works for one drive at a time"),
-        (("run", "DRIVE", "-o", "out", "--origin", "49.0,8.4"), 2, "found '49.0,8.4' (not enough values"),
+        (("run", "DRIVE", "-o", "out", "--origin", "49.0,8.4"), 2, "found '49.0,8.4', expected three"),
         (("run", "DRIVE", "-o", "out", "--origin", "91,8.4,0"), 2, "expected |lat| <= 90"),
         (("run", "DRIVE", "-o", "out", "--scheduler", "x:1"), 2, "a cluster maps several drives; found one"),
         (("run", "A", "B", "-o", "out", "--segmenter", "none", "--scheduler", "x", "--workers", "2"), 2, "own workers"),

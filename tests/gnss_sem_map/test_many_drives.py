@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -30,6 +31,7 @@ from gnss_sem_map.mapping.merging import merge_runs
 from gnss_sem_map.runs import finished_run, many_drives, merged_run
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, add_drive, remove_drive, run_drives
+from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
@@ -200,6 +202,49 @@ def test_a_drive_that_fails_is_left_out_and_two_workers_make_the_map_of_the_othe
     differ = {name for name, content in products(out).items() if content != expected.get(name)}
     assert differ <= {"run.json", "report.html"}
     assert products(out).keys() == expected.keys()
+
+
+NETWORK = """
+import os, signal
+import numpy as np
+
+def look(pixels):
+    if __name__ == "network_c":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return np.full((*pixels.shape[:2], 2), 0.5, np.float32)
+
+look.class_names = ["road", "other"]
+"""
+
+
+def test_a_drive_that_kills_its_workers_is_left_out(
+    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "networks").mkdir()
+    for name in "abc":
+        (tmp_path / f"networks/network_{name}.py").write_text(NETWORK)
+    monkeypatch.syspath_prepend(tmp_path / "networks")
+    places, how = list(drives.by_name.values()), HowMapped("python:network_{drive}:look", force=True)
+    made = run_drives(places, tmp_path / "out", SETTINGS, how, workers=2)
+    assert made.about["merged"] == ["a", "b"]
+    assert list(made.failed) == ["c"]
+    assert "given up after 3 attempts: 3 x a worker process died (SIGKILL" in made.failed["c"]
+
+
+def test_an_error_of_the_disk_in_one_drive_leaves_the_others(
+    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Source.open_log
+
+    def fails(source: Source) -> SensorLog:
+        if source.name == "b":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), "/torn/disk")
+        return original(source)
+
+    monkeypatch.setattr(Source, "open_log", fails)
+    made = mapped("ab", drives, tmp_path / "out", how)
+    assert made.about["merged"] == ["a"]
+    assert made.failed == {"b": f"/torn/disk: {os.strerror(errno.EIO)}"}
 
 
 def test_where_no_drive_can_be_mapped_nothing_is_written(

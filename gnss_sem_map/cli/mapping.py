@@ -69,7 +69,12 @@ def run(
     workers: Workers = None,
     scheduler: Scheduler = None,
     resume: Resume = False,
-    write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
+    write_labels: Annotated[
+        bool,
+        typer.Option(
+            help="Also write a class per original LiDAR point; of several drives, in OUT/drives/NAME/."
+        ),
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -83,13 +88,11 @@ def run(
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     if len(found) > 1:
-        if write_labels:
-            raise typer.BadParameter("works for one drive at a time", param_hint="--write-labels")
         if segmenter is None:
             typer.echo(no_segmenter_message(str(found[0])), err=True)
             raise typer.Exit(1)
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)
-        _run_many(found, out, settings, how, frame, workers, scheduler, as_json)
+        _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, as_json)
         return
     [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config)):
@@ -117,6 +120,7 @@ def _run_many(
     origin: LocalFrame | None,
     workers: int | None,
     scheduler: str | None,
+    write_labels: bool,
     as_json: bool,
 ) -> None:
     from gnss_sem_map.runs.many_drives import run_drives
@@ -124,7 +128,8 @@ def _run_many(
     with progress_bars() as progress:
         made = run_drives(
             drives, out, settings, how,
-            origin=origin, workers=workers or default_workers(), scheduler=scheduler, progress=progress,
+            origin=origin, workers=workers or default_workers(), scheduler=scheduler,
+            write_labels=write_labels, progress=progress,
         )  # fmt: skip
     print_many(made.about, out, as_json)
     if made.failed:

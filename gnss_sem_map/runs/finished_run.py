@@ -147,13 +147,22 @@ class Run:
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
-            for part in (MAP, evidence.FOLDER, DRIVES):
-                if is_folder(self.folder / part):
-                    shutil.copytree(self.folder / part, folder / part, copy_function=link_or_copy)
+            old_labels = shutil.ignore_patterns(*run_folder.LABELS)
+            for name in (MAP, evidence.FOLDER, DRIVES):
+                if is_folder(self.folder / name):
+                    shutil.copytree(
+                        self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
+                    )
             refined = pipeline.refine(folder, settings, stats)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, self.folder / TRACK, settings, about)
+                for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
+                    one = Run(known.parent)
+                    part = folder / DRIVES / known.parent.name
+                    run_folder.write_point_labels(
+                        part, one.drive(), one.trajectory, refined.kerbs, settings, known, folder
+                    )
             else:
                 known = self.folder / run_folder.RAW_LABELS
                 run_folder.write_again(

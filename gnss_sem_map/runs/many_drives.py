@@ -1,6 +1,6 @@
 """Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
 
-OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive
+OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive; its point labels, by the map of all
 OUT/map, ...        their sum, refined and exported as the map of one drive is
 
 Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once.
@@ -18,6 +18,7 @@ from typing import Any
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
@@ -54,6 +55,10 @@ class HowMapped:
     force: bool = False
     resume: bool = False
 
+    def source(self, drive: Path) -> Source:
+        """What the run of this drive reads."""
+        return source_of(drive, self.segmenter, self.frames, self.drive_format, self.device)
+
 
 @dataclass(frozen=True)
 class ManyDrives:
@@ -78,6 +83,7 @@ def run_drives(
     origin: LocalFrame | None = None,
     workers: int = 1,
     scheduler: str | None = None,
+    write_labels: bool = False,
     progress: Progress = silent,
 ) -> ManyDrives:
     """Map several drives into one map, in the frame `origin`, by default that of the first drive.
@@ -96,7 +102,8 @@ def run_drives(
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
-        about = _write(out, done, settings, frame, failed, progress)
+        labelled = [how.source(drive) for drive in drives if drive.name in done and write_labels]
+        about = _write(out, done, settings, frame, failed, progress, labelled)
     return ManyDrives(out, about)
 
 
@@ -194,8 +201,13 @@ def _map_all(
     origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
     tasks = []
     for drive in drives:
-        source = source_of(drive, how.segmenter, how.frames, how.drive_format, how.device)
-        arguments = (asdict(source), str(claim.work / DRIVES / drive.name), str(file), origin, how.force)
+        arguments = (
+            asdict(how.source(drive)),
+            str(claim.work / DRIVES / drive.name),
+            str(file),
+            origin,
+            how.force,
+        )
         tasks.append(Task(drive.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
     found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
     return {task.name: reason for task, reason in found if reason}
@@ -208,8 +220,9 @@ def _write(
     frame: LocalFrame,
     failed: Mapping[str, str],
     progress: Progress,
+    labelled: Sequence[Source] = (),
 ) -> dict[str, Any]:
-    """Write the map of these drives, whose folders are linked into it."""
+    """Write the map of these drives, whose folders are linked into it, and the point labels of some."""
     stats = RunStats()
     with new_folder(out) as folder:
         parts = [folder / DRIVES / name for name in sorted(drives)]
@@ -217,7 +230,12 @@ def _write(
             _link_all(drives[part.name], part)
         with stats.stage("mapping"):
             write_sum(parts, folder, frame, open_label_set(settings.classes), out)
-        refined = pipeline.refine(folder, settings, stats, progress, out)
+        # tiles that are taken from an earlier map do not say which points of kerbs are which
+        refined = pipeline.refine(folder, settings, stats, progress, None if labelled else out)
+        for source in labelled:
+            part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
+            trajectory = Trajectory.load(part / "trajectory.parquet")
+            run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
         about = {
             "name": " + ".join(part.name for part in parts),
             "merged": [part.name for part in parts],

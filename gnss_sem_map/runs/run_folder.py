@@ -43,6 +43,8 @@ from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
 RAW_LABELS = "labels_raw"
+LABELS = ("labels", RAW_LABELS, "confidence", "removed")
+"""Folders of the point labels of one drive."""
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
 
@@ -231,21 +233,22 @@ def write_point_labels(
     kerbs: Kerbs | None,
     settings: Settings,
     known_raw: Path | None = None,
+    run: Path | None = None,
 ) -> None:
     """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
-    `known_raw`: a folder with the labels before refinement, which are copied.
+    `known_raw`: a folder with the labels before refinement, which are copied. `run`: the folder of the maps, if it is
+    another one.
     """
-    for name in ("labels", "confidence", "removed"):
+    for name in LABELS:
         (folder / name).mkdir()
-    if known_raw is None:
-        (folder / RAW_LABELS).mkdir()
-    else:
-        shutil.copytree(known_raw, folder / RAW_LABELS)
+    if known_raw is not None:
+        shutil.copytree(known_raw, folder / RAW_LABELS, dirs_exist_ok=True)
     label_set = open_label_set(settings.classes)
     ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
-    maps = [tiles.open_map(folder / name, label_set) for name in (MAP, REFINED)[known_raw is not None :]]
+    places = [(run or folder) / name for name in (MAP, REFINED)[known_raw is not None :]]
+    maps = [tiles.open_map(place, label_set) for place in places]
     moving = evidence.read(folder, label_set).moving_points
     for scan, (*raw, refined) in label_points(log, trajectory, maps, settings, moving, kerbs):
         if raw:

@@ -413,6 +413,32 @@ def test_a_map_of_many_drives_is_merged_with_all_its_keyframe_scans(made: dict[s
     ]
 
 
+def labels_of(drive: Path) -> dict[str, bytes]:
+    names = ("labels", "labels_raw", "confidence", "removed")
+    files = [path for name in names for path in (drive / name).iterdir()]
+    return {path.relative_to(drive).as_posix(): path.read_bytes() for path in files}
+
+
+def test_every_drive_has_the_point_labels_of_the_map_of_all(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    """Those of one drive are those of a run of this drive alone; with two, both have some, also after refinement."""
+    a, b = (drives.by_name[name] for name in "ab")
+    finished_run.run(a, tmp_path / "alone", drives.labels, SETTINGS, force=True, write_labels=True)
+    run_drives([a], tmp_path / "one", SETTINGS, how, write_labels=True)
+    alone = labels_of(tmp_path / "alone")
+    assert labels_of(tmp_path / "one/drives/a") == alone
+    out = tmp_path / "two"
+    run_drives([a, b], out, SETTINGS, how, write_labels=True)
+    labels = {name: labels_of(out / "drives" / name) for name in "ab"}
+    assert labels["a"].keys() == labels["b"].keys() == alone.keys()
+    assert labels["a"] != alone, "the other drive sees the same walls"
+    Run.open(out).refine(SETTINGS)
+    assert {name: labels_of(out / "drives" / name) for name in "ab"} == labels
+    add_drive(out, drives.by_name["c"], how)
+    assert_same(out, made["abc"])
+
+
 def test_to_a_merged_map_no_drive_is_added(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:

@@ -10,9 +10,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -23,31 +21,15 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC, ChunkStore, open_store
+from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
-from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
 """Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
-
-
-@dataclass(frozen=True, eq=False)
-class Maps:
-    """The map of static points and the map of moving points; no point is in both."""
-
-    static: VoxelMap
-    removed: VoxelMap
-
-
-def build_maps(drive: Drive, stats: RunStats, progress: Progress = silent) -> Maps:
-    """Both maps of a drive in memory; see `map_scans`."""
-    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        store = map_scans(drive, Path(folder), stats, progress)
-        return Maps(store.whole(STATIC), store.whole(REMOVED))
 
 
 def map_scans(

@@ -25,6 +25,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from cut_drive import cut_all
 
 RESULTS = Path(__file__).parent / "results" / "scale.json"
@@ -44,6 +45,8 @@ finally:
     print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
 """
 Figures = dict[str, Any]
+TILING = ("drives", "mapping", "refinement")
+"""Stages of a run of many drives that workers share: drives, the sum of their maps, and its refinement."""
 DASK = Path(sys.executable).with_name("dask")
 
 
@@ -120,10 +123,41 @@ def memory(drives: Drives, out: Path) -> Figures:
             f"real_time_factor_{seconds}_s": seconds / figures["wall_s"],
             f"cpu_ms_per_scan_{seconds}_s": 1000 * figures["cpu_s"] / about["counts"]["scans"],
             f"seconds_by_stage_{seconds}_s": about["seconds"],
-            f"voxels_{seconds}_s": about["map"]["voxels"],
+            f"sizes_{seconds}_s": sizes(out / f"{seconds}"),
         }
     found["peak_480_over_60"] = found["peak_mb_480_s"] / found["peak_mb_60_s"]
     return found
+
+
+def sizes(run: Path) -> Figures:
+    """What the result of one drive holds: its length, its voxels, and the bytes of each part."""
+    about, refined = (
+        json.loads((run / "run.json").read_text()),
+        json.loads((run / "refined/map.json").read_text()),
+    )
+    stamps_and_positions = np.loadtxt(run / "trajectory.tum", usecols=(0, 1, 2, 3))
+    steps = np.linalg.norm(np.diff(stamps_and_positions[:, 1:], axis=0), axis=1)
+    parts = ("map", "refined", "evidence/moved", "evidence/keyframes", "evidence/moving_points")
+    products = [path for path in run.glob("*") if path.name.startswith(("map.", "viewer", "topview"))]
+    return {
+        "seconds": stamps_and_positions[-1, 0] - stamps_and_positions[0, 0],
+        "km": steps.sum() / 1000,
+        "scans": about["counts"]["scans"],
+        "voxels": about["map"]["voxels"],
+        "tiles": refined["tiles"],
+        "bytes": {part: bytes_in(run / part) for part in parts}
+        | {
+            "products": sum(map(bytes_in, products)),
+            "trajectory": sum(map(bytes_in, run.glob("trajectory.*"))),
+            "run.json": bytes_in(run / "run.json"),
+            "refined/map.json": bytes_in(run / "refined/map.json"),
+        },
+    }
+
+
+def bytes_in(path: Path) -> int:
+    """Of a file, or of all files of a folder."""
+    return sum(each.stat().st_size for each in [path, *path.rglob("*")] if each.is_file())
 
 
 def reads(drives: Drives, out: Path) -> Figures:
@@ -141,14 +175,8 @@ def disk(drives: Drives, out: Path) -> Figures:
     found: Figures = {}
     for layer in ("map", "refined", "evidence/moved"):
         voxels = json.loads((folder / layer / "map.json").read_text())["voxels"]
-        found[f"bytes_per_voxel_{layer}"] = _bytes_in(folder / layer) / max(voxels, 1)
-    found["bytes_per_second_keyframes"] = _bytes_in(folder / "evidence/keyframes") / 30
-    found["bytes_per_second_moving_points"] = _bytes_in(folder / "evidence/moving_points") / 30
+        found[f"bytes_per_voxel_{layer}"] = bytes_in(folder / layer) / max(voxels, 1)
     return found
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def refinement(drives: Drives, out: Path) -> Figures:
@@ -177,31 +205,41 @@ def refinement(drives: Drives, out: Path) -> Figures:
 
 
 def workers(drives: Drives, out: Path) -> Figures:
-    """Two processes over one, and Dask over processes; the same bytes from all."""
-    some = drives.of(30)[:2]
-    found, sums = {}, {}
-    for count in (1, 2):
-        figures = run(drives.words(some, out / f"workers{count}", "--workers", str(count)))
-        found[f"wall_s_{count}_workers"], sums[count] = figures["wall_s"], checksums(out / f"workers{count}")
+    """Two processes over one, and Dask over processes, for six drives; the same bytes from all."""
+    some = drives.of(30)[:6]
+    found: Figures = {"drives": len(some)}
+    sums = {}
     with _dask(2) as (address, _):
-        figures = run(drives.words(some, out / "dask", "--scheduler", address))
-        found["wall_s_dask"], sums["dask"] = figures["wall_s"], checksums(out / "dask")
-    found["two_workers_over_one"] = found["wall_s_1_workers"] / found["wall_s_2_workers"]
-    found["dask_over_processes"] = found["wall_s_2_workers"] / found["wall_s_dask"]
-    found["same_bytes"] = sums[1] == sums[2] == sums["dask"]
+        for name, how in (
+            ("1", ["--workers", "1"]),
+            ("2", ["--workers", "2"]),
+            ("dask", ["--scheduler", address]),
+        ):
+            figures = run(drives.words(some, out / name, *how), threads=1)
+            seconds = json.loads((out / name / "run.json").read_text())["seconds"]
+            found[f"wall_s_{name}"] = figures["wall_s"]
+            found[f"seconds_by_stage_{name}"] = seconds
+            found[f"tiling_s_{name}"] = sum(seconds[stage] for stage in TILING)
+            sums[name] = checksums(out / name)
+    found["two_workers_over_one"] = found["wall_s_1"] / found["wall_s_2"]
+    found["two_workers_over_one_tiling"] = found["tiling_s_1"] / found["tiling_s_2"]
+    found["dask_over_processes"] = found["wall_s_2"] / found["wall_s_dask"]
+    found["same_bytes"] = sums["1"] == sums["2"] == sums["dask"]
     return found
 
 
 def twenty(drives: Drives, out: Path) -> Figures:
     """Twenty drives, one map: one process, two processes, and Dask with a worker killed on the way."""
-    some, sums, found = drives.of(30)[:20], [], {"drives": len(drives.of(30)[:20])}
+    some, sums = drives.of(30)[:20], []
+    found: Figures = {"drives": len(some)}
     for count in (1, 2):
-        run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        figures = run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        found[f"wall_s_{count}"] = figures["wall_s"]
         sums.append(checksums(out / f"twenty{count}"))
     with _dask(2) as (address, processes):
         killer = subprocess.Popen(["sh", "-c", f"sleep 60; pkill -KILL -P {processes[1].pid}"])
-        run(drives.words(some, out / "twenty_dask", "--scheduler", address))
-        sums.append(checksums(out / "twenty_dask"))
+        found["wall_s_dask"] = run(drives.words(some, out / "dask", "--scheduler", address))["wall_s"]
+        sums.append(checksums(out / "dask"))
         killer.wait()
     return found | {"twenty_same_bytes": sums[0] == sums[1] == sums[2], "files": len(sums[0])}
 

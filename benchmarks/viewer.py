@@ -62,7 +62,7 @@ def cost(edge: int) -> dict[str, Any]:
     town(tiles[0])
     before, begun = peak_mb(), time.process_time()
     with TemporaryDirectory() as folder:
-        write_viewer(TiledMap(0.2, LABELS, None, tiles, read_tile), None, Path(folder) / "viewer.html")
+        write_viewer(TiledMap(0.2, LABELS, None, tiles, read_tile), (), Path(folder) / "viewer.html")
         seconds = time.process_time() - begun - making
         finer = [file.stat().st_size for file in Path(folder).glob("viewer/*")]
         page = (Path(folder) / "viewer.html").stat().st_size

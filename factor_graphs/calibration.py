@@ -5,6 +5,7 @@ its place move the residual by v d + R dl. One linear solve with these four unkn
 trajectory gives the correction and its covariance; the smoother applies it and comes back until it is small.
 """
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -55,9 +56,9 @@ def correct(
     linear.push_back(
         gtsam.JacobianFactor(C(0), np.diag(1 / stddevs), -moved / stddevs, gtsam.noiseModel.Unit.Create(4))
     )
-    net = eliminate(linear, len(problem.intervals.keyframes), last=(C(0),))
-    root = np.linalg.inv(net.at(net.size() - 1).R())
-    step, sigma = net.optimize().at(C(0)), np.sqrt(np.sum(root**2, axis=1))
+    (found,) = deque(eliminate(linear, len(problem.intervals.keyframes), last=(C(0),)), maxlen=1)
+    root = np.linalg.inv(found.R)
+    step, sigma = root @ found.d, np.sqrt(np.sum(root**2, axis=1))
     better = Calibration(
         now.time_offset_s + float(step[0]) if with_time else now.time_offset_s,
         now.p_imu_antenna + step[1:] if with_lever else now.p_imu_antenna,

@@ -6,6 +6,10 @@ keyframe, into conditionals R x = d - S y on later keyframes y, and the covarian
 cov(x) = R⁻¹ R⁻ᵀ + W cov(y) Wᵀ with W = R⁻¹ S (Kaess and Dellaert 2009).
 """
 
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
@@ -18,31 +22,71 @@ Array = NDArray[np.float64]
 SIZE = 15
 # A key of GTSAM holds its letter above so many bits of its index.
 INDEX_BITS = 56
+# Keyframes that are eliminated in one call; more take memory, fewer take time.
+TOGETHER = 20
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe.
 PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15)}
 
 
-def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = ()) -> gtsam.GaussianBayesNet:
-    """The graph of k keyframes as conditionals, X V B of each in order, then the keys in `last`."""
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """R x = d - S y: one variable x given later ones y; `keys` are theirs, in the order of the columns of R and S."""
+
+    keys: list[int]
+    R: Array
+    S: Array
+    d: Array
+
+
+def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = ()) -> Iterator[Conditional]:
+    """The graph of k keyframes as conditionals, X V B of each in order, then the keys in `last`.
+
+    GTSAM's own hold all rows that their elimination began with, 100 kB per keyframe. So it eliminates a few keyframes
+    at a time, from their factors and what the ones before them left, and only R, S and d are kept.
+    """
+    waiting, remaining = _by_first_keyframe(graph, k), gtsam.GaussianFactorGraph()
+    for begin in range(0, k + 1, TOGETHER):
+        window = range(begin, min(begin + TOGETHER, k + 1))
+        for factor in [factor for i in window for factor in waiting.pop(i, [])]:
+            remaining.push_back(factor)
+        keys = [key for i in window for key in ((X(i), V(i), B(i)) if i < k else last)]
+        net, remaining = remaining.eliminatePartialSequential(_ordering(keys), gtsam.EliminateQR)
+        for part in (net.at(n) for n in range(net.size())):
+            # GTSAM returns views into the conditional, which do not keep it alive
+            yield Conditional(list(part.keys()), part.R().copy(), part.S().copy(), part.d().copy())
+
+
+def _by_first_keyframe(graph: gtsam.GaussianFactorGraph, k: int) -> dict[int, list[gtsam.GaussianFactor]]:
+    """The factors of a graph by the first keyframe that they bind; k where they bind none."""
+    found = defaultdict(list)
+    for factor in (graph.at(n) for n in range(graph.size())):
+        keyframes = [index for letter, index in map(_split, factor.keys()) if letter in PLACES]
+        found[min(keyframes, default=k)].append(factor)
+    return found
+
+
+def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
     ordering = gtsam.Ordering()
-    for i in range(k):
-        for key in (X(i), V(i), B(i)):
-            ordering.push_back(key)
-    for key in last:
+    for key in keys:
         ordering.push_back(key)
-    return graph.eliminateSequential(ordering, gtsam.EliminateQR)
+    return ordering
+
+
+def _split(key: int) -> tuple[int, int]:
+    """Letter and index of a key."""
+    return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
 
 def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array:
     """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15)."""
-    net = eliminate(graph.linearize(values), k)
+    net = list(eliminate(graph.linearize(values), k))
     covariances = np.empty((k, SIZE, SIZE))
     # The joint covariance of a keyframe and of those it depends on. The IMU binds each keyframe to the next, so those
     # of the one before it are among them, and memory does not grow with the drive.
     known: list[int] = []
     joint = np.empty((0, 0))
     for i in reversed(range(k)):
-        R, later, S = _conditional(net, i)
+        R, later, S = _of_keyframe(i, net[3 * i : 3 * i + 3])
         own, _ = dtrtri(R)
         W = own @ S
         joint = _of(later, known, joint)
@@ -61,15 +105,14 @@ def _of(keyframes: list[int], known: list[int], joint: Array) -> Array:
     return np.asarray(joint[np.ix_(rows, rows)], np.float64)
 
 
-def _conditional(net: gtsam.GaussianBayesNet, i: int) -> tuple[Array, list[int], Array]:
+def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Array]:
     """Keyframe i given later ones: R (15, 15) upper triangular, those keyframes, and S (15, 15 each)."""
-    parts = [net.at(3 * i + n) for n in range(3)]
-    keys = [[(key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1) for key in part.keys()] for part in parts]  # noqa: SIM118
+    keys = [[_split(key) for key in part.keys] for part in parts]
     later = sorted({index for row in keys for _, index in row} - {i})
     start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
     columns = np.zeros((SIZE, SIZE * (1 + len(later))))
     for rows, part, row in zip(PLACES.values(), parts, keys, strict=True):
-        matrix, column = np.hstack([part.R(), part.S()]), 0
+        matrix, column = np.hstack([part.R, part.S]), 0
         for letter, index in row:
             place, first = PLACES[letter], start[index]
             width = place.stop - place.start

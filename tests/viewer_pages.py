@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -43,8 +44,9 @@ def unpacked(listed: list[int], text: str, meta: dict[str, Any]) -> tuple[np.nda
     return cells + (np.array(meta["origin"]) >> level), planes[6:].T
 
 
-def written(tmp_path: Path, semantic_map: SemanticMap, *arguments: Any, **settings: Any) -> str:
-    write_viewer(in_memory(semantic_map), *arguments, tmp_path / "viewer.html", **settings)
+def written(tmp_path: Path, semantic_map: SemanticMap, track: Trajectory | None, **settings: Any) -> str:
+    tracks = [] if track is None else [track]
+    write_viewer(in_memory(semantic_map), tracks, tmp_path / "viewer.html", **settings)
     return (tmp_path / "viewer.html").read_text("utf-8")
 
 

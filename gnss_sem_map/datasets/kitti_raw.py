@@ -98,7 +98,7 @@ def read(drive: Path) -> SensorLog:
         imu=ImuSamples(imu_stamps, imu_rows[:, SPECIFIC_FORCE], imu_rows[:, ANGULAR_RATE]),
         gnss=gnss,
         imu_noise=OXTS_NOISE,
-        initial_attitude=AttitudePrior(_attitudes(oxts[:1])[0], ATTITUDE_STDDEVS_RAD),
+        initial_attitude=AttitudePrior(_attitudes(imu_rows[:1])[0], ATTITUDE_STDDEVS_RAD),
         reference=reference,
         skips=(*skips, *fix_skips, *imu_skips, *scan_skips, *image_skips),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,8 +21,8 @@ class Exported:
     """A refined map and what its files say beside it."""
 
     map: TiledMap
-    driven: Trajectory | None = None
-    """The track from which pictures show the map."""
+    tracks: Sequence[Trajectory] = ()
+    """Of every drive; pictures show the map from them."""
     title: str | None = None
 
     @cached_property

@@ -27,7 +27,7 @@ class Format:
 FORMATS = (
     Format(
         "viewer", "viewer.html", "the map to turn and to ask, in any browser, offline",
-        lambda e, path: write_viewer(e.map, e.driven, path, title=e.title or "Semantic map"),
+        lambda e, path: write_viewer(e.map, e.tracks, path, title=e.title or "Semantic map"),
     ),
     Format(
         "laz", "map.laz",

@@ -60,19 +60,19 @@ _MATPLOTLIB = Lock()
 
 
 def write_topview(exported: Exported, path: Path | str) -> None:
-    """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the track.
+    """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the tracks.
 
     North is up; of every column the highest labelled voxel is seen, light grey where no camera saw any; what is
     high darkens what lies beside it. Small maps get several pixels per voxel, large ones several voxels per pixel.
     Raises DataError for an empty map or when the file cannot be written.
     """
     view = top_view(exported, LONGEST_SIDE_PX)
-    label_set, trajectory = exported.map.label_set, exported.driven
+    label_set = exported.map.label_set
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
     counts = np.bincount(view.labels[view.labels != NOTHING] + 1, minlength=1 + len(label_set.names))
     entries = _legend_entries(np.roll(counts, -1), label_set, UNLABELLED_BY_DAY)
-    if trajectory is not None:
+    if exported.tracks:
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
     strip_px = 50 + ENTRY_PX[1] * -(-len(entries) // columns)
@@ -81,8 +81,8 @@ def write_topview(exported: Exported, path: Path | str) -> None:
         strip = _strip(figure, strip_px)
         _draw_entries(strip, entries, columns, "black")
         _draw_scale_and_north(strip, view.cell_m / zoom)
-        if trajectory is not None:
-            _draw_track(axes, trajectory)
+        for track in exported.tracks:
+            _draw_track(axes, track)
         if exported.title is not None:
             axes.set_title(exported.title, fontsize=11, loc="left", parse_math=False)
         pixels = _drawn(figure, page)
@@ -195,20 +195,20 @@ def _round_length(longest_m: float) -> float:
 
 
 def write_perspective(exported: Exported, path: Path | str, camera: Camera | None = None) -> None:
-    """Draw the map as PNG, as seen by a virtual camera behind and above the vehicle, with legend and track.
+    """Draw the map as PNG, as seen by a virtual camera behind and above the vehicle, with legend and tracks.
 
     The vehicle is where the camera sees most of the map; without a track the camera looks at the whole map from the
     south. Or give a `camera`. Raises DataError for an empty map or when the file cannot be written.
     """
-    extent, label_set, track = exported.extent, exported.map.label_set, exported.driven
+    extent, label_set = exported.extent, exported.map.label_set
     if not extent.count:
         raise DataError(NO_VOXELS)
     if camera is None:
-        camera = _from_the_south(exported) if track is None else _best_behind(track, exported)
+        camera = _best_behind(exported) if exported.tracks else _from_the_south(exported)
     unlabelled = UNLABELLED_BY_NIGHT if extent.labels[:-1].any() else UNLABELLED_ALONE
     image = _lit(exported, np.vstack([label_set.colours, unlabelled, TRACK_COLOUR]), camera)
     entries = _legend_entries(extent.labels, label_set, unlabelled)
-    if track is not None:
+    if exported.tracks:
         entries.append(("track", TRACK_COLOUR))
     _write_png(np.vstack([image, _legend(image.shape[1], entries)]), path)
 
@@ -221,13 +221,13 @@ def _behind(T_map_imu: NDArray[np.float64]) -> Camera:
     return _camera(vehicle - BEHIND_M * forward + ABOVE_M * up, vehicle + AHEAD_M * forward - BELOW_M * up)
 
 
-def _best_behind(track: Trajectory, exported: Exported) -> Camera:
-    """The camera behind the vehicle, of a few before the end of the track, with most voxels in view.
+def _best_behind(exported: Exported) -> Camera:
+    """The camera behind the vehicle, of a few before the ends of the tracks, with most voxels in view.
 
     These are compared in small pictures, in which one column of voxels stands for four.
     """
-    along, voxel_m = _along(track), exported.map.voxel_size_m
-    poses = track.T_map_imu[along <= max(0.0, along[-1] - AHEAD_M / 2)]
+    voxel_m = exported.map.voxel_size_m
+    poses = np.concatenate([_before_the_end(track) for track in exported.tracks])
     cameras = [_behind(pose) for pose in poses[:: 1 + len(poses) // 20]]
     sketches = [replace(each, width_px=each.width_px // 6, height_px=each.height_px // 6) for each in cameras]
     pictures = [Picture.empty(sketch) for sketch in sketches]
@@ -246,6 +246,13 @@ def _best_behind(track: Trajectory, exported: Exported) -> Camera:
             draw_cubes(pictures[i], sketch, centres, voxel_m, numbers[chosen], sketch.target, SKETCHED_M)
     seen = [len(np.unique(picture.cube[picture.cube >= 0])) for picture in pictures]
     return cameras[int(np.argmax(seen))]
+
+
+def _before_the_end(track: Trajectory) -> NDArray[np.float64]:
+    """The poses (k, 4, 4) from which a camera still looks at what was driven."""
+    along = _along(track)
+    poses: NDArray[np.float64] = track.T_map_imu[along <= max(0.0, along[-1] - AHEAD_M / 2)]
+    return poses
 
 
 def _from_the_south(exported: Exported) -> Camera:
@@ -276,7 +283,7 @@ def _along(trajectory: Trajectory) -> NDArray[np.float64]:
 def _lit(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog, nearest tiles first.
 
-    The palette holds the colours of the classes, of no label, and of the track.
+    The palette holds the colours of the classes, of no label, and of the tracks.
     """
     distance = float(np.linalg.norm(camera.target - camera.eye))
     fine = replace(
@@ -284,8 +291,8 @@ def _lit(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDAr
     )
     picture, tiled_map, reach_m = Picture.empty(fine), exported.map, 10 * distance
     unlabelled, track = len(palette) - 2, len(palette) - 1
-    if exported.driven is not None:
-        beads = _beads(exported.driven)
+    for driven in exported.tracks:
+        beads = _beads(driven)
         draw_cubes(
             picture, fine, beads, BEAD_M / 2, np.full(len(beads), track, np.int32), camera.eye, reach_m
         )

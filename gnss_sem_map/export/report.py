@@ -10,6 +10,7 @@ from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
+from urllib.parse import quote
 
 from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.files.ownership import amend
@@ -69,6 +70,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _facts(run),
         _picture(folder, "perspective.png"),
         _warnings(run.get("warnings", ())),
+        _section("Drives", _drives(run.get("drives", {}), run.get("failed", {}))),
         _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
@@ -218,6 +220,22 @@ def _refinement(refinement: Mapping[str, Any]) -> str:
         "systematic label error rate, estimated without truth": _percent(refinement.get("systematic_errors"))
     }
     return table + _pairs(vehicles | (errors if "systematic_errors" in refinement else {}))
+
+
+def _drives(drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> str:
+    """A row for every drive of the map, with its own report; and why others are not in it."""
+    if not drives:
+        return ""
+    keys = list(next(iter(drives.values())))
+    rows = "".join(
+        f'<tr><td><a href="{escape(f"drives/{quote(name)}/report.html")}">{escape(name)}</a></td>'
+        f"{''.join(_cell(_value(about.get(key)), number=True) for key in keys)}</tr>"
+        for name, about in drives.items()
+    )
+    head = f'<tr><th>drive</th>{"".join(f"""<th class="number">{escape(_words(key))}</th>""" for key in keys)}</tr>'
+    return f'<div class="scroll"><table>{head}{rows}</table></div>' + (
+        f"<h3>Left out</h3>{_table(('drive', 'why'), list(failed.items()))}" if failed else ""
+    )
 
 
 def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:

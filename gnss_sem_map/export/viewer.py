@@ -11,6 +11,7 @@ import html
 import json
 import zlib
 from collections import Counter
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -33,7 +34,7 @@ AXIS_BYTES = 2
 PACKING = 4
 """Level of compression: 4 % larger than with zlib's usual 6, in 40 % of its time."""
 MOST_POSES = 50_000
-"""Of a longer track the page holds every second pose, every third, ..."""
+"""Of longer tracks the page holds every second pose, every third, ..."""
 SCRIPTS = ("viewer_shaders.js", "viewer_levels.js", "viewer.js")
 FINER_ALLOWED = " 'self' file:"
 """What a page with a folder may load beside what is in it: scripts from its own place."""
@@ -41,14 +42,14 @@ FINER_ALLOWED = " 'self' file:"
 
 def write_viewer(
     tiled_map: TiledMap,
-    trajectory: Trajectory | None,
+    tracks: Sequence[Trajectory],
     path: Path | str,
     title: str = "Semantic map",
     most_voxels: int = 3_000_000,
 ) -> None:
     """Write the map as an HTML page that works from file://, some 2 MB per million voxels.
 
-    Classes, the track, removed and unlabelled voxels are layers to switch; colours show class, height, confidence
+    Classes, the tracks, removed and unlabelled voxels are layers to switch; colours show class, height, confidence
     or where the class comes from; a click tells what a voxel is. Up to `most_voxels` the page holds the map. Above,
     voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of the page's name (`viewer/`
     beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map is read tile by tile.
@@ -62,7 +63,7 @@ def write_viewer(
     with adding_folder(path.with_suffix("")) as folder:
         levels = _Levels(folder, most_voxels, len(tiled_map.label_set.names))
         visit_nodes(tiled_map, levels.add, most_voxels)
-        page = _page(levels, tiled_map, trajectory, path.stem, title)
+        page = _page(levels, tiled_map, tracks, path.stem, title)
         with replacing(path) as file:
             file.write(page.encode("utf-8"))
 
@@ -130,13 +131,11 @@ def _encoded(node: Node) -> str:
     return base64.b64encode(packed).decode("ascii")
 
 
-def _page(
-    levels: _Levels, tiled_map: TiledMap, trajectory: Trajectory | None, folder: str, title: str
-) -> str:
+def _page(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory], folder: str, title: str) -> str:
     nodes = levels.in_page
     if not nodes:
         raise DataError(NO_VOXELS)
-    meta = _meta(levels, tiled_map, trajectory) | ({"folder": folder} if nodes[0].level else {})
+    meta = _meta(levels, tiled_map, tracks) | ({"folder": folder} if nodes[0].level else {})
     assets = resources.files("gnss_sem_map.export") / "assets"
     return Template((assets / "viewer.html").read_text("utf-8")).substitute(
         title=html.escape(title),
@@ -147,12 +146,12 @@ def _page(
     )
 
 
-def _meta(levels: _Levels, tiled_map: TiledMap, trajectory: Trajectory | None) -> dict[str, Any]:
+def _meta(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory]) -> dict[str, Any]:
     """Metadata for the page; lengths are in voxels of the map from `origin`, the lowest corner of its tiles."""
     west, south = lowest_tile(tiled_map.tiles)
     origin = np.array([west << TILE_BITS, south << TILE_BITS, -Z_OFFSET])
-    positions = np.empty((0, 3)) if trajectory is None else trajectory.positions
-    track = positions[:: 1 + len(positions) // MOST_POSES] / tiled_map.voxel_size_m - origin
+    every = 1 + sum(map(len, tracks)) // MOST_POSES
+    lines = [track.positions[::every] / tiled_map.voxel_size_m - origin for track in tracks]
     level = levels.in_page[0].level
     cells = np.concatenate([_indices(node) for node in levels.in_page])
     framed = cells[_framed(levels.in_page, tiled_map.label_set)]
@@ -174,7 +173,7 @@ def _meta(levels: _Levels, tiled_map: TiledMap, trajectory: Trajectory | None) -
             "target": ((low_corner + high_corner) / 2).tolist(),
             "distance": float(max(40.0, 0.9 * (high_corner - low_corner)[:2].max())),
         },
-        "track": track.round(2).tolist(),
+        "tracks": [line.round(2).tolist() for line in lines],
         "classes": [
             {"name": name, "colour": colour, "count": count}
             for name, colour, count in zip(

@@ -34,8 +34,9 @@ from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.merged_run import TRACK, write_merged
+from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import absolute, source_of
+from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -148,7 +149,7 @@ class Run:
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
             old_labels = shutil.ignore_patterns(*run_folder.LABELS)
-            for name in (MAP, evidence.FOLDER, DRIVES):
+            for name in (MAP, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / name):
                     shutil.copytree(
                         self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
@@ -156,7 +157,7 @@ class Run:
             refined = pipeline.refine(folder, settings, stats)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
-                write_merged(folder, self.folder / TRACK, settings, about)
+                write_merged(folder, settings, about)
                 for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
                     one = Run(known.parent)
                     part = folder / DRIVES / known.parent.name
@@ -215,7 +216,7 @@ class Run:
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
         refined = tiles.open_map(self.folder / "refined", self.label_set)
-        exported = Exported(refined, self._driven, str(self.about["name"]))
+        exported = Exported(refined, tracks_of(self.folder), str(self.about["name"]))
         if to is None:
             return [self._amended(known[name], exported) for name in chosen]
         files = [Path(to) / known[name].file for name in chosen]
@@ -239,18 +240,6 @@ class Run:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
         log = open_drive(Path(inputs["drive"])).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
-
-    @property
-    def _driven(self) -> Trajectory:
-        if self.is_merged:
-            return self._track
-        first, last = self.about["scans_s"]
-        return run_folder.between(self.trajectory, first, last)
-
-    @property
-    def _track(self) -> Trajectory:
-        """The trajectory for pictures."""
-        return Trajectory.load(self.folder / TRACK) if self.is_merged else self.trajectory
 
     def _refuse_merged(self, what: str) -> None:
         if self.is_merged:

@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
@@ -37,6 +39,7 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import Source, source_of
+from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.voxels import tiles
 
 SETTINGS = "config.yaml"
@@ -237,14 +240,27 @@ def _write(
             trajectory = Trajectory.load(part / "trajectory.parquet")
             run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
         about = {
-            "name": " + ".join(part.name for part in parts),
+            "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],
+            "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
             "local_frame": asdict(frame),
             "map": run_folder.about_map(folder, refined.report),
         }
-        write_merged(folder, parts[0] / "trajectory.parquet", settings, about)
+        write_merged(folder, settings, about)
     return about
+
+
+def _summary(drive: Path) -> dict[str, Any]:
+    """What the list of drives says of one."""
+    about = read_run(drive)
+    steps = np.diff(tracks_of(drive)[0].positions, axis=0)
+    return {
+        "scans": about["counts"]["scans"],
+        "way_m": round(float(np.linalg.norm(steps, axis=1).sum()), 1),
+        "skips": about["skips"]["count"],
+        "warnings": len(about["warnings"]),
+    }
 
 
 def _link_all(drive: Path, part: Path) -> None:

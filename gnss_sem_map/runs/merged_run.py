@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
@@ -18,15 +16,13 @@ from gnss_sem_map.mapping.merging import Alignment, merge_runs
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.mapping.refining import refine_map
 from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_map_files
-
-TRACK = "track.parquet"
-"""Trajectory of the first run, for pictures: a merged run has no trajectory of its own."""
+from gnss_sem_map.runs.tracks import keep_tracks, tracks_of
 
 
 def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) -> dict[str, Any]:
     """Write the merged run into `out`, refined with the settings of the first; returns the content of run.json.
 
-    With `match`, the second is registered to the first. Pictures show the track of the first. Raises DataError for
+    With `match`, the second is registered to the first. Pictures show the tracks of the first. Raises DataError for
     folders that hold no run, a run with itself, and maps that do not fit together.
     """
     for run in (first, second):
@@ -52,14 +48,14 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
         "map": about_map(folder, refined.report),
         "match": _about(merged.alignment),
     }
-    write_merged(folder, first / "trajectory.parquet", settings, about)
+    keep_tracks(folder, tracks_of(first))
+    write_merged(folder, settings, about)
     return about
 
 
-def write_merged(folder: Path, track: Path, settings: Settings, about: dict[str, Any]) -> None:
-    """Write the files of a merged run beside its maps; `track` is the file of its trajectory. Raises DataError."""
-    shutil.copyfile(track, folder / TRACK)
-    write_map_files(folder, Trajectory.load(folder / TRACK), str(about["name"]))
+def write_merged(folder: Path, settings: Settings, about: dict[str, Any]) -> None:
+    """Write the files of a run of several drives beside its maps and tracks, which are there already."""
+    write_map_files(folder, tracks_of(folder), str(about["name"]))
     write_about(folder, settings, about, {})
 
 

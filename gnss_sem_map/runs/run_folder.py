@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, astuple, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -87,7 +87,7 @@ def write_run(
     refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
     with mapped.stats.stage("export"):
         write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
-        write_map_files(folder, _while_mapping(mapped.trajectory, mapped.log), mapped.log.name)
+        write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
         if write_labels:
             write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
     about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
@@ -139,7 +139,7 @@ def write_again(
     for file in source.glob("trajectory*"):
         shutil.copyfile(file, folder / file.name)
     with stats.stage("export"):
-        write_map_files(folder, between(trajectory, first, last), str(about["name"]))
+        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]))
         if log is not None:
             write_point_labels(folder, log, trajectory, refined.kerbs, settings, known_raw)
     tracked = about["map"]["refinement"]
@@ -154,9 +154,9 @@ def write_again(
     write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
 
 
-def write_map_files(folder: Path, driven: Trajectory, title: str) -> None:
+def write_map_files(folder: Path, tracks: Sequence[Trajectory], title: str) -> None:
     """Write the refined map of a run folder in all formats."""
-    write_exports(Exported(tiles.open_map(folder / REFINED), driven, title), folder)
+    write_exports(Exported(tiles.open_map(folder / REFINED), tracks, title), folder)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:

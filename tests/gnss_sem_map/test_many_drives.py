@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -27,6 +28,7 @@ from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping.merging import merge_runs
 from gnss_sem_map.runs import finished_run, many_drives, merged_run
 from gnss_sem_map.runs.finished_run import Run
@@ -132,6 +134,22 @@ def test_every_drive_lies_in_the_map_where_it_was_driven(made: dict[str, Path], 
         found = Trajectory.load(made["abc"] / "drives" / name / "trajectory.parquet")
         exact = drives.motion.poses(found.stamps + start_s)[:, :3, 3] - origin
         assert np.abs(found.positions - exact).max() < 0.1
+
+
+def test_viewer_and_report_show_every_drive(made: dict[str, Path]) -> None:
+    out = made["abc"]
+    meta = json.loads(re.search(r'id="meta"[^>]*>(.*?)<', (out / "viewer.html").read_text("utf-8"))[1])
+    ends = (np.array([line[-1] for line in meta["tracks"]]) + meta["origin"]) * meta["voxel_m"]
+    tracks = [Trajectory.load(out / "drives" / name / "trajectory.parquet") for name in "abc"]
+    for end, track in zip(ends, tracks, strict=True):
+        assert np.linalg.norm(track.positions - end, axis=1).min() < 0.01
+    about, report = read_run(out), (out / "report.html").read_text("utf-8")
+    assert about["name"] == "3 drives"
+    assert list(about["drives"]) == list("abc")
+    assert [drive["scans"] for drive in about["drives"].values()] == [
+        read_run(out / "drives" / name)["counts"]["scans"] for name in "abc"
+    ]
+    assert all(f'href="drives/{name}/report.html"' in report for name in "abc")
 
 
 @pytest.mark.parametrize(("before", "name", "after"), [("a", "b", "ab"), ("ab", "c", "abc")])
@@ -437,6 +455,15 @@ def test_every_drive_has_the_point_labels_of_the_map_of_all(
     assert {name: labels_of(out / "drives" / name) for name in "ab"} == labels
     add_drive(out, drives.by_name["c"], how)
     assert_same(out, made["abc"])
+
+
+def test_a_map_of_many_drives_is_merged_into_a_run_with_their_tracks(
+    made: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    merged_run.merge_run_folders(made["ab"], made["a"], out, match=False)
+    assert len(list((out / "tracks").iterdir())) == 2
+    assert Run(out).refine(Run(out).settings, tmp_path / "again").about["merged"] == ["ab", "a"]
 
 
 def test_to_a_merged_map_no_drive_is_added(

@@ -14,7 +14,7 @@ const hash = new URLSearchParams(location.hash.slice(1));  // #colour=height&hid
 const MOST_BEADS = 500000;
 const classes = meta.classes.length;  // then one entry for unlabelled and one for the track
 const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], count: meta.unlabelled },
-                { name: "track", colour: [255, 214, 10], count: meta.track.length }];
+                { name: "track", colour: [255, 214, 10], count: meta.tracks.flat().length }];
 const hidden = new Set((hash.get("hide") ?? (meta.classes.some(c => c.count) ? "unlabelled" : "")).split(","));
 const visible = layers.map(layer => !hidden.has(layer.name));
 let showRemoved = hash.has("removed"), mode = 0, frameAsked = false;
@@ -45,16 +45,17 @@ async function unpack(node, text) {
   upload(node, decoded(bytes, node.count), gl.SHORT, STRIDE);
 }
 
-// The track as beads; a long one has fewer.
-function trackNode(track) {
-  const steps = (a, b) => Math.hypot(...a.map((v, k) => b[k] - v));
-  const length = track.slice(1).reduce((sum, point, i) => sum + steps(track[i], point), 0);
+// The tracks as beads; long ones have fewer.
+function trackNode(tracks) {
+  const corner = tracks[0][0], steps = (a, b) => Math.hypot(...a.map((v, k) => b[k] - v));
+  const pairs = tracks.flatMap(track => track.slice(1).map((point, i) => [track[i], point]));
+  const length = pairs.reduce((sum, [a, b]) => sum + steps(a, b), 0);
   const apart = Math.max(TRACK_HALF, length / MOST_BEADS), beads = [];
-  for (let i = 1; i < track.length; i++) {
-    const [a, b] = [track[i - 1], track[i]], n = Math.ceil(steps(a, b) / apart);
-    for (let s = 0; s < n; s++) beads.push(a.map((v, k) => v - track[0][k] - 0.5 + (b[k] - v) * s / n));
+  for (const [a, b] of pairs) {
+    const n = Math.ceil(steps(a, b) / apart);
+    for (let s = 0; s < n; s++) beads.push(a.map((v, k) => v - corner[k] - 0.5 + (b[k] - v) * s / n));
   }
-  const node = { name: "track", corner: track[0], scale: 1, count: beads.length };
+  const node = { name: "track", corner, scale: 1, count: beads.length };
   const data = new ArrayBuffer(16 * beads.length), about = new Uint8Array(data);
   new Float32Array(data).set(beads.flatMap(bead => [...bead, 0]));
   beads.forEach((_, i) => { about.set([classes + 1, 0, 0, 0], 16 * i + 12); });
@@ -326,7 +327,7 @@ async function main() {
   const nodes = nodesOf(meta.nodes), roots = [...nodes.values()].filter(({ level }) => level === meta.level);
   const texts = document.getElementById("voxels").textContent.split("\n");
   await Promise.all(roots.map((root, i) => unpack(root, texts[i])));
-  scene = { nodes, roots, drawn: [], views: 0, track: meta.track.length ? trackNode(meta.track) : null,
+  scene = { nodes, roots, drawn: [], views: 0, track: meta.tracks.length ? trackNode(meta.tracks) : null,
             nothing: gl.createVertexArray(), cubes: program(VERTEX, FRAGMENT), lighting: program(SCREEN, LIGHTING) };
   layers.forEach((layer, i) => {
     if (layer.count) addLayer(layer.name, layer.colour, layer.count, visible[i], on => { visible[i] = on; });

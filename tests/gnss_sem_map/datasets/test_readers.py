@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import street
+from scipy.spatial.transform import Rotation
 from street import Street
 
 from factor_graphs.trajectory import Trajectory
@@ -204,6 +205,19 @@ def test_the_100_hz_twin_is_used_for_the_imu_only(copy: Path) -> None:
     log = open_drive(copy)
     assert len(log.imu.stamps) == 10
     assert len(log.gnss.stamps) == 14
+
+
+def test_the_first_attitude_is_that_of_the_first_sample_of_the_imu(copy: Path) -> None:
+    """The twin begins before the drive, and the vehicle may turn in between."""
+    twin = copy.with_name(copy.name.replace("_sync", "_extract"))
+    shutil.copytree(copy / "oxts", twin / "oxts")
+    first = min((twin / "oxts/data").iterdir())
+    values = first.read_text().split()
+    values[3:6] = ["0.0", "0.0", "1.25"]  # roll, pitch, yaw
+    first.write_text(" ".join(values))
+    attitude = open_drive(copy).initial_attitude
+    assert attitude is not None
+    np.testing.assert_allclose(Rotation.from_matrix(attitude.R_map_imu).as_rotvec(), [0, 0, 1.25])
 
 
 def remove(name: str) -> Callable[[Path], None]:

@@ -24,12 +24,12 @@ from gnss_sem_map.voxels.tiles import in_memory
 Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
 
 WRITERS: dict[str, Writer] = {
-    "map.ply": lambda m, t, f, path: write_ply(Exported(in_memory(m, f), t), path),
-    "map.laz": lambda m, t, f, path: write_laz(Exported(in_memory(m, f), t), path),
-    "topview.png": lambda m, t, f, path: write_topview(Exported(in_memory(m, f), t), path),
-    "perspective.png": lambda m, t, f, path: write_perspective(Exported(in_memory(m, f), t), path),
-    "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(Exported(in_memory(m, f), t), path),
-    "viewer.html": lambda m, t, f, path: write_viewer(in_memory(m), t, path),
+    "map.ply": lambda m, t, f, path: write_ply(Exported(in_memory(m, f), [t]), path),
+    "map.laz": lambda m, t, f, path: write_laz(Exported(in_memory(m, f), [t]), path),
+    "topview.png": lambda m, t, f, path: write_topview(Exported(in_memory(m, f), [t]), path),
+    "perspective.png": lambda m, t, f, path: write_perspective(Exported(in_memory(m, f), [t]), path),
+    "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(Exported(in_memory(m, f), [t]), path),
+    "viewer.html": lambda m, t, f, path: write_viewer(in_memory(m), [t], path),
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
     "trajectory_kitti.txt": lambda m, t, f, path: write_kitti(t, path),
     "trajectory.geojson": lambda m, t, f, path: write_geojson(t, f, path),
@@ -88,6 +88,6 @@ def test_a_full_disk_leaves_nothing_of_a_page_with_levels_of_detail(
     street: SemanticMap, tmp_path: Path
 ) -> None:
     with room_for(1000), pytest.raises(DataError, match="viewer: no room to write it") as caught:
-        write_viewer(in_memory(street), None, tmp_path / "viewer.html", most_voxels=10_000)
+        write_viewer(in_memory(street), [], tmp_path / "viewer.html", most_voxels=10_000)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())

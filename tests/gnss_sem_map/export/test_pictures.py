@@ -77,13 +77,26 @@ def test_the_track_is_drawn_on_the_road_that_it_follows(
     street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:
     write_topview(Exported(in_memory(street)), tmp_path / "without.png")
-    write_topview(Exported(in_memory(street), track), tmp_path / "with.png")
+    write_topview(Exported(in_memory(street), [track]), tmp_path / "with.png")
     without, drawn = (read(tmp_path / name) for name in ("without.png", "with.png"))
     rows = len(without) - 100  # above the legend, which has one more entry
     without, drawn = without[:rows], drawn[:rows]
     changed = (without != drawn).any(axis=2)
     assert near(without, "road")[changed].mean() > 0.9
     assert changed.any(axis=0).sum() > 0.9 * without.shape[1]
+
+
+def test_the_tracks_of_two_drives_are_drawn_as_the_two_halves_of_one(
+    street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    half = len(track) // 2
+    halves = [
+        Trajectory(track.stamps[part], track.T_map_imu[part]) for part in (slice(half + 1), slice(half, None))
+    ]
+    for name, tracks in (("whole", [track]), ("halves", halves)):
+        write_perspective(Exported(in_memory(street), tracks), tmp_path / name, camera=chased((480, 270)))
+    whole, drawn = (read(tmp_path / name).astype(int) for name in ("whole", "halves"))
+    assert (np.abs(whole - drawn).max(axis=2) > 30).mean() < 0.002, "the beads of a half begin anew"
 
 
 def test_the_removed_car_is_not_in_the_picture(street: SemanticMap, tmp_path: Path) -> None:
@@ -119,7 +132,7 @@ def test_driving_east_the_hedge_in_the_north_is_on_the_left(tmp_path: Path) -> N
 def test_the_default_camera_flies_behind_the_vehicle_and_sees_its_track(
     street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:
-    write_perspective(Exported(in_memory(street), track), tmp_path / "perspective.png")
+    write_perspective(Exported(in_memory(street), [track]), tmp_path / "perspective.png")
     image = read(tmp_path / "perspective.png")
     assert image.shape[1] == 1920
     yellow = np.argwhere((image[:1080] > (200, 160, 0)).all(axis=2) & (image[:1080, :, 2] < 60))

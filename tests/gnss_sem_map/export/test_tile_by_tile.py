@@ -27,9 +27,9 @@ def test_the_tiles_on_disk_give_the_bytes_of_the_map_in_memory(
     tiles.write(street, tmp_path / "refined", karlsruhe)
     opened = tiles.open_map(tmp_path / "refined")
     assert len(opened.tiles) > 1
-    WRITE[name](Exported(opened, track, "street"), tmp_path / f"from_disk.{name}")
+    WRITE[name](Exported(opened, [track], "street"), tmp_path / f"from_disk.{name}")
     WRITE[name](
-        Exported(tiles.in_memory(street, karlsruhe), track, "street"), tmp_path / f"from_memory.{name}"
+        Exported(tiles.in_memory(street, karlsruhe), [track], "street"), tmp_path / f"from_memory.{name}"
     )
     assert (tmp_path / f"from_disk.{name}").read_bytes() == (tmp_path / f"from_memory.{name}").read_bytes()
 
@@ -94,7 +94,7 @@ tiles = tuple((x, y) for x in range(side) for y in range(side))
 T = np.tile(np.eye(4), (20, 1, 1))
 T[:, :3, 3] = np.linspace((20, 50, 2), (102.4 * side - 20, 50, 2), 20)
 driven = Trajectory(np.arange(20.0), T)
-exported = Exported(TiledMap(0.2, label_set, LocalFrame(49.0, 8.4, 115.0), tiles, read_tile), driven, "tiles")
+exported = Exported(TiledMap(0.2, label_set, LocalFrame(49.0, 8.4, 115.0), tiles, read_tile), [driven], "tiles")
 write = {each.name: each.write for each in formats.FORMATS}[name]
 write(exported, Path(sys.argv[3]))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)

@@ -29,7 +29,8 @@ def test_the_page_holds_every_voxel_with_its_class_confidence_and_state(
         int((street.labels[street.shown] == i).sum()) for i in range(5)
     ]
     assert meta["removed"] == (street.states == State.REMOVED).sum()
-    path = (np.array(meta["track"]) + meta["origin"]) * meta["voxel_m"]
+    (line,) = meta["tracks"]
+    path = (np.array(line) + meta["origin"]) * meta["voxel_m"]
     np.testing.assert_allclose(path, track.positions, atol=0.002)
 
 
@@ -57,14 +58,14 @@ def test_tiles_without_voxels_are_passed_over(street: SemanticMap, tmp_path: Pat
             tiles=corners,
             read_tile=lambda tile: nothing if tile == (2, 5) else tiled_map.read_tile(tile),
         )
-        write_viewer(with_empty, None, tmp_path / "viewer.html")
+        write_viewer(with_empty, (), tmp_path / "viewer.html")
         pages.append(decoded((tmp_path / "viewer.html").read_text("utf-8"))[1])
     np.testing.assert_array_equal(*pages)
 
 
 def test_a_page_needs_a_suffix_since_its_folder_has_none(street: SemanticMap, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"viewer: found no suffix, expected a name such as viewer.html"):
-        write_viewer(in_memory(street), None, tmp_path / "viewer")
+        write_viewer(in_memory(street), (), tmp_path / "viewer")
 
 
 def test_an_empty_map_is_refused(street: SemanticMap, tmp_path: Path) -> None:

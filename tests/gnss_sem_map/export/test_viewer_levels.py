@@ -75,7 +75,7 @@ def test_a_map_in_tiles_on_disk_gives_the_same_bytes_and_each_tile_is_read_once(
 
     for name, tiled_map in (("disk", replace(opened, read_tile=read_tile)), ("memory", in_memory(town))):
         (tmp_path / name).mkdir()
-        write_viewer(tiled_map, track, tmp_path / name / "viewer.html", most_voxels=20_000)
+        write_viewer(tiled_map, [track], tmp_path / name / "viewer.html", most_voxels=20_000)
     assert sorted(read) == list(opened.tiles)
     disk, memory = (
         {file.relative_to(tmp_path / name): file.read_bytes() for file in (tmp_path / name).rglob("*.*")}
@@ -96,7 +96,7 @@ def peak_memory(edge: int, piece: SemanticMap, page: Path) -> int:
     corners = tuple((x, y) for x in range(edge) for y in range(edge))
     tiled_map = replace(in_memory(piece), tiles=corners, read_tile=lambda _: piece[np.arange(len(piece))])
     tracemalloc.start()
-    write_viewer(tiled_map, None, page, most_voxels=20_000)
+    write_viewer(tiled_map, (), page, most_voxels=20_000)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak

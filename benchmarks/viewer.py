@@ -22,7 +22,8 @@ import numpy as np
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.tiles import TILE_BITS, Tile, TiledMap
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
+from gnss_sem_map.voxels.tiles import TiledMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 RESULTS = Path(__file__).parent / "results" / "viewer.json"

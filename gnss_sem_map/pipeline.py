@@ -24,6 +24,7 @@ from gnss_sem_map.evaluation import preflight
 from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sample
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans, probabilities_fingerprint
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
@@ -137,14 +138,18 @@ def refine(
     stats: RunStats,
     progress: Progress = silent,
     earlier: Path | None = None,
+    *,
+    executor: Executor | None = None,
+    work: Path | None = None,
 ) -> Refined:
     """Write `refined/` of a run folder from its raw map and evidence; see `refinement.steps`.
 
-    Of an `earlier` run, tiles that were refined from the same are taken.
+    Of an `earlier` run, and of the folder `work` of an interrupted one, tiles that were refined from the same are
+    taken. Tiles are tasks of `executor`, by default in this process.
     """
     with stats.stage("refinement"):
         raw = open_raw(folder, open_label_set(settings.classes))
-        return refine_map(raw, folder, settings, progress, earlier)
+        return refine_map(raw, folder, settings, progress, earlier, executor=executor, work=work)
 
 
 def check_drive(

@@ -18,7 +18,7 @@ from gnss_sem_map.export.raster import NOTHING, TopView, top_view
 from gnss_sem_map.export.render import Camera, Picture, draw_cubes, hollows, lit
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.tiles import TILE_BITS, Tile
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,7 +17,7 @@ from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR
 from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
-from gnss_sem_map.voxels.tiles import TILE_BITS
+from gnss_sem_map.voxels.tile_files import TILE_BITS
 
 NOTHING = -2
 """Label of a cell without any voxel."""

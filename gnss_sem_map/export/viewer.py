@@ -27,7 +27,8 @@ from gnss_sem_map.export.viewer_levels import Node, lowest_tile, visit_nodes
 from gnss_sem_map.files.atomic import adding_folder, replacing
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import State
-from gnss_sem_map.voxels.tiles import TILE_BITS, Z_OFFSET, TiledMap
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET
+from gnss_sem_map.voxels.tiles import TiledMap
 
 AXIS_BYTES = 2
 """A zigzag difference of 14-bit heights fits 15 bits."""

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import TILE_BITS, Z_BITS, Tile, TiledMap, local_keys
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_BITS, Tile, local_keys
+from gnss_sem_map.voxels.tiles import TiledMap
 
 COLUMNS = 1 << TILE_BITS
 

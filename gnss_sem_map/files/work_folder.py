@@ -5,6 +5,7 @@
           job.json, trajectory.npz   what other processes need to map chunks (`runs.chunk_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
+          tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
           .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
@@ -20,7 +21,7 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, ANSWERS, DRIVES, PART, OLD = "chunks.json", "answers", "drives", "part", "old"
+CHUNKS, ANSWERS, DRIVES, TILES, PART, OLD = "chunks.json", "answers", "drives", "tiles", "part", "old"
 JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
@@ -28,7 +29,7 @@ OF_CHUNKS = re.compile(
     r"|\.\d+\.\d+\.waiting/(\d+\.npy)?"
 )
 OURS = re.compile(
-    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -84,9 +85,9 @@ def clear(folder: Path) -> None:
 
 
 def remove_drives(folder: Path) -> None:
-    """Remove the maps of single drives, which we made in a folder of ours; raises OSError."""
-    if (folder / DRIVES).is_dir():
-        shutil.rmtree(folder / DRIVES)
+    """Remove the maps of single drives, and tiles that were made from them; raises OSError."""
+    _remove_ours(folder / DRIVES)
+    _remove_ours(folder / TILES)
 
 
 def remove_answers(folder: Path) -> None:
@@ -95,8 +96,9 @@ def remove_answers(folder: Path) -> None:
 
 
 def remove_chunks(folder: Path) -> None:
-    """Remove mapped chunks, their index first; raises OSError."""
+    """Remove mapped chunks, their index first, and tiles that were made from them; raises OSError."""
     (folder / CHUNKS).unlink(missing_ok=True)
+    _remove_ours(folder / TILES)
     for path in sorted(folder.iterdir()):
         if OF_CHUNKS.fullmatch(path.name + "/" * _is_folder(path)):
             _remove_known(folder, path)
@@ -105,10 +107,15 @@ def remove_chunks(folder: Path) -> None:
 def drop_results(folder: Path) -> None:
     """Remove the results in a work folder: the new one, and our files of the old one. Raises OSError."""
     part, old = folder / PART, folder / OLD
-    if part.is_dir():
-        shutil.rmtree(part)  # we made it, in a folder of ours
+    _remove_ours(part)
     if old.is_dir():
         ownership.remove(old)
+
+
+def _remove_ours(path: Path) -> None:
+    """Remove a folder that only we write into, in a folder of ours."""
+    if path.is_dir():
+        shutil.rmtree(path)
 
 
 def _remove_known(work: Path, path: Path) -> None:

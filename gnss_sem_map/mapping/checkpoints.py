@@ -5,7 +5,7 @@ file; an incomplete or damaged chunk is mapped again. Evidence is integer sums, 
 bytes for any number of processes and any interruptions.
 
 NUMBER/record.json           counts, skips, moving objects, checksums
-       static/x_y.parquet    the voxels of a tile (`voxels.tiles`); removed/ likewise
+       static/x_y.parquet    the voxels of a tile (`voxels.tile_files`); removed/ likewise
        moving_points.npz     the points that moved (`mapping.evidence`)
        keyframes.npz         range images for free-space evidence, if they are of use
 """
@@ -34,7 +34,8 @@ from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.chunks import MappedChunk
 from gnss_sem_map.mapping.waiting_points import WAITING
-from gnss_sem_map.voxels.tiles import Tile, by_tile, decode_voxels, encode_voxels, joined_voxels
+from gnss_sem_map.voxels.tile_files import Tile, decode_voxels, encode_voxels
+from gnss_sem_map.voxels.tiles import by_tile, joined_voxels
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 RECORD = "record.json"

@@ -22,6 +22,7 @@ from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
 from gnss_sem_map.mapping.raw_map import MAP, open_raw
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HEIGHT_UNITS, HITS_LIMIT
+from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of, unpack
 
@@ -89,7 +90,7 @@ def merge_runs(
     maps that do not fit together.
     """
     label_set = label_set or tiles.open_map(first / MAP).label_set
-    frames = [_known(tiles.read_frame(run / MAP)) for run in (first, second)]
+    frames = [_known(read_frame(run / MAP)) for run in (first, second)]
     known = [open_raw(run, label_set).evidence for run in (first, second)]
     moved = [one.moved.whole().voxels for one in known]
     static = [_without(run, label_set, part) for run, part in zip((first, second), moved, strict=True)]

@@ -1,38 +1,47 @@
 """Refinement of a map on disk, tile by tile: figures of the whole map first, then every tile with its halo.
 
-What a tile is refined from has a digest. A tile that an earlier map refined from the same is taken from there: so a
+Both are tasks: they read the raw map, and save what they find in a folder, tile by tile. What a tile is refined from
+has a digest. A tile that was refined from the same is taken over, from an earlier map or from an interrupted call: so a
 drive that is added to a large map touches the tiles around it only.
 """
 
 from __future__ import annotations
 
+import base64
 import hashlib
-import json
-from collections.abc import Iterator
+import io
+import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.raw_map import MAP, RawMap
+from gnss_sem_map.mapping.execution import Executor, InProcess
+from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
+from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, on_tiles
 from gnss_sem_map.refinement import kerb_points
 from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import TILE_BITS, Reuse, Tile
+from gnss_sem_map.voxels.map_json import files_of, name_of
+from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
+from gnss_sem_map.voxels.tiles import places_around
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 REFINED = "refined"
 
@@ -43,144 +52,209 @@ class Refined:
 
     report: RefinementReport
     kerbs: Kerbs | None
-    """Voxels of the refined map whose points are classified one by one; of the tiles that were refined now."""
+    """Voxels of the refined map whose points are classified one by one; not of the tiles of an earlier map."""
 
 
 def refine_map(
-    raw: RawMap, run: Path, settings: Settings, progress: Progress = silent, earlier: Path | None = None
+    raw: RawMap,
+    run: Path,
+    settings: Settings,
+    progress: Progress = silent,
+    earlier: Path | None = None,
+    *,
+    executor: Executor | None = None,
+    work: Path | None = None,
 ) -> Refined:
     """Write `refined/` of a run folder from its raw map; one tile and its halo are in memory at a time.
 
-    Of an `earlier` run, which may be the same before a change, tiles that were refined from the same are taken. Raises
-    DataError.
+    Tiles are tasks of `executor`, by default in this process. Of an `earlier` run, which may be the same before a
+    change, tiles that were refined from the same are taken, and so are those that an interrupted call left in the
+    folder `work`. Raises DataError.
     """
-    return _Refinement(raw, run, settings, progress, earlier).write()
+    with folder_of_tiles(work, run, REFINED) as made_in:
+        return _Refinement(raw, run, settings, progress, earlier, executor or InProcess(), made_in).write()
 
 
+@dataclass(frozen=True, eq=False)
 class _Refinement:
     """One refinement of a map on disk."""
 
-    def __init__(
-        self, raw: RawMap, run: Path, settings: Settings, progress: Progress, earlier: Path | None
-    ) -> None:
-        self._raw, self._run, self._settings, self._progress = raw, run, settings, progress
-        self._earlier = None if earlier is None else earlier / REFINED
-        self._model = opened_sensor_model(settings)
-        self._halo = halo_m(settings.refinement, raw.fused.voxel_size_m)
-        self._tiles: list[Tile] = list(raw.fused.tiles) or [(0, 0)]
+    raw: RawMap
+    run: Path
+    settings: Settings
+    progress: Progress
+    earlier: Path | None
+    executor: Executor
+    made_in: Path
 
     def write(self) -> Refined:
-        fused = self._raw.fused
+        fused = self.raw.fused
         around = self._digests()
         sums = self._sums(around)
         figures = figures_of(reduce(add, sums.values()))
-        reuse = Reuse(self._made_from(around, figures), self._earlier)
-        for tile, of_tile in sums.items():
-            reuse.said[tile] = {"around": around[tile], "sums": of_tile.to_json()}
-        known = _reports(reuse)
-        for tile, report in known.items():
-            reuse.said[tile]["report"] = report.to_json()
-        reports, kerbs = dict(known), []
+        made_from = self._made_from(around, figures)
+        said = {tile: {"around": around[tile], "sums": sums[tile].to_json()} for tile in sums}
+        made = self._made(made_from, said)
+        new = {tile: {"made_from": made_from[tile], "said": said[tile]} for tile in sums if tile not in made}
+        for _ in self._on_tiles("refinement", REFINE_TILES, (asdict(figures),), new):
+            pass
+        made |= of_work(self.made_in, {tile: made_from[tile] for tile in new})
+        pieces = [(tile, made[tile]) for tile in fused.tiles]
+        tiles.write_tiles(pieces, self.run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set)
+        reports = [RefinementReport.from_json(made[tile].about["said"]["report"]) for tile in sums]
+        kerbs = [_kerbs(made[tile].beside) for tile in sums if made[tile].beside is not None]
+        return Refined(reduce(add, reports), kerb_points.joined(kerbs) if kerbs else None)
 
-        def refined(tile: Tile) -> tuple[MapState, RefinementReport]:
-            voxels = self._raw.static(tile, self._halo)
-            return refine_tile(tile, voxels, self._evidence(tile), self._settings.refinement, figures)
-
-        def pieces() -> Iterator[tuple[Tile, SemanticMap]]:
-            changed = [tile for tile in self._tiles if tile not in known]
-            for done, tile in enumerate(changed, 1):
-                state, report = refined(tile)
-                reports[tile] = report
-                reuse.said[tile]["report"] = report.to_json()
-                kerbs.extend([state.kerbs] if state.kerbs is not None else [])
-                self._progress("refinement", done, len(changed))
-                assert state.decided is not None
-                if fused.tiles:
-                    yield tile, state.decided
-
-        tiles.write_tiles(
-            pieces(), self._run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set, reuse
+    def _on_tiles(
+        self, stage: str, function: str, more: tuple[Any, ...], of_tiles: Mapping[Tile, Any]
+    ) -> Any:
+        shared = str(self.run), self.settings.model_dump_json(), str(self.made_in), *more
+        return on_tiles(
+            function, shared, of_tiles, self._voxels, self.executor, partial(self.progress, stage)
         )
-        of_all = reduce(add, (reports[tile] for tile in self._tiles))
-        return Refined(of_all, kerb_points.joined(kerbs) if kerbs else None)
+
+    @property
+    def _tiles(self) -> list[Tile]:
+        return list(self.raw.fused.tiles) or [(0, 0)]
+
+    @property
+    def _voxels(self) -> dict[Tile, int]:
+        files = files_of(self.run / MAP)
+        return {tile: files[name_of(tile)]["voxels"] for tile in self.raw.fused.tiles}
 
     def _digests(self) -> dict[Tile, str]:
         """Digest of the settings, and of the raw map in and around each tile."""
-        moved = self._run / evidence.FOLDER / evidence.MOVED
-        files = tiles.files_of(self._run / MAP), tiles.files_of(moved)
+        moved = self.run / evidence.FOLDER / evidence.MOVED
+        files = files_of(self.run / MAP), files_of(moved)
         sums = [{name: about["sha256"] for name, about in of_layer.items()} for of_layer in files]
-        said = [self._settings.refinement.model_dump_json(), self._settings.classes, self._halo]
-        model = None if self._model is None else repr(self._model.to_yaml())
-        reach = range(-self._tiles_in_halo, self._tiles_in_halo + 1)
+        voxel_size_m = self.raw.fused.voxel_size_m
+        halo = halo_m(self.settings.refinement, voxel_size_m)
+        said = [self.settings.refinement.model_dump_json(), self.settings.classes, halo]
+        model = opened_sensor_model(self.settings)
+        of_all = [said, None if model is None else repr(model.to_yaml())]
+        tiles_in_halo = math.ceil(halo / (voxel_size_m * (1 << TILE_BITS)))
+        reach = range(-tiles_in_halo, tiles_in_halo + 1)
         found = {}
         for x, y in self._tiles:
-            near = [tiles.name_of((x + i, y + j)) for i in reach for j in reach]
-            around = [[of_layer.get(name) for name in near] for of_layer in sums]
-            found[x, y] = _digest([said, model, around])
+            near = [name_of((x + i, y + j)) for i in reach for j in reach]
+            found[x, y] = digest([*of_all, [[of_layer.get(name) for name in near] for of_layer in sums]])
         return found
 
-    @property
-    def _tiles_in_halo(self) -> int:
-        return int(np.ceil(self._halo / (self._raw.fused.voxel_size_m * (1 << TILE_BITS))))
-
-    def _sums(self, around: dict[Tile, str]) -> dict[Tile, Sums]:
+    def _sums(self, around: Mapping[Tile, str]) -> dict[Tile, Sums]:
         """What every tile adds to the figures of the map."""
-        known, earlier = {}, tiles.files_of(self._earlier)
+        earlier = files_of(None if self.earlier is None else self.earlier / REFINED)
+        known = {}
         for tile in self._tiles:
-            try:
-                said = earlier[tiles.name_of(tile)]["said"]
-                if said["around"] == around[tile]:
-                    known[tile] = Sums.from_json(said["sums"])
-            except (KeyError, TypeError, ValueError):
-                continue  # there is none, or none that can be read
-        new = [tile for tile in self._tiles if tile not in known]
-
-        def measured(tile: Tile) -> Sums:
-            beside, steps = Evidence(sensor_model=self._model), self._settings.refinement
-            return sums_of(tile, self._raw.static(tile, self._halo), beside, steps)
-
-        for done, tile in enumerate(new, 1):
-            known[tile] = measured(tile)
-            self._progress("figures", done, len(new))
+            in_map = earlier.get(name_of(tile), {}).get("said")
+            for said in (in_map, read_record(_sums_file(tile, self.made_in))):
+                try:
+                    if isinstance(said, dict) and said["around"] == around[tile]:
+                        known[tile] = Sums.from_json(said["sums"])
+                except (KeyError, TypeError, ValueError):
+                    continue  # there is none that can be read
+        new = {tile: around[tile] for tile in self._tiles if tile not in known}
+        for tile, sums in self._on_tiles("figures", MEASURE_TILES, (), new):
+            known[tile] = Sums.from_json(sums)
         return {tile: known[tile] for tile in self._tiles}
 
-    def _made_from(self, around: dict[Tile, str], figures: Figures) -> dict[Tile, str]:
+    def _made_from(self, around: Mapping[Tile, str], figures: Figures) -> dict[Tile, str]:
         """Digest of all that decides each tile."""
-        poses = np.concatenate([np.empty((0, 4, 4)), *self._raw.evidence.poses.values()])
+        poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
         at = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[:, :2]
-        edge = self._raw.fused.voxel_size_m * (1 << TILE_BITS)
-        reach = self._settings.refinement.free_space.farthest_m
+        edge = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
+        reach = self.settings.refinement.free_space.farthest_m
         found = {}
         for tile in self._tiles:
             low = np.array(tile) * edge
             near = poses[((at > low - reach) & (at < low + edge + reach)).all(axis=1)]
             # to 1 um: poses that were saved as quaternions come back with other last bits; + 0.0 makes -0.0 a 0.0
             keyframes = hashlib.sha256((near.round(6) + 0.0).tobytes()).hexdigest()
-            found[tile] = _digest([around[tile], asdict(figures), keyframes])
+            found[tile] = digest([around[tile], asdict(figures), keyframes])
         return found
 
-    def _evidence(self, tile: Tile) -> Evidence:
-        found, free_space = self._raw.evidence, self._settings.refinement.free_space
-        beside = Evidence(found.moved.around(tile, 0).voxels, self._model)
-        own = self._raw.static(tile, 0)
-        if not len(own) or not free_space.enabled:
-            return beside
-        return replace(beside, keyframes=found.keyframes_near(own.centres, free_space.farthest_m))
+    def _made(self, made_from: Mapping[Tile, str], said: Mapping[Tile, Any]) -> dict[Tile, Made]:
+        """The tiles that stay; one without a report that can be read is refined again."""
+        earlier = of_map(None if self.earlier is None else self.earlier / REFINED, made_from)
+        found = {}
+        for tile, made in (earlier | of_work(self.made_in, made_from)).items():
+            try:
+                report = RefinementReport.from_json(made.about["said"]["report"])
+            except (KeyError, TypeError, ValueError):
+                continue
+            about = made.about | {"said": said[tile] | {"report": report.to_json()}}
+            found[tile] = replace(made, about=about)
+        return found
 
 
-def _reports(reuse: Reuse) -> dict[Tile, RefinementReport]:
-    """The reports of the tiles that stay; a tile without a readable one is refined again."""
-    found = {}
-    for tile, about in list(reuse.same.items()):
-        try:
-            found[tile] = RefinementReport.from_json(about["said"]["report"])
-        except (KeyError, TypeError, ValueError):
-            del reuse.same[tile]
+class _Inputs:
+    """What tasks read of a run."""
+
+    def __init__(self, run: str, settings: str) -> None:
+        opened = Settings.model_validate_json(settings)
+        self.steps, self.model = opened.refinement, opened_sensor_model(opened)
+        self.raw = open_raw(Path(run), open_label_set(opened.classes))
+        self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
+
+    def beside(self, tile: Tile, around: VoxelMap, moved: VoxelMap) -> Evidence:
+        own = around.indices[places_around(around, tile, 0)]
+        keyframes = None
+        if len(own) and self.steps.free_space.enabled:
+            box: NDArray[np.float64] = (
+                np.stack([own.min(axis=0), own.max(axis=0)]) + 0.5
+            ) * around.voxel_size_m
+            keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
+        return Evidence(moved, self.model, keyframes)
+
+
+def measure_tiles(
+    run: str, settings: str, made_in: str, of_tiles: list[tuple[int, int, str]]
+) -> list[dict[str, int]]:
+    """Sums of tiles, saved with the digest of what is around each: a task."""
+    inputs, found = _Inputs(run, settings), []
+    for x, y, around in of_tiles:
+        voxels, _ = inputs.raw.around((x, y), inputs.halo)
+        sums = sums_of((x, y), voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
+        write_record({"around": around, "sums": sums}, _sums_file((x, y), Path(made_in)))
+        found.append(sums)
     return found
 
 
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+def refine_tiles(
+    run: str, settings: str, made_in: str, figures: dict[str, Any], of_tiles: list[tuple[int, int, Any]]
+) -> list[None]:
+    """Refine tiles, and save each with what `map.json` is to say of it and its report: a task."""
+    inputs = _Inputs(run, settings)
+    for x, y, about in of_tiles:
+        voxels, moved = inputs.raw.around((x, y), inputs.halo)
+        beside = inputs.beside((x, y), voxels, moved)
+        state, report = refine_tile((x, y), voxels, beside, inputs.steps, Figures(**figures))
+        about["said"]["report"] = report.to_json()
+        assert state.decided is not None
+        save((x, y), state.decided, about, _packed(state.kerbs), Path(made_in))
+    return [None] * len(of_tiles)
+
+
+MEASURE_TILES, REFINE_TILES = (f"{f.__module__}:{f.__name__}" for f in (measure_tiles, refine_tiles))
+
+
+def _sums_file(tile: Tile, made_in: Path) -> Path:
+    return made_in / f"{tile[0]}_{tile[1]}.sums.json"
+
+
+def _packed(kerbs: Kerbs | None) -> dict[str, Any] | None:
+    """Kerbs as JSON."""
+    if kerbs is None:
+        return None
+    file = io.BytesIO()
+    np.savez_compressed(file, keys=kerbs.keys, leaning=kerbs.leaning, known=kerbs.known, levels=kerbs.levels)
+    arrays = base64.b64encode(file.getvalue()).decode()
+    return {"voxel_size_m": kerbs.voxel_size_m, "classes": list(kerbs.classes), "arrays": arrays}
+
+
+def _kerbs(packed: Any) -> Kerbs:
+    road, sidewalk = packed["classes"]
+    with np.load(io.BytesIO(base64.b64decode(packed["arrays"])), allow_pickle=False) as arrays:
+        return Kerbs(packed["voxel_size_m"], (road, sidewalk), **arrays)
 
 
 def opened_sensor_model(settings: Settings) -> LabelCalibration | None:

@@ -10,7 +10,6 @@ any size, and the work in the halo shrinks from step to step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import reduce
@@ -31,9 +30,10 @@ from gnss_sem_map.refinement import (
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, VehicleObject
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings, do
-from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
+from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import TILE_BITS, Tile, joined, joined_voxels
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
+from gnss_sem_map.voxels.tiles import joined, joined_voxels, places_around
 from gnss_sem_map.voxels.voxel_map import VoxelMap, unpack
 
 WORTH_CUTTING_M = 2.0
@@ -49,8 +49,8 @@ def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
 def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
     """What a tile adds to the figures of the whole map, from the voxels of the tile and its halo."""
     reach = _sums_reach_m(settings, around.voxel_size_m)
-    state = MapState.of(around[_places(around, tile, reach + height_above_ground.REACH_M)], beside)
-    state = state[_places(state.voxels, tile, reach)]
+    state = MapState.of(around[places_around(around, tile, reach + height_above_ground.REACH_M)], beside)
+    state = state[places_around(state.voxels, tile, reach)]
     state, _ = do(STEPS[0], state, settings)
     images = state.scores
     state, _ = do(STEPS[1], state, settings)
@@ -81,13 +81,13 @@ def refine_tile(
     """
     size, halo, reports = around.voxel_size_m, halo_m(settings, around.voxel_size_m), []
     if beside.moved is not None:
-        beside = replace(beside, moved=beside.moved[_places(beside.moved, tile, 0)])
-    state = MapState.of(around[_places(around, tile, halo)], beside, figures)
+        beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, 0)])
+    state = MapState.of(around[places_around(around, tile, halo)], beside, figures)
     own = _inside(state.voxels, tile)
     for i, step in enumerate(STEPS):
         needed = _reach_from(i, settings, size)
         if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
-            state, halo = state[_places(state.voxels, tile, needed)], needed
+            state, halo = state[places_around(state.voxels, tile, needed)], needed
             own = _inside(state.voxels, tile)
         state, report = do(step, state, settings, own if halo else slice(None))
         reports.append(report)
@@ -148,26 +148,11 @@ def _reach_from(first: int, settings: RefinementSettings, voxel_size_m: float) -
     return sum((reach(section, voxel_size_m) for section, reach in reaches if section.enabled), 0.0)
 
 
-def _places(voxels: VoxelMap, tile: Tile, margin_m: float) -> NDArray[np.int64]:
-    """The places of the voxels of a tile and of a margin around it."""
-    low_x, high_x, low_y, high_y = _limits(tile, math.ceil(margin_m / voxels.voxel_size_m))
-    start, end = np.searchsorted(voxels.keys, [low_x << 2 * AXIS_BITS, high_x << 2 * AXIS_BITS])
-    y = voxels.keys[start:end] >> AXIS_BITS & AXIS_MASK
-    return np.asarray(np.flatnonzero((y >= low_y) & (y < high_y)) + start, np.int64)
-
-
 def _inside(voxels: VoxelMap, tile: Tile) -> NDArray[np.bool_]:
     """Which voxels (v,) lie in a tile."""
     inside = np.zeros(len(voxels), np.bool_)
-    inside[_places(voxels, tile, 0)] = True
+    inside[places_around(voxels, tile, 0)] = True
     return inside
-
-
-def _limits(tile: Tile, margin_voxels: int) -> tuple[int, int, int, int]:
-    """First and past the last column in x and in y of a tile and its margin, in the numbers of packed keys."""
-    (x, y), edge = tile, 1 << TILE_BITS
-    low_x, low_y = (AXIS_OFFSET + axis * edge - margin_voxels for axis in (x, y))
-    return low_x, low_x + edge + 2 * margin_voxels, low_y, low_y + edge + 2 * margin_voxels
 
 
 def _holds(tile: Tile, thing: VehicleObject, voxel_size_m: float) -> bool:

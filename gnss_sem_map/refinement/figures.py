@@ -53,13 +53,14 @@ class Sums:
     @classmethod
     def from_json(cls, content: Mapping[str, object]) -> Sums:
         """Raises ValueError for anything but whole numbers of these names."""
+        numbers = {name: value for name, value in dict(content).items() if type(value) is int and value >= 0}
         names = {field.name for field in fields(cls)}
-        if set(content) != names or not all(type(value) is int and value >= 0 for value in content.values()):
+        if set(content) != names or len(numbers) < len(names):
             raise ValueError(
                 f"sums of a tile: found {str(dict(content))[:200]}, expected whole numbers {sorted(names)};"
                 " refine the map again"
             )
-        return cls(**content)  # type: ignore[arg-type]
+        return cls(**numbers)
 
 
 @dataclass(frozen=True)

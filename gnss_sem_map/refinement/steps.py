@@ -242,5 +242,7 @@ def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | slice) 
         source = known
     source, target = source[own], target[own]
     differ = target != source
-    pairs, counts = np.unique(np.stack([source[differ], target[differ]]), axis=1, return_counts=True)
-    return {(names[a], names[b]): int(n) for (a, b), n in zip(pairs.T, counts, strict=True)}
+    # -1 comes first; sorting the pairs would take as long as a step does
+    pairs = (source[differ].astype(np.intp) + 1) * len(names) + target[differ] + 1
+    counts = np.bincount(pairs, minlength=len(names) ** 2).reshape(len(names), -1)
+    return {(names[a - 1], names[b - 1]): int(counts[a, b]) for a, b in np.argwhere(counts)}

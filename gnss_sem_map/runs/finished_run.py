@@ -26,10 +26,11 @@ from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
-from gnss_sem_map.mapping.raw_map import DRIVES, MAP
+from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
@@ -40,6 +41,7 @@ from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 __all__ = ["Run", "Settings", "open_drive", "run"]
@@ -83,7 +85,9 @@ def run(
                 log, network, settings, folder, claim.work, progress,
                 origin=origin, resume=resume, elsewhere=elsewhere, labels_from=source.labels_from, force=force,
             )  # fmt: skip
-            refined = pipeline.refine(folder, settings, mapped.stats, progress)
+            refined = pipeline.refine(
+                folder, settings, mapped.stats, progress, executor=executor, work=claim.work
+            )
             run_folder.write_run(folder, source, mapped, refined, settings, write_labels)
     return Run(out)
 
@@ -127,7 +131,7 @@ class Run:
     @cached_property
     def frame(self) -> LocalFrame | None:
         """The local frame of the map; None for a map without a georeference."""
-        return tiles.read_frame(self.folder / "map")
+        return read_frame(self.folder / "map")
 
     @cached_property
     def label_set(self) -> LabelSet:
@@ -154,7 +158,7 @@ class Run:
                     shutil.copytree(
                         self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
                     )
-            refined = pipeline.refine(folder, settings, stats)
+            refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)

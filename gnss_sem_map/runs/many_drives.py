@@ -30,17 +30,17 @@ from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
-from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
-from gnss_sem_map.mapping.raw_map import DRIVES, MAP, write_sum
+from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 
 SETTINGS = "config.yaml"
 OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
@@ -106,7 +106,7 @@ def run_drives(
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
         labelled = [how.source(drive) for drive in drives if drive.name in done and write_labels]
-        about = _write(out, done, settings, frame, failed, progress, labelled)
+        about = _write(out, done, settings, frame, failed, claim, executor, progress, labelled)
     return ManyDrives(out, about)
 
 
@@ -127,7 +127,7 @@ def add_drive(
         if failed:
             raise DataError(f"{out}: stays as it was; {_first(failed)}")
         added = {drive.name: claim.work / DRIVES / drive.name}
-        about = _write(out, there | added, settings, frame, {}, progress)
+        about = _write(out, there | added, settings, frame, {}, claim, InProcess(), progress)
     return ManyDrives(out, about)
 
 
@@ -139,8 +139,8 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
         raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
     if not stay:
         raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
-    with run_folder.claimed_run(out):
-        about = _write(out, stay, settings, frame, {}, progress)
+    with run_folder.claimed_run(out) as claim:
+        about = _write(out, stay, settings, frame, {}, claim, InProcess(), progress)
     return ManyDrives(out, about)
 
 
@@ -222,6 +222,8 @@ def _write(
     settings: Settings,
     frame: LocalFrame,
     failed: Mapping[str, str],
+    claim: Claim,
+    executor: Executor,
     progress: Progress,
     labelled: Sequence[Source] = (),
 ) -> dict[str, Any]:
@@ -232,9 +234,12 @@ def _write(
         for part in parts:
             _link_all(drives[part.name], part)
         with stats.stage("mapping"):
-            write_sum(parts, folder, frame, open_label_set(settings.classes), out)
+            write_sum(parts, folder, frame, settings.classes, out, executor=executor, work=claim.work)
         # tiles that are taken from an earlier map do not say which points of kerbs are which
-        refined = pipeline.refine(folder, settings, stats, progress, None if labelled else out)
+        earlier = None if labelled else out
+        refined = pipeline.refine(
+            folder, settings, stats, progress, earlier, executor=executor, work=claim.work
+        )
         for source in labelled:
             part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
             trajectory = Trajectory.load(part / "trajectory.parquet")
@@ -276,7 +281,7 @@ def _link_all(drive: Path, part: Path) -> None:
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     """Settings, frame and drives of a finished map, which may be that of one drive; raises DataError."""
     about, settings = read_run(out), config.load(out / SETTINGS)
-    frame = tiles.read_frame(out / MAP)
+    frame = read_frame(out / MAP)
     if frame is None:
         raise DataError(f"{shown(out)}: its map has no georeference, so no other drive fits to it")
     if is_folder(out / DRIVES):

@@ -8,7 +8,7 @@ from pathlib import Path
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_folder
-from gnss_sem_map.mapping.raw_map import DRIVES
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.runs.run_folder import between
 
 TRACKS = "tracks"

@@ -18,6 +18,7 @@ from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels import label_set, sensor_model
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 
 FRAMES = range(4)
 CLASSES = ("road", "sidewalk", "vehicle", "building", "vegetation")
@@ -244,7 +245,7 @@ def small_map(folder: Path) -> Path:
 def map_json(folder: Path) -> Reader:
     """What says which tiles a map has."""
     where = small_map(folder)
-    return Reader(where / "map.json", lambda: (tiles.read(where), tiles.read_frame(where)), mutations.text)
+    return Reader(where / "map.json", lambda: (tiles.read(where), read_frame(where)), mutations.text)
 
 
 def tile(folder: Path) -> Reader:

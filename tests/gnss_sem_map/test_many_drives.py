@@ -36,6 +36,7 @@ from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, add_drive, remo
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.map_json import read_frame
 
 SETTINGS = Settings()
 OF_MOMENT = ("run.json", "report.html")
@@ -126,7 +127,7 @@ def test_the_map_is_the_sum_of_the_maps_of_its_drives(made: dict[str, Path]) -> 
 
 def test_every_drive_lies_in_the_map_where_it_was_driven(made: dict[str, Path], drives: Drives) -> None:
     """In the frame of the first drive, though each has an origin of its own."""
-    frame = tiles.read_frame(made["abc"] / "map")
+    frame = read_frame(made["abc"] / "map")
     assert frame == open_drive(drives.by_name["a"]).frame
     origin = drives.motion.poses(np.array([drives.starts_s["a"]]))[0, :3, 3]
     for name, start_s in drives.starts_s.items():
@@ -170,7 +171,7 @@ def test_a_map_from_which_a_drive_was_taken_is_that_of_the_others(
     remove_drive(out, "c")
     assert_same(out, made["ab"])
     remove_drive(out, "a")
-    frame = tiles.read_frame(made["ab"] / "map")
+    frame = read_frame(made["ab"] / "map")
     run_drives([drives.by_name["b"]], tmp_path / "b", SETTINGS, how, origin=frame)
     assert_same(out, tmp_path / "b")
     with pytest.raises(DataError, match=r"out: b is its only drive; remove the folder instead$"):

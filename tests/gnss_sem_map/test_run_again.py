@@ -42,14 +42,26 @@ LIVE = ("--set", "dynamics.window_scans=2", "--write-labels")
 SMALL = ("--set", "dynamics.window_scans=1")
 """Two scans in a chunk."""
 COMMAND = """
-import os, sys
+import os, re, sys
+
+tiles = 0
 
 def look(event, details):
-    if event == "os.rename" and (name := os.path.basename(os.fsdecode(details[1]))).isdecimal():
+    global tiles
+    if event != "os.rename":
+        return
+    name = os.path.basename(os.fsdecode(details[1]))
+    if name.isdecimal():
         if name == os.environ.get("die_before_chunk"):
             os._exit(137)
         with open("chunks", "a") as file:
             print(name, os.getpid(), file=file)
+    if re.fullmatch(r"-?\\d+_-?\\d+[.]json", name):
+        if str(tiles) == os.environ.get("die_after_tiles"):
+            os._exit(137)
+        tiles += 1
+        with open("tiles", "a") as file:
+            print(name, file=file)
 
 sys.addaudithook(look)  # in the processes that map too: they run this file when they start
 if __name__ == "__main__":
@@ -88,6 +100,8 @@ class Watched:
     """Numbers of the chunks of scans that it mapped and put away."""
     processes: list[int]
     """The process that mapped each."""
+    tiles: list[str]
+    """Records of the tiles that it refined."""
     asked: list[str]
     """A checksum of every image that the network answered."""
 
@@ -103,10 +117,10 @@ def watched(folder: Path, words: Sequence[str | Path], **dies: int) -> Watched:
     )  # fmt: skip
     lines = {
         name: path.read_text().split() if (path := folder / name).exists() else []
-        for name in ("chunks", "asked")
+        for name in ("chunks", "tiles", "asked")
     }
     numbers = list(map(int, lines["chunks"]))
-    return Watched(done.returncode, done.stderr, numbers[::2], numbers[1::2], lines["asked"])
+    return Watched(done.returncode, done.stderr, numbers[::2], numbers[1::2], lines["tiles"], lines["asked"])
 
 
 def results_of(out: Path) -> dict[str, bytes]:
@@ -146,6 +160,22 @@ def test_a_killed_run_is_resumed_by_two_processes_and_keeps_what_it_had(
     assert sorted(resumed.chunks) == [1, 2, 3, 4, 5], "the chunk that was there is mapped again"
     assert len(set(resumed.processes)) == 2
     assert_same_maps(out, whole)
+
+
+def test_a_run_that_is_killed_while_it_is_refined_keeps_the_tiles_that_it_had(
+    small_drive: Street, live: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    words = run_of(small_drive, out, *LIVE, labels="python:network:look")
+    died = watched(tmp_path / "first", words, die_after_tiles=1)
+    assert died.code == KILLED
+    assert len(died.tiles) == 1
+    resumed = watched(tmp_path / "second", [*words, "--resume"])
+    assert resumed.code == 0, resumed.err
+    assert resumed.tiles
+    assert not {*resumed.tiles} & {*died.tiles}, "a tile that was there is refined again"
+    assert len(resumed.tiles) == len(tiles.open_map(out / "refined").tiles) - 1
+    assert results_of(out) == results_of(live)
 
 
 @pytest.fixture(scope="module")

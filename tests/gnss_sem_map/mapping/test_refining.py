@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,48 +10,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from long_street import keyframes, street
+from raw_street import EVERY, FRAME, MOVED, SETTINGS, VOXELS, content, write_raw
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import evidence, refining
+from gnss_sem_map.mapping import refining
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
-from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tiles import Tile
+from gnss_sem_map.voxels import reuse, tiles
+from gnss_sem_map.voxels.map_json import name_of
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-FRAME = LocalFrame(49.011, 8.423, 112.0)
-VOXELS = street()
-MOVED = VOXELS[np.flatnonzero(VOXELS.centres[:, 0] > 350.0)[::9]]
-"""Of the fourth tile and those after it."""
-EVERY = [(x, 0) for x in range(7)]
-SETTINGS = Settings()
 WITHOUT_FREE_SPACE = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
-
-
-def write_raw(
-    run: Path,
-    voxels: VoxelMap = VOXELS,
-    scans: bool = False,
-    moved: VoxelMap = MOVED,
-    frame: LocalFrame = FRAME,
-) -> Path:
-    """The raw map of a run folder, and its evidence, with or without keyframe scans between x = 325 and 350 m."""
-    tiles.write(SemanticMap.of(voxels), run / "map", frame)
-    tiles.write(SemanticMap.of(moved), run / "evidence" / "moved", frame)
-    file = io.BytesIO()
-    evidence.write_keyframes(keyframes(), file)
-    evidence.write([], [file.getvalue()] if scans else [], run)
-    return run
 
 
 def seen_again(voxels: VoxelMap, tile: Tile) -> VoxelMap:
     """The same map with 40 voxels of a tile seen once more."""
-    inside = (voxels.indices[:, :2] >> tiles.TILE_BITS == tile).all(axis=1)
+    inside = (voxels.indices[:, :2] >> TILE_BITS == tile).all(axis=1)
     more = np.zeros(len(voxels), np.uint32)
     more[np.flatnonzero(inside)[1000:1040]] = 1
     return replace(
@@ -89,13 +66,9 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
 def linked(run: Path, earlier: Path, layer: str = "refined") -> list[Tile]:
     """The tiles of a layer that are files of an earlier run as well."""
-    names = {tile: tiles.name_of(tile) for tile in EVERY}
+    names = {tile: name_of(tile) for tile in EVERY}
     return [tile for tile in EVERY if (run / layer / names[tile]).samefile(earlier / layer / names[tile])]
 
 
@@ -144,6 +117,34 @@ def test_other_settings_refine_every_tile_again(before: Path, tmp_path: Path, re
     assert linked(tmp_path / "run", before) == []
 
 
+def copied(run: Path, to: Path) -> Path:
+    """A run that a test may damage."""
+    (to / "refined").mkdir(parents=True)
+    for path in (run / "refined").iterdir():
+        (to / "refined" / path.name).write_bytes(path.read_bytes())
+    return to
+
+
+def test_tiles_of_another_version_are_made_again(
+    before: Path, tmp_path: Path, refine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reuse, "VERSION", "0.0.1")
+    _, called = refine(write_raw(tmp_path / "run"), before)
+    assert called == EVERY
+    assert linked(tmp_path / "run", before) == []
+
+
+def test_a_damaged_tile_is_made_again(before: Path, tmp_path: Path, refine: Any) -> None:
+    earlier = copied(before, tmp_path / "earlier")
+    tile = earlier / "refined" / name_of((3, 0))
+    content_of_tile = bytearray(tile.read_bytes())
+    content_of_tile[1000] ^= 1
+    tile.write_bytes(content_of_tile)
+    _, called = refine(write_raw(tmp_path / "run"), earlier)
+    assert called == [(3, 0)]
+    assert content(tmp_path / "run/refined") == content(before / "refined")
+
+
 def without(said: dict[str, Any], name: str) -> dict[str, Any]:
     return {key: value for key, value in said.items() if key != name}
 
@@ -171,12 +172,9 @@ def test_what_an_earlier_map_says_is_made_anew_where_it_cannot_be_read(
     damage: Callable[[dict[str, Any]], Any], again: bool, before: Path, tmp_path: Path, refine: Any
 ) -> None:
     """Without a report the tile is refined again; without sums these are added up again."""
-    earlier, damaged = tmp_path / "earlier", (3, 0)
-    (earlier / "refined").mkdir(parents=True)
-    for path in (before / "refined").iterdir():
-        (earlier / "refined" / path.name).write_bytes(path.read_bytes())
+    earlier, damaged = copied(before, tmp_path / "earlier"), (3, 0)
     about = json.loads((earlier / "refined/map.json").read_text())
-    of_tile = about["files"][tiles.name_of(damaged)]
+    of_tile = about["files"][name_of(damaged)]
     of_tile["said"] = damage(of_tile["said"])
     (earlier / "refined/map.json").write_text(json.dumps(about))
     _, called = refine(write_raw(tmp_path / "run"), earlier)
@@ -197,7 +195,7 @@ def test_an_earlier_map_that_cannot_be_read_is_as_none(
 
 def summed(run: Path, drives: list[Path], earlier: Path | None = None) -> dict[str, bytes]:
     run.mkdir()
-    write_sum(drives, run, FRAME, open_label_set(), earlier)
+    write_sum(drives, run, FRAME, earlier=earlier)
     return {str(path.relative_to(run)): path.read_bytes() for path in run.rglob("*") if path.is_file()}
 
 
@@ -232,4 +230,4 @@ def test_drives_of_another_voxel_size_or_frame_do_not_add_up(tmp_path: Path) -> 
     elsewhere = write_raw(tmp_path / "elsewhere", frame=LocalFrame(49.0, 8.4, 112.0))
     for other in (coarse, elsewhere):
         with pytest.raises(DataError, match=r"voxels of .* m, or another frame; map them again$"):
-            write_sum([fine, other], tmp_path / "out", FRAME, open_label_set())
+            write_sum([fine, other], tmp_path / "out", FRAME)

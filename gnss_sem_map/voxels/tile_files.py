@@ -1,0 +1,171 @@
+"""One tile of a map as a Parquet file: 512 x 512 columns of voxels.
+
+A tile holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key (x 9 bits,
+y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, the sum of the points' heights over the bottom of the voxel
+where it is known, and the label, confidence and state of each voxel. A refined map counts all hits, and in
+`hits_removed` those of moving objects; log-likelihoods are of static objects only. Keys are sorted and delta-coded, so
+a voxel takes about 14 bytes. Any Parquet reader opens it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import read_bytes, shown
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
+
+TILE_BITS = 9
+Z_BITS = 14
+Z_OFFSET = 1 << (Z_BITS - 1)
+HITS_REMOVED = "hits_removed"
+"""Column of maps in which objects moved through static voxels."""
+HEIGHTS = "heights"
+"""Column of maps that know how high the surface in a voxel lies."""
+Tile = tuple[int, int]
+
+
+def encode(piece: SemanticMap) -> bytes:
+    """The voxels of one tile and what is decided about them."""
+    columns = _columns_of(piece.voxels)
+    columns |= {"label": piece.labels.astype(np.int32), "state": piece.states.astype(np.int32)}
+    columns |= {"confidence": piece.confidence}
+    if piece.hits_removed is not None:
+        columns[HITS_REMOVED] = piece.hits_removed
+    return _as_parquet(columns)
+
+
+def describe(piece: SemanticMap, content: bytes) -> dict[str, Any]:
+    """What `map.json` says of a tile, which has this content as a file."""
+    return {
+        "voxels": len(piece),
+        "points": int(piece.voxels.hits.sum(dtype=np.int64)),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+
+
+def read(
+    path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
+) -> SemanticMap:
+    """The tile that `encode` wrote, of so many `voxels` and with this `sha256`; raises DataError, with its name."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = ["key", *(f"log_{name}" for name in label_set.names), "hits", "label", "confidence", "state"]
+    content = read_bytes(path)
+    try:
+        if hashlib.sha256(content).hexdigest() != about["sha256"]:
+            raise ValueError("its checksum is not that of map.json")
+        file = pq.ParquetFile(pa.BufferReader(content))
+        if file.metadata.num_rows != about["voxels"]:
+            raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
+        names += [name for name in (HITS_REMOVED, HEIGHTS) if name in file.schema_arrow.names]
+        table = file.read(columns=names)
+        columns = {name: _column(table, name) for name in names}
+        if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
+            raise ValueError("it has labels of no class")
+        if not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
+            raise ValueError("it has confidences beyond 0..1")
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None
+    removed = columns.get(HITS_REMOVED)
+    return SemanticMap(
+        voxels=_voxels_of(columns, tile, voxel_size_m, label_set),
+        labels=columns["label"].astype(np.int8),
+        confidence=columns["confidence"].astype(np.float32),
+        states=columns["state"].astype(np.uint8),
+        hits_removed=None if removed is None else removed.astype(np.uint32),
+    )
+
+
+def encode_voxels(voxels: VoxelMap) -> bytes:
+    """The voxels of one tile, without decisions, as a Parquet file."""
+    return _as_parquet(_columns_of(voxels))
+
+
+def decode_voxels(content: bytes, tile: Tile, voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
+    """What `encode_voxels` wrote; raises ValueError or pyarrow's ArrowException for anything else."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(pa.BufferReader(content)).read()
+    columns = {name: _column(table, name) for name in table.column_names}
+    return _voxels_of(columns, tile, voxel_size_m, label_set)
+
+
+def _columns_of(voxels: VoxelMap) -> dict[str, NDArray[Any]]:
+    # Parquet's smallest integer is 32 bits; it packs small ones tightly
+    columns: dict[str, NDArray[Any]] = {"key": local_keys(voxels)}
+    columns |= {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
+    columns |= {"hits": voxels.hits}
+    return columns if voxels.heights is None else columns | {HEIGHTS: voxels.heights}
+
+
+def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    whole = [name for name in columns if name != "confidence"]
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        pa.table(columns), sink, compression="zstd", use_dictionary=False, write_statistics=False,
+        column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED")
+        | {name: "BYTE_STREAM_SPLIT" for name in columns if name == "confidence"},
+    )  # fmt: skip
+    return bytes(sink.getvalue())
+
+
+def _column(table: Any, name: str) -> NDArray[Any]:
+    """A column as numbers without gaps; raises ValueError for anything else."""
+    import pyarrow as pa
+
+    column = table[name].combine_chunks()
+    is_number = pa.types.is_floating if name == "confidence" else pa.types.is_integer
+    if column.null_count or not is_number(column.type):
+        raise ValueError(f"column {name} is {column.type} with {column.null_count} gaps")
+    return np.from_dlpack(column)  # `to_numpy` imports pandas, which takes half a second
+
+
+def _voxels_of(
+    columns: dict[str, NDArray[Any]], tile: Tile, voxel_size_m: float, label_set: LabelSet
+) -> VoxelMap:
+    heights = columns.get(HEIGHTS)
+    return VoxelMap(
+        voxel_size_m,
+        label_set,
+        _global(tile, columns["key"]),
+        np.stack([columns[f"log_{name}"] for name in label_set.names], axis=1, dtype=np.int32),
+        columns["hits"].astype(np.uint32),
+        None if heights is None else heights.astype(np.int64),
+    )
+
+
+def local_keys(voxels: VoxelMap) -> NDArray[np.uint32]:
+    """Keys of voxels inside their tile."""
+    x, y, height = voxels.indices.T.astype(np.int64)
+    z = height + Z_OFFSET
+    if len(z) and (z.min() < 0 or z.max() >= 1 << Z_BITS):
+        raise DataError(
+            f"voxel heights {height.min()} to {height.max()} do not fit a tile (-{Z_OFFSET} to"
+            f" {Z_OFFSET - 1}); check the heights of the trajectory"
+        )
+    mask = (1 << TILE_BITS) - 1
+    local = (x & mask) << (TILE_BITS + Z_BITS) | (y & mask) << Z_BITS | z
+    return np.asarray(local, np.uint32)
+
+
+def _global(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Keys of a tile's voxels."""
+    wide = local.astype(np.int64)
+    mask = (1 << TILE_BITS) - 1
+    x = (wide >> (TILE_BITS + Z_BITS)) + (tile[0] << TILE_BITS)
+    y = (wide >> Z_BITS & mask) + (tile[1] << TILE_BITS)
+    return pack(np.stack([x, y, (wide & ((1 << Z_BITS) - 1)) - Z_OFFSET], axis=1))

@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 import tracklets
+from chunks import build_maps
 from numpy.typing import NDArray
 
 from gnss_sem_map import config
@@ -38,7 +39,6 @@ from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynam
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
-from gnss_sem_map.mapping.fusion import build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.pipeline import estimate_trajectory

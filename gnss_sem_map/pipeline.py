@@ -25,7 +25,7 @@ from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sam
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.execution import Executor
-from gnss_sem_map.mapping.fusion import map_scans, probabilities_fingerprint
+from gnss_sem_map.mapping.fusion import Elsewhere, map_scans, probabilities_fingerprint
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
@@ -69,7 +69,7 @@ def run(
     *,
     origin: LocalFrame | None = None,
     resume: bool = False,
-    workers: int = 1,
+    elsewhere: Elsewhere | None = None,
     labels_from: str = "",
     force: bool = False,
 ) -> Mapped:
@@ -77,8 +77,8 @@ def run(
 
     Without a segmenter, or without images, the map has no labels. The frame of the map is that of the drive, or
     `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
-    see `mapping.fusion.map_scans`. With `force`, a red pre-flight does not stop the run. Raises PreflightError,
-    DataError when not one scan can be used, MeasurementError and EstimationError from the smoother.
+    for this and `elsewhere` see `mapping.fusion.map_scans`. With `force`, a red pre-flight does not stop the run.
+    Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
     check_georeference(log, origin)
@@ -97,7 +97,7 @@ def run(
     log, trajectory = in_frame(log, found.trajectory, origin)
     drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     mapped = map_drive(
-        drive, folder, work, stats, progress, resume=resume, workers=workers, labels_from=labels_from
+        drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
     return replace(mapped, solution=found.solution, sharpness=sharpness, preflight=page)
 
@@ -110,7 +110,7 @@ def map_drive(
     progress: Progress = silent,
     *,
     resume: bool = False,
-    workers: int = 1,
+    elsewhere: Elsewhere | None = None,
     labels_from: str = "",
 ) -> Mapped:
     """Raw map and evidence of a drive whose trajectory is known; see `run`."""
@@ -121,7 +121,7 @@ def map_drive(
             stats,
             progress,
             resume=resume,
-            workers=workers,
+            elsewhere=elsewhere,
             labels_from=labels_from,
         )
         write_raw(store, folder, drive.log.frame)

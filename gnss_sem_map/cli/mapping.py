@@ -39,7 +39,7 @@ Workers = Annotated[
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(help="Address of a Dask scheduler whose workers map the drives (docs/cluster.md)."),
+    typer.Option(help="Address of a Dask scheduler whose workers map instead (docs/cluster.md)."),
 ]
 Resume = Annotated[bool, typer.Option(help="Continue an interrupted run of the same drives and settings.")]
 
@@ -69,7 +69,12 @@ def run(
     workers: Workers = None,
     scheduler: Scheduler = None,
     resume: Resume = False,
-    write_labels: Annotated[bool, typer.Option(help="Also write a class per original LiDAR point.")] = False,
+    write_labels: Annotated[
+        bool,
+        typer.Option(
+            help="Also write a class per original LiDAR point; of several drives, in OUT/drives/NAME/."
+        ),
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -80,17 +85,15 @@ def run(
     from gnss_sem_map.segmentation import no_segmenter_message
 
     settings, frame, found = settings_of(config, set_), frame_of(origin), drives_of(drives)
+    if scheduler is not None and workers is not None:
+        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     if len(found) > 1:
-        if write_labels:
-            raise typer.BadParameter("works for one drive at a time", param_hint="--write-labels")
         if segmenter is None:
             typer.echo(no_segmenter_message(str(found[0])), err=True)
             raise typer.Exit(1)
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)
-        _run_many(found, out, settings, how, frame, workers, scheduler, as_json)
+        _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, as_json)
         return
-    if scheduler is not None:
-        raise typer.BadParameter("a cluster maps several drives; found one", param_hint="--scheduler")
     [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config)):
         log = open_log(drive, drive_format, frames)
@@ -100,8 +103,9 @@ def run(
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
-                log=log, frames=frames, device=device, origin=frame, workers=workers or default_workers(),
-                resume=resume, write_labels=write_labels, force=force, progress=progress,
+                log=log, frames=frames, drive_format=drive_format, device=device, origin=frame,
+                workers=workers or default_workers(), scheduler=scheduler, resume=resume,
+                write_labels=write_labels, force=force, progress=progress,
             )  # fmt: skip
     about = finished.about
     warn(about["warnings"])
@@ -116,16 +120,16 @@ def _run_many(
     origin: LocalFrame | None,
     workers: int | None,
     scheduler: str | None,
+    write_labels: bool,
     as_json: bool,
 ) -> None:
     from gnss_sem_map.runs.many_drives import run_drives
 
-    if scheduler is not None and workers is not None:
-        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     with progress_bars() as progress:
         made = run_drives(
             drives, out, settings, how,
-            origin=origin, workers=workers or default_workers(), scheduler=scheduler, progress=progress,
+            origin=origin, workers=workers or default_workers(), scheduler=scheduler,
+            write_labels=write_labels, progress=progress,
         )  # fmt: skip
     print_many(made.about, out, as_json)
     if made.failed:

@@ -35,7 +35,7 @@ Segmenter = Annotated[
     str | None,
     typer.Option(
         help="Source of class probabilities: labels:DIR, refinenet:FILE, hf:MODEL, onnx:FILE,"
-        " python:MODULE:CALLABLE; none: geometry only."
+        " python:MODULE:CALLABLE; none: geometry only. {drive} stands for the name of the drive."
     ),
 ]
 Device = Annotated[str, typer.Option(help="Device of a network: auto, cpu, cuda.")]
@@ -91,11 +91,15 @@ def frame_of(origin: str | None) -> LocalFrame | None:
         return None
     try:
         lat_deg, lon_deg, alt_m = map(float, origin.split(","))
-        return LocalFrame(lat_deg, lon_deg, alt_m)
-    except (ValueError, MeasurementError) as error:
+    except ValueError:
         raise typer.BadParameter(
-            f"found {origin!r} ({error}); expected LAT,LON,ALT", param_hint="--origin"
+            f"found {origin[:100]!r}, expected three numbers LAT,LON,ALT in degrees and m, e.g. 49.01,8.43,112.8",
+            param_hint="--origin",
         ) from None
+    try:
+        return LocalFrame(lat_deg, lon_deg, alt_m)
+    except MeasurementError as error:
+        raise typer.BadParameter(str(error), param_hint="--origin") from None
 
 
 def default_workers() -> int:

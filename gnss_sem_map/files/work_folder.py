@@ -2,6 +2,7 @@
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
+          job.json, trajectory.npz   what other processes need to map chunks (`runs.chunk_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
@@ -21,8 +22,9 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
 CHUNKS, ANSWERS, DRIVES, TILES, PART, OLD = "chunks.json", "answers", "drives", "tiles", "part", "old"
+JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
-    r"\.[^/]+\.\d+\.part|chunks\.json"
+    r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
     r"|\.\d+\.\d+\.waiting/(\d+\.npy)?"
 )

@@ -12,7 +12,8 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
@@ -51,16 +52,12 @@ class Cluster:
     timeout_s: float = 3600.0
     allowed: str = ALLOWED
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
+    def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
         """Call all tasks; yields each with its result when it is done.
 
-        Raises ConfigError without Dask or a scheduler, and DataError when workers are missing or cannot do the tasks.
+        Raises what `check` raises, and DataError when all workers are gone for long.
         """
-        with _connected(self.address) as client:
-            _wait_for_worker(client, self.address)
-            _refuse_other_versions(client)
-            _refuse_without_nanny(client)
-            _refuse_own_folders(client, self.work.resolve())
+        with self._checked() as client:
             waiting, losses = deque(tasks), Losses()
             under_way: dict[Future[Any], Task] = {}
             finished: SimpleQueue[Future[Any]] = SimpleQueue()
@@ -77,11 +74,24 @@ class Cluster:
                         try:
                             yield task, _result(client, task, future)
                         except Lost as lost:
-                            losses.add(task, lost)
-                            waiting.append(task)
+                            yield from losses.add(task, lost, waiting)
             finally:
                 if client.status == "running":
                     client.cancel(list(under_way))
+
+    def check(self) -> None:
+        """Raise ConfigError without Dask or a scheduler, and DataError when workers are missing or not fit."""
+        with self._checked():
+            pass
+
+    @contextmanager
+    def _checked(self) -> Iterator[Client]:
+        with _connected(self.address) as client:
+            _wait_for_worker(client, self.address)
+            _refuse_other_versions(client)
+            _refuse_without_nanny(client)
+            _refuse_own_folders(client, self.work.resolve())
+            yield client
 
     def _submit(self, client: Client, task: Task) -> Future[Any]:
         words = (task.function, json.dumps(task.arguments), self.allowed, self.timeout_s, _version())
@@ -111,19 +121,22 @@ def _result(client: Client, task: Task, future: Future[Any]) -> Any:
     """The result of a finished task; raises Lost when a second attempt may succeed."""
     from distributed import KilledWorker
 
-    if future.cancelled():
-        if client.status != "running":
-            raise DataError("the connection to the Dask scheduler was lost; see that it runs, and --resume")
-        raise Lost("Dask cancelled it")
-    try:
-        address, answered = future.result()
-    except KilledWorker as error:  # Dask itself has made several attempts
-        reason = "a Dask worker died (its log says why; lack of memory is likely)"
-        raise Lost(reason, times=error.allowed_failures + 1) from None
-    except Exception as error:  # noqa: BLE001 (whatever the function raises is an answer)
+    if future.status == "error":
+        error = future.exception()
+        if isinstance(error, KilledWorker):  # Dask itself has made several attempts
+            reason = "a Dask worker died (its log says why; lack of memory is likely)"
+            raise Lost(reason, times=error.allowed_failures + 1)
         raise DataError(
             f"{task.name}: Dask could not call it ({error!r}); install the same {PACKAGE} on all workers"
-        ) from None
+        )
+    try:
+        address, answered = future.result()
+    except (CancelledError, OSError) as error:
+        if client.status != "running":
+            raise DataError(
+                "the connection to the Dask scheduler was lost; see that it runs, and --resume"
+            ) from None
+        raise Lost(f"Dask lost it ({error!r})") from None
     try:
         return result_of(task, answered, f" (on Dask worker {address})")
     except Lost:
@@ -165,10 +178,8 @@ class _Threads:
 def _nthreads(client: Client, address: str) -> dict[str, int]:
     try:
         return dict(client.nthreads())
-    except (
-        OSError,
-        AttributeError,
-    ):  # CommClosedError is an OSError; a client that was closed has no scheduler
+    # CommClosedError is an OSError; a client that was closed has no scheduler
+    except (OSError, AttributeError):
         raise DataError(f"scheduler {address}: was lost; see that it runs, and --resume") from None
 
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import json
 import re
 import traceback
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
@@ -22,7 +23,7 @@ from gnss_sem_map.errors import ConfigError, DataError, SemMapError, WriteError
 ALLOWED = "gnss_sem_map."
 """Modules whose functions may be tasks begin with this."""
 ATTEMPTS = 3
-"""A task that is lost as often as this is an error."""
+"""A task that is lost as often as this is given up."""
 _REMADE: dict[str, type[Exception]] = {
     kind.__name__: kind for kind in (WriteError, DataError, ConfigError, EstimationError, MeasurementError)
 }
@@ -56,23 +57,37 @@ class Task:
 class Executor(Protocol):
     """Something that calls tasks and yields each with its result, in the order in which they finish."""
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
-        """Call all tasks; raises our own errors as the functions do, and DataError when a task is lost too often."""
+    def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
+        """Call all tasks; the result of one that is lost too often is GivenUp. Raises our errors as functions do."""
+
+
+class GivenUp(DataError):
+    """A task was lost too often."""
+
+
+def given_up(error: GivenUp) -> Any:
+    """Raise the error: what `run_tasks` does with a lost task by default."""
+    raise error
 
 
 def run_tasks(
-    tasks: Iterable[Task], executor: Executor, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Iterator[tuple[Task, Any]]:
+    tasks: Iterable[Task],
+    executor: Executor,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    lost: Callable[[GivenUp], Any] = given_up,
+) -> Generator[tuple[Task, Any]]:
     """Call all tasks, and yield each with its result (JSON) when it is done.
 
-    `progress(done, total)` is called before the first task and after every one. Raises what the functions raise of our
-    errors, DataError for an OSError and for a task that is lost three times, and RuntimeError for a defect.
+    `progress(done, total)` is called before the first task and after every one. `lost` makes the result of a task that
+    is lost three times; by default it raises GivenUp. Raises what the functions raise of our errors, DataError for an
+    OSError, and RuntimeError for a defect.
     """
     tasks = list(tasks)
     progress(0, len(tasks))
-    for done, (task, result) in enumerate(executor.run(tasks), start=1):
-        progress(done, len(tasks))
-        yield task, result
+    with closing(executor.run(tasks)) as running:
+        for done, (task, result) in enumerate(running, start=1):
+            progress(done, len(tasks))
+            yield task, lost(result) if isinstance(result, GivenUp) else result
 
 
 @dataclass(frozen=True)
@@ -81,7 +96,7 @@ class InProcess:
 
     allowed: str = ALLOWED
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
+    def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
         """Call all tasks in order."""
         for task in tasks:
             yield task, json.loads(call(task.function, json.dumps(task.arguments), self.allowed))
@@ -149,13 +164,18 @@ class Losses:
     def __init__(self) -> None:
         self._reasons: defaultdict[Task, list[str]] = defaultdict(list)
 
-    def add(self, task: Task, lost: Lost) -> None:
-        """Count a loss; raises DataError when there will be no further attempt."""
+    def add(self, task: Task, lost: Lost, waiting: deque[Task]) -> Iterator[tuple[Task, GivenUp]]:
+        """Let a lost task wait for its next attempt; yields it, with the error, when there will be none."""
         reasons = self._reasons[task]
         reasons += [str(lost)] * lost.times
-        if len(reasons) >= ATTEMPTS:
-            told = ", ".join(f"{count} x {reason}" for reason, count in Counter(reasons).items())
-            raise DataError(
+        if len(reasons) < ATTEMPTS:
+            waiting.append(task)
+            return
+        told = ", ".join(f"{count} x {reason}" for reason, count in Counter(reasons).items())
+        yield (
+            task,
+            GivenUp(
                 f"{task.name}: given up after {len(reasons)} attempts: {told}; take fewer workers if memory is short, a"
                 " longer time-out if it is slow, and --resume"
-            )
+            ),
+        )

@@ -8,12 +8,9 @@ bytes in all cases.
 from __future__ import annotations
 
 import hashlib
-import os
-import pickle
+import secrets
 import shutil
-import tempfile
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -21,35 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC, ChunkStore, open_store
+from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
-from gnss_sem_map.mapping.worker_processes import in_processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
-from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-RANGES_PER_WORKER = 2
-"""Chunks in a row go to one worker, which reads the scans between them once; shorter ranges end more evenly."""
-
-
-@dataclass(frozen=True, eq=False)
-class Maps:
-    """The map of static points and the map of moving points; no point is in both."""
-
-    static: VoxelMap
-    removed: VoxelMap
-
-
-def build_maps(drive: Drive, stats: RunStats, progress: Progress = silent) -> Maps:
-    """Both maps of a drive in memory; see `map_scans`."""
-    with tempfile.TemporaryDirectory(prefix="gnss-sem-map-") as folder:
-        store = map_scans(drive, Path(folder), stats, progress)
-        return Maps(store.whole(STATIC), store.whole(REMOVED))
+Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
+"""Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
 
 
 def map_scans(
@@ -59,15 +39,15 @@ def map_scans(
     progress: Progress = silent,
     *,
     resume: bool = False,
-    workers: int = 1,
+    elsewhere: Elsewhere | None = None,
     labels_from: str = "",
 ) -> ChunkStore:
     """Map all points of all scans (eq. 1 to 7): each at its own stamp, labelled by the nearest image in time.
 
     The chunks of the map are written into the folder `work`; with `resume`, those of an interrupted run are used if
-    drive, settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. `workers`
-    processes share the chunks. Raises DataError when no scan can be used, or `work` cannot be written or holds
-    something else.
+    drive, settings and `labels_from` (the source of the labels) are the same. The caller removes the folder. Chunks are
+    mapped in this process, or `elsewhere` (see `runs.chunk_tasks`). Raises DataError when no scan can be used, or
+    `work` cannot be written or holds something else.
     """
     _warn(drive, stats)
     chunks, total = chunks_of(drive), len(drive.log.scans)
@@ -78,15 +58,13 @@ def map_scans(
     there = store.done()
     done = sum(len(chunks[number]) for number in there)
     pending = [number for number in range(len(chunks)) if number not in there]
-    ranges = _ranges(pending, workers)
-    if workers > 1 and len(ranges) > 1:
-        _check_sendable(drive)
-        for place in in_processes(_map_range, (drive, store, ranges), range(len(ranges)), workers):
-            done += sum(len(chunks[number]) for number in ranges[place])
+    if elsewhere is not None and len(pending) > 1:
+        for numbers in elsewhere(drive, store, pending):
+            done += sum(len(chunks[number]) for number in numbers)
             progress("mapping", done, total)
     else:
-        for place, numbers in enumerate(ranges):
-            _map_range(drive, store, ranges, place, _shifted(progress, done, total))
+        for numbers in ranges(pending, len(chunks)):
+            map_range(drive, store, numbers, _shifted(progress, done, total))
             done += sum(len(chunks[number]) for number in numbers)
     for record in store.records():
         stats.counts.update(record["counts"])
@@ -95,22 +73,20 @@ def map_scans(
     return store
 
 
-def _ranges(pending: Sequence[int], workers: int) -> list[range]:
-    """Consecutive chunks that one worker maps, about `RANGES_PER_WORKER` for each."""
-    most = len(pending) if workers == 1 else -(-len(pending) // (RANGES_PER_WORKER * workers))
-    ranges = []
+def ranges(pending: Sequence[int], most: int) -> list[range]:
+    """Consecutive chunks, at most so many in a range."""
+    found = []
     for _, group in groupby(enumerate(pending), lambda pair: pair[1] - pair[0]):
         numbers = [number for _, number in group]
         for start in range(0, len(numbers), most):
-            ranges.append(range(numbers[start], numbers[min(start + most, len(numbers)) - 1] + 1))
-    return ranges
+            found.append(range(numbers[start], numbers[min(start + most, len(numbers)) - 1] + 1))
+    return found
 
 
-def _map_range(
-    drive: Drive, store: ChunkStore, ranges: Sequence[range], place: int, progress: Progress = silent
-) -> None:
-    """Map some chunks in a row and save each when it is done."""
-    waiting = store.folder / f".{ranges[place].start}.{os.getpid()}{WAITING}"
+def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progress = silent) -> None:
+    """Map some chunks in a row and save each when it is done; raises DataError when the disk is full."""
+    # not named after the process: those of two containers may have one number
+    waiting = store.folder / f".{numbers.start}.{secrets.randbelow(1 << 60)}{WAITING}"
     try:
         waiting.mkdir()
     except OSError as error:
@@ -118,7 +94,7 @@ def _map_range(
             f"{waiting}: cannot be written ({error.strerror}); free the disk, then --resume"
         ) from None
     try:
-        for chunk in map_chunks(drive, ranges[place], waiting, progress):
+        for chunk in map_chunks(drive, numbers, waiting, progress):
             store.write(chunk)
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
@@ -151,16 +127,6 @@ def _first_reason(stats: RunStats, what: str) -> str:
 
 def _shifted(progress: Progress, done: int, total: int) -> Progress:
     return lambda stage, more, _: progress(stage, done + more, total)
-
-
-def _check_sendable(drive: Drive) -> None:
-    try:
-        pickle.dumps(drive.segmenter)
-    except Exception as error:  # noqa: BLE001 (an object may refuse in any way)
-        raise ConfigError(
-            f"this segmenter cannot work in several processes ({error}); write its probabilities with"
-            " `gnss-sem-map segment` first and use labels:FOLDER, or leave out --workers"
-        ) from None
 
 
 def fingerprint(drive: Drive, labels_from: str) -> str:

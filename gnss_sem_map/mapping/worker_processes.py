@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -21,8 +21,6 @@ from multiprocessing.process import BaseProcess, parent_process
 from pathlib import Path
 from typing import Any
 
-from factor_graphs.errors import FactorGraphError
-from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
 from gnss_sem_map.scans.prefetch import THREADS_VARIABLE, threads
 
@@ -37,9 +35,10 @@ CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")
 class Processes:
     """Calls tasks in worker processes of this machine; cores and memory are shared out evenly.
 
-    A worker ends after `tasks_per_worker` tasks, which frees whatever they left behind. One that holds more than
-    `memory_bytes` (None: the memory of the machine / (workers + 1), as the main process has a share too), or works on
-    one task for more than `timeout_s`, is killed; what a dead worker had under way is called again in a new one.
+    With fewer tasks than `workers`, there is one for each. A worker ends after `tasks_per_worker` tasks, which frees
+    whatever they left behind. One that holds more than `memory_bytes` (None: the memory of the machine divided by their
+    number + 1, as the main process has a share too), or works on one task for more than `timeout_s`, is killed; what a
+    dead worker had under way is called again in a new one.
     """
 
     workers: int
@@ -48,14 +47,15 @@ class Processes:
     tasks_per_worker: int = 10
     allowed: str = ALLOWED
 
-    def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
+    def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
         """Call all tasks; yields each with its result when it is done."""
-        most_bytes = self.memory_bytes or machine_memory_bytes() // (self.workers + 1)
+        count = min(self.workers, len(tasks))
+        most_bytes = self.memory_bytes or machine_memory_bytes() // (count + 1)
         waiting, losses = deque(tasks), Losses()
         team: list[_Worker] = []
         try:
             while waiting or any(worker.task for worker in team):
-                self._give(waiting, team)
+                self._give(waiting, team, count)
                 wait([worker.connection for worker in team], WATCH_S)
                 for worker in list(team):
                     task = worker.task
@@ -67,22 +67,21 @@ class Processes:
                         worker.end()
                         team.remove(worker)
                         if task is not None:
-                            losses.add(task, lost)
-                            waiting.append(task)
+                            yield from losses.add(task, lost, waiting)
         finally:
             for worker in team:
                 worker.end()
 
-    def _give(self, waiting: deque[Task], team: list[_Worker]) -> None:
-        """Give every idle worker a task; workers that have done their share are replaced."""
+    def _give(self, waiting: deque[Task], team: list[_Worker], count: int) -> None:
+        """Give every idle one of `count` workers a task; workers that have done their share are replaced."""
         for worker in [worker for worker in team if worker.task is None]:
             if worker.tasks_done >= self.tasks_per_worker:
                 worker.end()
                 team.remove(worker)
             elif waiting:
                 worker.give(waiting.popleft(), self.allowed)
-        while waiting and len(team) < self.workers:
-            team.append(_Worker(max(threads() // self.workers, 1)))
+        while waiting and len(team) < count:
+            team.append(_Worker(max(threads() // count, 1)))
             team[-1].give(waiting.popleft(), self.allowed)
 
 
@@ -91,7 +90,7 @@ class _Worker:
 
     def __init__(self, own_threads: int) -> None:
         with _environment(dict.fromkeys(THREADS_VARIABLES, str(own_threads))):
-            self.connection, self._process = _start(_serve)
+            self.connection, self._process = _start()
         self.task: Task | None = None
         self.tasks_done = 0
 
@@ -151,59 +150,11 @@ def _resident_bytes(pid: int | None) -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def in_processes(
-    function: Callable[..., None], shared: tuple[Any, ...], items: Sequence[int], workers: int
-) -> Iterator[int]:
-    """Call `function(*shared, item)` for every item in one of several processes; yields each item when it is done.
-
-    Large data are sent only after a worker has started: it may die before it reads them. Raises what the function
-    raises of our own errors, and DataError when a process dies.
-    """
-    waiting = deque(items)
-    team: dict[Connection, BaseProcess] = {}
-    try:
-        for _ in range(min(workers, len(items))):
-            ours, process = _start(_work)
-            team[ours] = process
-        for ours in team:
-            ours.send((function, shared))
-            ours.send(waiting.popleft())
-        busy = list(team)
-        while busy:
-            ours = _first_of(busy)
-            answer = ours.recv()
-            if isinstance(answer, Exception):
-                raise answer
-            if waiting:
-                ours.send(waiting.popleft())
-            else:
-                busy.remove(ours)
-            yield answer
-    except (EOFError, ConnectionError):
-        raise DataError(
-            "a worker process died: for lack of memory (take fewer --workers, and --resume), or because a script calls"
-            " this outside `if __name__ == '__main__':`"
-        ) from None
-    finally:
-        for ours, process in team.items():
-            ours.close()
-            process.terminate()
-        for process in team.values():
-            process.join()
-
-
-def _first_of(connections: list[Connection]) -> Connection:
-    ready = wait(connections)[0]
-    assert isinstance(ready, Connection)
-    return ready
-
-
-def _start(work: Callable[[Connection], None]) -> tuple[Connection, BaseProcess]:
+def _start() -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
     ours, theirs = context.Pipe()
-    process = context.Process(
-        target=work, args=(theirs,), daemon=True
-    )  # the main process never waits for it at exit
+    # the main process never waits at exit for a daemon
+    process = context.Process(target=_serve, args=(theirs,), daemon=True)
     with theirs, _signals_blocked():
         process.start()
     return ours, process
@@ -240,22 +191,6 @@ def _serve(parent: Connection) -> None:
     try:
         while True:
             parent.send_bytes(answer(*json.loads(parent.recv_bytes())).encode())
-    except (EOFError, ConnectionError):  # the parent has finished, or died
-        return
-
-
-def _work(parent: Connection) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        function, shared = parent.recv()
-        while True:
-            item = parent.recv()
-            try:
-                function(*shared, item)
-            except (SemMapError, FactorGraphError, OSError) as error:
-                parent.send(error)
-                return
-            parent.send(item)
     except (EOFError, ConnectionError):  # the parent has finished, or died
         return
 

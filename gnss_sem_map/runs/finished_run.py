@@ -31,10 +31,12 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.chunk_tasks import ChunkTasks
+from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
@@ -57,6 +59,7 @@ def run(
     device: str = "auto",
     origin: LocalFrame | None = None,
     workers: int = 1,
+    scheduler: str | None = None,
     resume: bool = False,
     write_labels: bool = False,
     force: bool = False,
@@ -65,29 +68,27 @@ def run(
     """Map one drive into a run folder, as `gnss-sem-map run` does.
 
     `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only, and `{drive}` in it the name of
-    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. Raises PreflightError where the drive
+    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. The scans are shared among `workers`
+    processes, or the workers of the Dask scheduler at the address `scheduler`. Raises PreflightError where the drive
     looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
-    segmenter = run_folder.segmenter_of(drive, segmenter)
-    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, segmenter)) as claim:
-        log = log or open_drive(drive, drive_format).between(frames)
+    source = source_of(drive, segmenter, frames, drive_format, device)
+    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, source.segmenter)) as claim:
+        log = log or source.open_log()
         refuse_inputs(claim.out, sorted(log.folders))
-        network = None
-        if segmenter not in (None, "none"):
-            label_set = open_label_set(settings.classes)
-            network = open_segmenter(str(segmenter), label_set, device, log.calibration.image_size)
+        network = source.open_network(settings, log)
+        executor = executor_of(workers, scheduler, claim.work)
+        elsewhere = None if executor is None else ChunkTasks(source, executor)
         with new_folder(out) as folder:
             mapped = pipeline.run(
                 log, network, settings, folder, claim.work, progress,
-                origin=origin, resume=resume, workers=workers, labels_from=str(segmenter), force=force,
+                origin=origin, resume=resume, elsewhere=elsewhere, labels_from=source.labels_from, force=force,
             )  # fmt: skip
-            executor = Processes(workers) if workers > 1 else None
             refined = pipeline.refine(
                 folder, settings, mapped.stats, progress, executor=executor, work=claim.work
             )
-            inputs = run_folder.inputs_of_run(drive, segmenter, frames)
-            run_folder.write_run(folder, drive, mapped, refined, settings, write_labels, inputs)
+            run_folder.write_run(folder, source, mapped, refined, settings, write_labels)
     return Run(out)
 
 
@@ -151,13 +152,22 @@ class Run:
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
-            for part in (MAP, evidence.FOLDER, DRIVES, TRACKS):
-                if is_folder(self.folder / part):
-                    shutil.copytree(self.folder / part, folder / part, copy_function=link_or_copy)
+            old_labels = shutil.ignore_patterns(*run_folder.LABELS)
+            for name in (MAP, evidence.FOLDER, DRIVES, TRACKS):
+                if is_folder(self.folder / name):
+                    shutil.copytree(
+                        self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
+                    )
             refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
+                for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
+                    one = Run(known.parent)
+                    part = folder / DRIVES / known.parent.name
+                    run_folder.write_point_labels(
+                        part, one.drive(), one.trajectory, refined.kerbs, settings, known, folder
+                    )
             else:
                 known = self.folder / run_folder.RAW_LABELS
                 run_folder.write_again(
@@ -182,7 +192,7 @@ class Run:
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
-        inputs = self.about["inputs"] | {"segmenter": run_folder.absolute(segmenter)}
+        inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
         stats = RunStats()
         with self._rewritten(out) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:

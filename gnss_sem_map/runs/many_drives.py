@@ -1,6 +1,6 @@
 """Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
 
-OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive
+OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive; its point labels, by the map of all
 OUT/map, ...        their sum, refined and exported as the map of one drive is
 
 Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once.
@@ -20,6 +20,7 @@ import numpy as np
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
@@ -30,22 +31,18 @@ from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.dask_cluster import Cluster
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
-from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
-from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.map_json import read_frame
 
 SETTINGS = "config.yaml"
-LONGEST_DRIVE_S = 86_400.0
-"""A worker that maps one drive for longer is replaced."""
 OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
 """Files of a drive beside its map, evidence and trajectory."""
 
@@ -60,6 +57,10 @@ class HowMapped:
     device: str = "auto"
     force: bool = False
     resume: bool = False
+
+    def source(self, drive: Path) -> Source:
+        """What the run of this drive reads."""
+        return source_of(drive, self.segmenter, self.frames, self.drive_format, self.device)
 
 
 @dataclass(frozen=True)
@@ -85,25 +86,27 @@ def run_drives(
     origin: LocalFrame | None = None,
     workers: int = 1,
     scheduler: str | None = None,
+    write_labels: bool = False,
     progress: Progress = silent,
 ) -> ManyDrives:
     """Map several drives into one map, in the frame `origin`, by default that of the first drive.
 
     Drives are shared among `workers` processes, or the workers of the Dask scheduler at the address `scheduler`.
-    A drive that fails is left out, and named in run.json. Raises DataError when all fail, when two drives have one
-    name or are the same, or the first has no georeference.
+    A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises DataError when all
+    fail, when two drives have one name or are the same, or the first has no georeference.
     """
     drives = [_absolute(drive) for drive in drives]
     _check_distinct([(drive.name, drive) for drive in drives])
     with run_folder.claimed_run(out, drives) as claim:
         frame = origin or _frame_of(drives, how.drive_format)
-        executor = _executor(workers, scheduler, claim)
+        executor = executor_of(workers, scheduler, claim.work) or InProcess()
         failed = _map_all(drives, claim, settings, how, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
-        about = _write(out, done, settings, frame, failed, claim, executor, progress)
+        labelled = [how.source(drive) for drive in drives if drive.name in done and write_labels]
+        about = _write(out, done, settings, frame, failed, claim, executor, progress, labelled)
     return ManyDrives(out, about)
 
 
@@ -141,34 +144,33 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
     return ManyDrives(out, about)
 
 
-def map_one(drive: str, folder: str, settings: str, origin: Sequence[float], how: Mapping[str, Any]) -> str:
+def map_one(
+    source: Mapping[str, Any], folder: str, settings: str, origin: Sequence[float], force: bool
+) -> str:
     """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
     try:
-        _map_one(Path(drive), Path(folder), Path(settings), LocalFrame(*origin), HowMapped(**how))
+        _map_one(Source(**source), Path(folder), config.load(Path(settings)), LocalFrame(*origin), force)
     except (SemMapError, FactorGraphError) as error:
         return str(error)
+    except OSError as error:
+        return f"{error.filename or 'a file'}: {error.strerror or error}"
     return ""
 
 
-def _map_one(drive: Path, folder: Path, file: Path, frame: LocalFrame, how: HowMapped) -> None:
-    settings = config.load(file)
-    spec = run_folder.segmenter_of(drive, how.segmenter)
-    inputs = run_folder.inputs_of_run(drive, spec, how.frames)
-    if _is_done(folder, settings, inputs, frame):  # what is not to be used was removed before the first task
+def _map_one(source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool) -> None:
+    if _is_done(folder, settings, source.inputs, frame):  # what is not to be used was removed before
         return
-    with run_folder.claimed_run(folder, run_folder.places_read(drive, settings, spec)) as claim:
-        log = open_drive(drive, how.drive_format).between(how.frames)
+    places = run_folder.places_read(Path(source.drive), settings, source.segmenter)
+    with run_folder.claimed_run(folder, places) as claim:
+        log = source.open_log()
         refuse_inputs(claim.out, sorted(log.folders))
-        network = None
-        if spec not in (None, "none"):
-            label_set = open_label_set(settings.classes)
-            network = open_segmenter(str(spec), label_set, how.device, log.calibration.image_size)
+        network = source.open_network(settings, log)
         with new_folder(folder) as part:
             mapped = pipeline.run(
                 log, network, settings, part, claim.work,
-                origin=frame, resume=True, labels_from=str(spec), force=how.force,
+                origin=frame, resume=True, labels_from=source.labels_from, force=force,
             )  # fmt: skip
-            run_folder.write_drive(part, drive, mapped, settings, inputs)
+            run_folder.write_drive(part, source, mapped, settings)
 
 
 def _is_done(folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame) -> bool:
@@ -181,12 +183,6 @@ def _is_done(folder: Path, settings: Settings, inputs: dict[str, Any], frame: Lo
         return bool(same and config.load(folder / SETTINGS) == settings)
     except (SemMapError, KeyError):
         return False
-
-
-def _executor(workers: int, scheduler: str | None, claim: Claim) -> Executor:
-    if scheduler is not None:
-        return Cluster(scheduler, claim.work, timeout_s=LONGEST_DRIVE_S)
-    return Processes(workers, timeout_s=LONGEST_DRIVE_S) if workers > 1 else InProcess()
 
 
 def _map_all(
@@ -206,15 +202,17 @@ def _map_all(
     file = claim.work / DRIVES / SETTINGS
     file.write_text(settings.to_yaml(), "utf-8")
     origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
-    tasks = [
-        Task(
-            drive.name,
-            "gnss_sem_map.runs.many_drives:map_one",
-            (str(drive), str(claim.work / DRIVES / drive.name), str(file), origin, asdict(how)),
+    tasks = []
+    for drive in drives:
+        arguments = (
+            asdict(how.source(drive)),
+            str(claim.work / DRIVES / drive.name),
+            str(file),
+            origin,
+            how.force,
         )
-        for drive in drives
-    ]
-    found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total))
+        tasks.append(Task(drive.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
+    found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
     return {task.name: reason for task, reason in found if reason}
 
 
@@ -227,8 +225,9 @@ def _write(
     claim: Claim,
     executor: Executor,
     progress: Progress,
+    labelled: Sequence[Source] = (),
 ) -> dict[str, Any]:
-    """Write the map of these drives, whose folders are linked into it."""
+    """Write the map of these drives, whose folders are linked into it, and the point labels of some."""
     stats = RunStats()
     with new_folder(out) as folder:
         parts = [folder / DRIVES / name for name in sorted(drives)]
@@ -236,7 +235,15 @@ def _write(
             _link_all(drives[part.name], part)
         with stats.stage("mapping"):
             write_sum(parts, folder, frame, settings.classes, out, executor=executor, work=claim.work)
-        refined = pipeline.refine(folder, settings, stats, progress, out, executor=executor, work=claim.work)
+        # tiles that are taken from an earlier map do not say which points of kerbs are which
+        earlier = None if labelled else out
+        refined = pipeline.refine(
+            folder, settings, stats, progress, earlier, executor=executor, work=claim.work
+        )
+        for source in labelled:
+            part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
+            trajectory = Trajectory.load(part / "trajectory.parquet")
+            run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 from collections import Counter
@@ -39,10 +38,13 @@ from gnss_sem_map.pipeline import Mapped
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
 RAW_LABELS = "labels_raw"
+LABELS = ("labels", RAW_LABELS, "confidence", "removed")
+"""Folders of the point labels of one drive."""
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
 
@@ -64,16 +66,6 @@ def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> Abstract
     return claimed(out, inputs, is_run_file)
 
 
-def name_of(drive: Path) -> str:
-    """The name of a drive: that of its folder, or of the link that was given."""
-    return Path(os.path.abspath(drive)).name
-
-
-def segmenter_of(drive: Path, spec: str | None) -> str | None:
-    """The segmenter's SPEC for a drive, whose name `{drive}` stands for."""
-    return None if spec is None else spec.replace("{drive}", name_of(drive))
-
-
 def places_read(
     drive: Path, settings: Settings, segmenter: str | None = None, config: Path | None = None
 ) -> list[Path | str | None]:
@@ -85,12 +77,11 @@ def places_read(
 
 def write_run(
     folder: Path,
-    drive: Path,
+    source: Source,
     mapped: Mapped,
     refined: Refined,
     settings: Settings,
     write_labels: bool,
-    inputs: dict[str, Any],
 ) -> None:
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
     refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
@@ -99,28 +90,21 @@ def write_run(
         write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
         if write_labels:
             write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
-    about = about_mapped(drive, mapped, inputs) | {"map": about_map(folder, refined.report)}
+    about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
     write_about(folder, settings, about, metrics_of(mapped))
 
 
-def write_drive(
-    folder: Path, drive: Path, mapped: Mapped, settings: Settings, inputs: dict[str, Any]
-) -> None:
+def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings) -> None:
     """Write what is known of one of several drives beside its raw map, which is in the folder already."""
     write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
-    write_about(folder, settings, about_mapped(drive, mapped, inputs), metrics_of(mapped))
+    write_about(folder, settings, about_mapped(source, mapped), metrics_of(mapped))
 
 
-def inputs_of_run(drive: Path, segmenter: str | None, frames: str | None) -> dict[str, Any]:
-    """From what a run is made, for run.json."""
-    return {"drive": str(drive.resolve()), "segmenter": absolute(segmenter), "frames": frames}
-
-
-def about_mapped(drive: Path, mapped: Mapped, inputs: dict[str, Any]) -> dict[str, Any]:
+def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
     """What is known of a drive beside its map, for run.json."""
     scans = mapped.log.scans
-    return about_run(drive, mapped.log, mapped.stats) | {
-        "inputs": inputs,
+    return about_run(source.name, mapped.log, mapped.stats) | {
+        "inputs": source.inputs,
         "scans_s": [scans[0].stamp, scans[-1].stamp],
         "preflight": mapped.preflight.as_dict(),
         "trajectory": _about_solution(mapped.solution),
@@ -206,7 +190,7 @@ def write_trajectory_run(
     with claimed_run(out, [drive]), new_folder(out) as folder:
         write_trajectory_files(folder, log, found.trajectory, found.solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
-        about = about_run(drive, log, stats) | {
+        about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
             "trajectory": _about_solution(found.solution),
         }
@@ -249,21 +233,22 @@ def write_point_labels(
     kerbs: Kerbs | None,
     settings: Settings,
     known_raw: Path | None = None,
+    run: Path | None = None,
 ) -> None:
     """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
-    `known_raw`: a folder with the labels before refinement, which are copied.
+    `known_raw`: a folder with the labels before refinement, which are copied. `run`: the folder of the maps, if it is
+    another one.
     """
-    for name in ("labels", "confidence", "removed"):
+    for name in LABELS:
         (folder / name).mkdir()
-    if known_raw is None:
-        (folder / RAW_LABELS).mkdir()
-    else:
-        shutil.copytree(known_raw, folder / RAW_LABELS)
+    if known_raw is not None:
+        shutil.copytree(known_raw, folder / RAW_LABELS, dirs_exist_ok=True)
     label_set = open_label_set(settings.classes)
     ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
-    maps = [tiles.open_map(folder / name, label_set) for name in (MAP, REFINED)[known_raw is not None :]]
+    places = [(run or folder) / name for name in (MAP, REFINED)[known_raw is not None :]]
+    maps = [tiles.open_map(place, label_set) for place in places]
     moving = evidence.read(folder, label_set).moving_points
     for scan, (*raw, refined) in label_points(log, trajectory, maps, settings, moving, kerbs):
         if raw:
@@ -273,15 +258,15 @@ def write_point_labels(
         refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
 
 
-def about_run(drive: Path, log: SensorLog, stats: RunStats) -> dict[str, Any]:
-    """Inputs, skips with their reasons, times and memory, for run.json."""
+def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
+    """The name of the drive, skips with their reasons, times and memory, for run.json."""
     skips = sorted(set(stats.skips), key=astuple)
     frames: Counter[str] = Counter()
     for skip in skips:
         frames[skip.what] += skip.frames
     return {
         "versions": {name: _version(name) for name in PACKAGES},
-        "drive": name_of(drive),
+        "drive": drive,
         "name": log.name,
         "epoch_ns": log.epoch_ns,
         "local_frame": None if log.frame is None else asdict(log.frame),
@@ -354,15 +339,6 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
         ],
         "untracked_segments": len(report.tracked) - len(followed),
     }
-
-
-def absolute(segmenter: str | None) -> str | None:
-    """The segmenter's SPEC with an absolute path."""
-    kind, colon, rest = (segmenter or "").partition(":")
-    place, mark, options = rest.partition("?")
-    if not place or not Path(place).exists():
-        return segmenter
-    return f"{kind}{colon}{Path(place).resolve()}{mark}{options}"
 
 
 def _version(package: str) -> str | None:

@@ -284,7 +284,7 @@ def unaccounted(place: Place, harm: Harm, out: Path, with_labels: bool) -> list[
     kerbs = pipeline.refine(out, SETTINGS, mapped.stats).kerbs
     write_point_labels(out, mapped.log, mapped.trajectory, kerbs, SETTINGS)
     refined, static = tiles.read(out / "refined"), tiles.read(out / "refined").standing
-    about = about_run(place.drive, log, mapped.stats)
+    about = about_run(place.drive.name, log, mapped.stats)
     counts, frames = about["counts"], about["skips"]["frames"]
     labelled = {path.stem: path.stat().st_size // 4 for path in (out / "labels").iterdir()}
     removed = sum(int(np.fromfile(path, "<u4").sum()) for path in (out / "removed").iterdir())

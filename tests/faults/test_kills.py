@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from chunks import assert_same
+from chunks import assert_same, build_maps
 from faults.harness import gnss_sem_map
 from faults.killing import (
     command,
@@ -25,7 +25,7 @@ from street import Street
 
 from gnss_sem_map.files.ownership import MARKER, is_partial
 from gnss_sem_map.mapping.checkpoints import REMOVED, STATIC
-from gnss_sem_map.mapping.fusion import build_maps, map_scans
+from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.run_stats import RunStats
 
 OLD = {

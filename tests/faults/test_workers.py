@@ -6,78 +6,59 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from faults.killing import street_drive
+from processes import group, wait_until
 from street import Street
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.fusion import map_scans
-from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.chunk_tasks import ChunkTasks
+from gnss_sem_map.runs.source import source_of
 
 UNGUARDED = """
 import sys
-from pathlib import Path
-sys.path.insert(0, sys.argv[1])
-from faults.killing import street_drive
-from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping.fusion import map_scans
+import gnss_sem_map
 
-try:
-    map_scans(street_drive(Path(sys.argv[2]), Path(sys.argv[3])), Path(sys.argv[4]), RunStats(), workers=2)
-except DataError as error:
-    print(error)
+drive, labels, out = sys.argv[1:]
+settings = gnss_sem_map.Settings(dynamics={"window_scans": 2})
+if True:
+    gnss_sem_map.run(drive, out, f"labels:{labels}", settings, workers=2, force=True)
 """
-GUARDED = UNGUARDED.replace("try:", "if __name__ == '__main__':").replace(
-    "except DataError as error:\n    print(error)", ""
-)
+GUARDED = UNGUARDED.replace("if True:", "if __name__ == '__main__':")
+DEADLY = """
+import os, signal
+
+def look(pixels):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+look.class_names = ["road", "other"]
+"""
 
 
 def start(script: str, street: Street, folder: Path) -> subprocess.Popen[str]:
     file = folder / "script.py"
     file.write_text(script)
-    tests = Path(__file__).parents[1]
-    words = [sys.executable, file, tests, street.drive, street.labels, folder / "work"]
+    words = [sys.executable, file, street.drive, street.labels, folder / "out"]
     pipe = subprocess.PIPE
     return subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
-
-
-def group(leader: int) -> list[int]:
-    """Processes of a group that are alive."""
-    found = []
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdecimal():
-            try:
-                fields = (folder / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            if int(fields[2]) == leader and fields[0] not in "ZX":
-                found.append(int(folder.name))
-    return found
-
-
-def wait_until(condition, within_s: float = 30.0) -> bool:
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return False
 
 
 def test_a_script_without_a_guard_gets_an_error_and_does_not_hang(small_drive, trial, tmp_path: Path) -> None:
     process = start(UNGUARDED, small_drive, tmp_path)
     try:
-        out, _ = process.communicate(timeout=100)
+        _, err = process.communicate(timeout=100)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         trial("workers", ["hang"])
-    faults = ["not explained"] * ("a worker process died" not in out or "__main__" not in out)
-    trial("workers", [*faults, *["orphans"] * (not wait_until(lambda: not group(process.pid)))], out)
+    last = err.splitlines()[-1]
+    faults = ["not explained"] * ("a worker process died" not in last or "__main__" not in last)
+    trial("workers", [*faults, *["orphans"] * (not wait_until(lambda: not group(process.pid)))], err)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -87,27 +68,23 @@ def test_workers_end_when_their_parent_is_killed(
     with start(GUARDED, small_drive, tmp_path) as process:
         begun = wait_until(lambda: len(group(process.pid)) > 2)
         process.send_signal(number)
-    faults = ["never began"] * (not begun) + ["orphans"] * (
-        not wait_until(lambda: not group(process.pid), 10.0)
-    )
-    trial("workers", faults)
+    orphans = not wait_until(lambda: not group(process.pid), 10.0)
+    trial("workers", ["never began"] * (not begun) + ["orphans"] * orphans)
 
 
-class Deadly:
-    """A segmenter that kills the process that asks it."""
-
-    class_names = ("road", "other")
-
-    def __call__(self, image: object) -> object:
-        os.kill(os.getpid(), signal.SIGKILL)
-        return None
-
-
-def test_a_worker_that_is_killed_is_an_error_and_what_is_mapped_stays(
-    small_drive, trial, tmp_path: Path
+def test_a_worker_that_is_killed_again_and_again_is_an_error_in_one_line(
+    small_drive, trial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "deadly_network.py").write_text(DEADLY)
+    monkeypatch.syspath_prepend(tmp_path)
     drive = street_drive(small_drive.drive, small_drive.labels)
-    deadly = Drive(drive.log, drive.trajectory, Deadly(), drive.settings)
-    with pytest.raises(DataError, match="a worker process died"):
-        map_scans(deadly, tmp_path / "work", RunStats(), workers=2)
+    source = source_of(small_drive.drive, "python:deadly_network:look")
+    drive = replace(drive, segmenter=source.open_network(drive.settings, drive.log))
+    with pytest.raises(
+        DataError, match=r"chunks \d to \d: given up after 3 attempts: 3 x a worker process died"
+    ):
+        map_scans(
+            drive, tmp_path / "work", RunStats(),
+            elsewhere=ChunkTasks(source, Processes(2)), labels_from=source.labels_from,
+        )  # fmt: skip
     trial("workers")

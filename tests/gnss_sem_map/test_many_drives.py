@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -32,6 +33,7 @@ from gnss_sem_map.mapping.merging import merge_runs
 from gnss_sem_map.runs import finished_run, many_drives, merged_run
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, add_drive, remove_drive, run_drives
+from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import read_frame
@@ -221,6 +223,49 @@ def test_a_drive_that_fails_is_left_out_and_two_workers_make_the_map_of_the_othe
     assert products(out).keys() == expected.keys()
 
 
+NETWORK = """
+import os, signal
+import numpy as np
+
+def look(pixels):
+    if __name__ == "network_c":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return np.full((*pixels.shape[:2], 2), 0.5, np.float32)
+
+look.class_names = ["road", "other"]
+"""
+
+
+def test_a_drive_that_kills_its_workers_is_left_out(
+    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "networks").mkdir()
+    for name in "abc":
+        (tmp_path / f"networks/network_{name}.py").write_text(NETWORK)
+    monkeypatch.syspath_prepend(tmp_path / "networks")
+    places, how = list(drives.by_name.values()), HowMapped("python:network_{drive}:look", force=True)
+    made = run_drives(places, tmp_path / "out", SETTINGS, how, workers=2)
+    assert made.about["merged"] == ["a", "b"]
+    assert list(made.failed) == ["c"]
+    assert "given up after 3 attempts: 3 x a worker process died (SIGKILL" in made.failed["c"]
+
+
+def test_an_error_of_the_disk_in_one_drive_leaves_the_others(
+    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = Source.open_log
+
+    def fails(source: Source) -> SensorLog:
+        if source.name == "b":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), "/torn/disk")
+        return original(source)
+
+    monkeypatch.setattr(Source, "open_log", fails)
+    made = mapped("ab", drives, tmp_path / "out", how)
+    assert made.about["merged"] == ["a"]
+    assert made.failed == {"b": f"/torn/disk: {os.strerror(errno.EIO)}"}
+
+
 def test_where_no_drive_can_be_mapped_nothing_is_written(
     drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -385,6 +430,32 @@ def test_a_map_of_many_drives_is_merged_with_all_its_keyframe_scans(made: dict[s
         made["ab"] / "drives/b" / keyframes,
         made["a"] / keyframes,
     ]
+
+
+def labels_of(drive: Path) -> dict[str, bytes]:
+    names = ("labels", "labels_raw", "confidence", "removed")
+    files = [path for name in names for path in (drive / name).iterdir()]
+    return {path.relative_to(drive).as_posix(): path.read_bytes() for path in files}
+
+
+def test_every_drive_has_the_point_labels_of_the_map_of_all(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    """Those of one drive are those of a run of this drive alone; with two, both have some, also after refinement."""
+    a, b = (drives.by_name[name] for name in "ab")
+    finished_run.run(a, tmp_path / "alone", drives.labels, SETTINGS, force=True, write_labels=True)
+    run_drives([a], tmp_path / "one", SETTINGS, how, write_labels=True)
+    alone = labels_of(tmp_path / "alone")
+    assert labels_of(tmp_path / "one/drives/a") == alone
+    out = tmp_path / "two"
+    run_drives([a, b], out, SETTINGS, how, write_labels=True)
+    labels = {name: labels_of(out / "drives" / name) for name in "ab"}
+    assert labels["a"].keys() == labels["b"].keys() == alone.keys()
+    assert labels["a"] != alone, "the other drive sees the same walls"
+    Run.open(out).refine(SETTINGS)
+    assert {name: labels_of(out / "drives" / name) for name in "ab"} == labels
+    add_drive(out, drives.by_name["c"], how)
+    assert_same(out, made["abc"])
 
 
 def test_a_map_of_many_drives_is_merged_into_a_run_with_their_tracks(

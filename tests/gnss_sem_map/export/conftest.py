@@ -1,5 +1,7 @@
 """A short street as a semantic map, a track along it, and where on Earth it lies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,22 @@ def street() -> SemanticMap:
         np.concatenate([indices for indices, _, _ in parts]),
         np.concatenate([np.full(len(indices), label) for indices, label, _ in parts]),
         np.concatenate([np.full(len(indices), state) for indices, _, state in parts]),
+    )
+
+
+@pytest.fixture(scope="session")
+def town(street: SemanticMap) -> SemanticMap:
+    """Twelve copies of the street in eleven tiles, west and east, south and north of the origin."""
+    copies = [(dx, dy) for dx in (-900, -300, 400, 1100) for dy in (-700, 30, 600)]
+    voxels = street.voxels
+    keys = np.concatenate([pack(voxels.indices + np.array([dx, dy, 0])) for dx, dy in copies])
+    order = np.argsort(keys)
+    many = np.tile(np.arange(len(street)), len(copies))[order]
+    return SemanticMap(
+        replace(voxels, keys=keys[order], evidence=voxels.evidence[many], hits=voxels.hits[many]),
+        street.labels[many],
+        street.confidence[many],
+        street.states[many],
     )
 
 

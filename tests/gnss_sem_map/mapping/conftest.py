@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from chunks import Maps, build_maps
 from street import Street
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.fusion import Maps, build_maps
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter

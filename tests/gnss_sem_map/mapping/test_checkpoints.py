@@ -12,19 +12,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from chunks import assert_same, by_chunks
+from chunks import Maps, assert_same, by_chunks
 from damage import flipped, halved
 from street import Street
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
-from gnss_sem_map.mapping.fusion import Maps, fingerprint, map_scans
+from gnss_sem_map.mapping.fusion import fingerprint, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
@@ -41,14 +40,12 @@ def assert_same_as(at_once: tuple[Maps, RunStats], store: ChunkStore, stats: Run
     assert stats.skips == at_once[1].skips
 
 
-@pytest.mark.parametrize(
-    ("window", "workers"), [(1, 1), (2, 1), (100, 1), pytest.param(2, 2, marks=pytest.mark.integration)]
-)
-def test_chunks_and_processes_give_the_same_map_and_stats(
-    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, window: int, workers: int
+@pytest.mark.parametrize("window", [1, 2, 100])
+def test_chunks_give_the_same_map_and_stats(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path, window: int
 ) -> None:
     stats = RunStats()
-    store = map_scans(by_chunks(drive, window), tmp_path / "work", stats, workers=workers)
+    store = map_scans(by_chunks(drive, window), tmp_path / "work", stats)
     assert store.count == {1: 6, 2: 3, 100: 1}[window]
     assert_same_as(at_once, store, stats)
 
@@ -83,7 +80,8 @@ if __name__ == "__main__":
     log = open_drive(drive)
     segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
     job = Drive(log, log.reference, segmenter, Settings(dynamics={"enabled": False, "window_scans": 1}))
-    fusion.build_maps(job, RunStats())  # compiled code is loaded: the kills fall into the mapping
+    # compiled code is loaded first: the kills fall into the mapping
+    fusion.map_scans(job, work.with_suffix(".first"), RunStats())
     print("ready", flush=True)
     fusion.map_scans(job, work, RunStats(), resume=True)
     print("done", flush=True)
@@ -222,24 +220,6 @@ def test_an_input_that_was_changed_since_is_noticed(
         halved(path)
         assert fingerprint(copied, labels_from) != before, changed
         before = fingerprint(copied, labels_from)
-
-
-class Unsendable:
-    """A segmenter that holds something that no other process can have."""
-
-    class_names = ("road", "other")
-    lock = property(lambda self: None)
-
-    def __init__(self) -> None:
-        self.here = lambda: None
-
-    def __call__(self, image: object) -> np.ndarray:
-        return np.zeros((48, 150, 2), np.uint8)
-
-
-def test_a_segmenter_that_cannot_be_shared_is_refused_before_any_work(drive: Drive, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="cannot work in several processes"):
-        map_scans(by_chunks(replace(drive, segmenter=Unsendable()), 1), tmp_path / "w", RunStats(), workers=2)
 
 
 FILL = """

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from chunks import assert_same, by_chunks
+from chunks import assert_same, build_maps, by_chunks
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
 from gnss_sem_map.mapping.evidence import read_moving_points
-from gnss_sem_map.mapping.fusion import build_maps, map_scans
+from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.run_stats import RunStats

@@ -8,13 +8,13 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import wait_until
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.mapping import dask_cluster
@@ -219,12 +219,3 @@ def started(what: str, scheduler_file: Path, *words: str) -> Iterator[subprocess
         finally:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-
-
-def wait_until(condition, within_s: float = 30.0) -> bool:
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return False

@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import is_alive, wait_until
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
@@ -129,6 +129,15 @@ def test_workers_share_the_cores_and_are_recycled(tmp_path: Path, monkeypatch: p
 
 
 @integration
+def test_fewer_tasks_than_workers_share_all_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "6")
+    tasks = [task("process_and_threads", str(tmp_path)) for _ in range(2)]
+    found = [result for _, result in run_tasks(tasks, processes(5))]
+    assert {threads for _, *both in found for threads in both} == {3}
+    assert len({pid for pid, *_ in found}) == 2
+
+
+@integration
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_task_whose_worker_dies_is_called_again(number: signal.Signals, tmp_path: Path) -> None:
     tasks = [*products(4), task("dies", str(tmp_path), int(number), 2), *products(4)]
@@ -143,6 +152,15 @@ def test_a_task_that_is_lost_three_times_is_an_error(tmp_path: Path) -> None:
         results([task("dies", str(tmp_path), int(signal.SIGKILL), 9), *products()], processes())
     assert "\n" not in str(raised.value)
     assert len(list(tmp_path.iterdir())) == 3
+
+
+@integration
+def test_the_other_tasks_are_done_when_the_caller_accepts_the_loss(tmp_path: Path) -> None:
+    tasks, told = [task("dies", str(tmp_path), int(signal.SIGKILL), 9), *products()], []
+    found = dict(run_tasks(tasks, processes(), lambda *counts: told.append(counts), lost=str))
+    assert "3 x a worker process died (SIGKILL" in found.pop(tasks[0])
+    assert sorted(found.values()) == sorted(number * 0.1 for number in range(12))
+    assert told[-1] == (13, 13)
 
 
 @integration
@@ -211,7 +229,7 @@ def test_workers_end_when_nobody_wants_more_results(tmp_path: Path) -> None:
     tasks = [task("process_and_threads", str(tmp_path)), *[task("begins_and_waits", str(tmp_path))] * 3]
     running = run_tasks(tasks, processes())
     next(running)
-    running.close()  # type: ignore[attr-defined]
+    running.close()
     assert not any(is_alive(int(path.name)) for path in tmp_path.iterdir())
 
 
@@ -241,19 +259,3 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
         process.wait(20)
     workers = [int(path.name) for path in begun.iterdir()]
     assert wait_until(lambda: not any(map(is_alive, workers)))
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
-
-
-def wait_until(condition, within_s: float = 30.0) -> bool:
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        if condition():
-            return True
-        time.sleep(0.05)
-    return False

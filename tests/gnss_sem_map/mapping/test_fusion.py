@@ -9,7 +9,7 @@ import numpy as np
 import numpy_chain
 import pytest
 import street
-from chunks import assert_same
+from chunks import Maps, assert_same, build_maps
 from numpy.typing import NDArray
 from street import Street
 
@@ -17,8 +17,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.fusion import Drive, Maps, build_maps
-from gnss_sem_map.mapping.labelled_scans import labelled_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter

@@ -1,0 +1,25 @@
+"""Where the tasks of a run are called: here, in processes of this machine, or on a Dask cluster."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gnss_sem_map.files import work_folder
+from gnss_sem_map.mapping.dask_cluster import Cluster
+from gnss_sem_map.mapping.worker_processes import Processes
+
+LONGEST_TASK_S = 86_400.0
+"""A worker that is busy with one drive, or a part of it, for longer is replaced."""
+
+
+def executor_of(workers: int, scheduler: str | None, work: Path) -> Processes | Cluster | None:
+    """Processes, or the workers of the Dask scheduler at an address; None for this process.
+
+    `work` is the work folder of the run. Raises ConfigError and DataError for a cluster that cannot do the tasks.
+    """
+    if scheduler is None:
+        return Processes(workers, timeout_s=LONGEST_TASK_S) if workers > 1 else None
+    work_folder.make(work)
+    cluster = Cluster(scheduler, work, timeout_s=LONGEST_TASK_S)
+    cluster.check()
+    return cluster

@@ -1,0 +1,78 @@
+"""What a run reads, in words: with them any process opens the same log and the same network."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.segmentation import Segmenter, open_segmenter
+from gnss_sem_map.sensor_log import SensorLog
+
+
+@dataclass(frozen=True)
+class Source:
+    """A drive and the SPEC of its segmenter; `source_of` makes it. All paths are absolute."""
+
+    drive: str
+    segmenter: str | None = "none"
+    """None and `none`: no labels, geometry only."""
+    frames: str | None = None
+    drive_format: str | None = None
+    device: str = "auto"
+
+    @property
+    def name(self) -> str:
+        """The name of the drive: that of its folder, or of the link that was given."""
+        return Path(self.drive).name
+
+    @property
+    def labels_from(self) -> str:
+        """Where labels come from, for the fingerprint of a map."""
+        return str(self.segmenter)
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """From what the run is made, for run.json."""
+        return {
+            "drive": str(Path(self.drive).resolve()),
+            "segmenter": self.segmenter,
+            "frames": self.frames,
+        }
+
+    def open_log(self) -> SensorLog:
+        """The log, with the scans of `frames`; raises DataError and ConfigError."""
+        return open_drive(self.drive, self.drive_format).between(self.frames)
+
+    def open_network(self, settings: Settings, log: SensorLog) -> Segmenter | None:
+        """The segmenter for the images of this log; None for geometry only. Raises DataError and ConfigError."""
+        if self.segmenter in (None, "none"):
+            return None
+        label_set, size = open_label_set(settings.classes), log.calibration.image_size
+        return open_segmenter(str(self.segmenter), label_set, self.device, size)
+
+
+def source_of(
+    drive: Path,
+    segmenter: str | None = "none",
+    frames: str | None = None,
+    drive_format: str | None = None,
+    device: str = "auto",
+) -> Source:
+    """The source of a run; `{drive}` in the SPEC stands for the name of the drive."""
+    folder = os.path.abspath(drive)
+    spec = None if segmenter is None else absolute(segmenter.replace("{drive}", Path(folder).name))
+    return Source(folder, spec, frames, drive_format, device)
+
+
+def absolute(segmenter: str) -> str:
+    """The segmenter's SPEC with an absolute path."""
+    kind, colon, rest = segmenter.partition(":")
+    place, mark, options = rest.partition("?")
+    if not place or not Path(place).exists():
+        return segmenter
+    return f"{kind}{colon}{Path(place).resolve()}{mark}{options}"

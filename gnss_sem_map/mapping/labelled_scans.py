@@ -88,8 +88,8 @@ class LabelledScan:
     @property
     def labels(self) -> NDArray[np.int8]:
         """(m,) class of the pixel of each point, c for `other`, -1 if the image does not show it."""
-        of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED)  # -1 is the last
-        return np.asarray(of_pixel[self.pixels], np.int8)
+        of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED).astype(np.int8)  # -1 is the last
+        return of_pixel.take(self.pixels)
 
 
 def labelled_scans(

@@ -36,15 +36,18 @@ def atan2_deg(y, x):
 def azimuths_deg(rows: NDArray[np.float32]) -> NDArray[np.float64]:
     """Azimuth (n,) of the points (n, 4) of a scan, degrees, from -180 to 180; 0 on the axis.
 
-    A scan takes 0.4 ms, with `np.arctan2` 3.0 ms; a drive's scans are read several times.
+    A scan takes 0.2 ms, with `np.arctan2` 3.0 ms; a drive's scans are read twice.
     """
     azimuths = np.empty(len(rows))
-    _azimuths(rows, azimuths)
+    _azimuths(rows.reshape(-1), azimuths)
     return azimuths
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _azimuths(rows, azimuths):
-    for i in range(len(azimuths)):
-        x, y = np.float64(rows[i, 0]), np.float64(rows[i, 1])
-        azimuths[i] = atan2_deg(y, x) if x != 0 or y != 0 else 0.0
+    for i in range(
+        len(azimuths)
+    ):  # rows flat and no branch, else the compiler does not vectorise: a quarter of the time
+        x, y = np.float64(rows[4 * i]), np.float64(rows[4 * i + 1])
+        angle = atan2_deg(y, x)
+        azimuths[i] = angle if (x != 0) | (y != 0) else 0.0

@@ -85,13 +85,12 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
                 table = np.full(1 << bits, -1, np.int32)
                 for number in range(count):
                     table[slot_of(keys[number], keys, table, bits)] = number
-        mean = means[row]
         counts[row] += 1
-        mean[0] += x
-        mean[1] += y
-        mean[2] += z
-        mean[3] += rows[4 * i + 3]
-        mean[4] += stamp
+        means[row, 0] += x
+        means[row, 1] += y
+        means[row, 2] += z
+        means[row, 3] += rows[4 * i + 3]
+        means[row, 4] += stamp
     for row in range(count):
         for column in range(MEANS):
             means[row, column] /= counts[row]

@@ -8,6 +8,7 @@ evidence/moved/               the voxels of moving points, tile by tile
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -32,6 +33,9 @@ MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand."""
 FILES_HELD = 4
 """Files of keyframes in memory at a time, some 40 MB each."""
+
+PACKING = 2
+"""Level of compression: 5 % larger than with zlib's usual 6, in a quarter of its time (0.5 s of a drive of 30 s)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +95,7 @@ def write_moving_points(moving: Mapping[int, NDArray[np.int64]], file: Path | Bi
     """Write the indices of the moving points of every frame; raises OSError."""
     frames = sorted(moving)
     indices = [moving[number] for number in frames]
-    np.savez_compressed(
+    _write(
         file,
         frames=np.array(frames, np.int64),
         counts=np.array([len(some) for some in indices], np.int64),
@@ -101,7 +105,15 @@ def write_moving_points(moving: Mapping[int, NDArray[np.int64]], file: Path | Bi
 
 def write_keyframes(scans: KeyframeScans, file: Path | BinaryIO) -> None:
     """Write range images and poses of keyframe scans; raises OSError."""
-    np.savez_compressed(file, images=scans.images, T_lidar_map=scans.T_lidar_map)
+    _write(file, images=scans.images, T_lidar_map=scans.T_lidar_map)
+
+
+def _write(file: Path | BinaryIO, **arrays: NDArray[Any]) -> None:
+    """Write what `np.savez_compressed` writes, with less effort: raises OSError."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=PACKING) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def read(run: Path, label_set: LabelSet) -> RunEvidence:

@@ -20,7 +20,7 @@ def silent(stage: str, done: int, total: int) -> None:
     """Progress that is not shown."""
 
 
-def _release_memory() -> None:
+def release_memory() -> None:
     """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -42,5 +42,5 @@ class RunStats:
         start = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-        _release_memory()
+        release_memory()
         self.peak_memory_mb[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -22,6 +22,8 @@ def stop(
     if outcome.code == 0:
         return [*faults, *["no result"] * (not (folder / "out/run.json").is_file())], outcome
     faults += [f"code {outcome.code}"] * (outcome.code != 128 + number)
+    if (folder / "out/run.json").is_file():  # it came after the whole result was put in its place
+        return faults, outcome
     faults += ["a result"] * (folder / "out").exists()
     beside = {path.name for path in folder.iterdir()} - {"trial"}
     kept = any(name.endswith("record.json") for name in content(folder / ".out.work"))

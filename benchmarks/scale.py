@@ -45,8 +45,6 @@ finally:
     print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
 """
 Figures = dict[str, Any]
-TILING = ("drives", "mapping", "refinement")
-"""Stages of a run of many drives that workers share: drives, the sum of their maps, and its refinement."""
 DASK = Path(sys.executable).with_name("dask")
 
 
@@ -216,13 +214,9 @@ def workers(drives: Drives, out: Path) -> Figures:
             ("dask", ["--scheduler", address]),
         ):
             figures = run(drives.words(some, out / name, *how), threads=1)
-            seconds = json.loads((out / name / "run.json").read_text())["seconds"]
             found[f"wall_s_{name}"] = figures["wall_s"]
-            found[f"seconds_by_stage_{name}"] = seconds
-            found[f"tiling_s_{name}"] = sum(seconds[stage] for stage in TILING)
             sums[name] = checksums(out / name)
     found["two_workers_over_one"] = found["wall_s_1"] / found["wall_s_2"]
-    found["two_workers_over_one_tiling"] = found["tiling_s_1"] / found["tiling_s_2"]
     found["dask_over_processes"] = found["wall_s_2"] / found["wall_s_dask"]
     found["same_bytes"] = sums["1"] == sums["2"] == sums["dask"]
     return found

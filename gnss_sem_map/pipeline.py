@@ -29,7 +29,13 @@ from gnss_sem_map.mapping.fusion import Elsewhere, map_scans, probabilities_fing
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
-from gnss_sem_map.mapping.trajectory import check_georeference, estimate_trajectory, in_frame, locate
+from gnss_sem_map.mapping.trajectory import (
+    DriveTrajectory,
+    check_georeference,
+    estimate_trajectory,
+    in_frame,
+    locate,
+)
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
@@ -49,6 +55,8 @@ class Mapped:
     stats: RunStats
     objects: tuple[TrackedObject, ...] = ()
     """Objects through time, with the evidence of their motion."""
+    untracked: int = 0
+    """Objects that had too few points to be tracked."""
     solution: Solution | None = None
     """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
@@ -85,21 +93,28 @@ def run(
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
     page = check_drive(log, segmenter, settings, stats, force)
-    sample = SweepSample(log)
-    with stats.stage("trajectory"):
-        progress("trajectory", 0, 1)
-        found = locate(sample.listening(), settings, stats, progress, page.solution)
-        progress("trajectory", 1, 1)
-    with stats.stage("sharpness"):
-        trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
-        figures = of_sample(sample, trajectories, progress)
-        sharpness = dict(zip(("map", "gnss and imu"), figures, strict=False))
+    found, sharpness = _located(log, settings, stats, progress, page.solution)
     log, trajectory = in_frame(log, found.trajectory, origin)
     drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     mapped = map_drive(
         drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
     return replace(mapped, solution=found.solution, sharpness=sharpness, preflight=page)
+
+
+def _located(
+    log: SensorLog, settings: Settings, stats: RunStats, progress: Progress, first: Solution | None
+) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
+    """The trajectory of a drive, and how sharp a map it makes; the sweeps that tell it are not held any longer."""
+    sample = SweepSample(log)
+    with stats.stage("trajectory"):
+        progress("trajectory", 0, 1)
+        found = locate(sample.listening(), settings, stats, progress, first)
+        progress("trajectory", 1, 1)
+    with stats.stage("sharpness"):
+        trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
+        figures = of_sample(sample, trajectories, progress)
+    return replace(found, without_lidar=None), dict(zip(("map", "gnss and imu"), figures, strict=False))
 
 
 def map_drive(
@@ -128,7 +143,12 @@ def map_drive(
     if stats.counts["points"] - stats.counts["points left out"] == stats.counts["points of moving objects"]:
         stats.warnings.append("all points were removed as moving: the pictures show the removed points")
     return Mapped(
-        drive.log, drive.trajectory, stats, store.objects(), from_lidar_odometry=drive.from_lidar_odometry
+        drive.log,
+        drive.trajectory,
+        stats,
+        store.objects(),
+        store.untracked(),
+        from_lidar_odometry=drive.from_lidar_odometry,
     )
 
 

@@ -24,6 +24,8 @@ class Format:
     write: Callable[[Exported, Path], None]
 
 
+SMALL = 1_000_000
+"""Voxels of a map."""
 FORMATS = (
     Format(
         "viewer", "viewer.html", "the map to turn and to ask, in any browser, offline",
@@ -48,10 +50,10 @@ FORMATS = (
 
 
 def write_exports(exported: Exported, folder: Path) -> None:
-    """All files that can be written of a map, two at a time."""
+    """All files that can be written of a map: two at a time of a small one, as each takes memory with its size."""
     possible = [each for each in FORMATS if exported.map.frame is not None or each.name != "geotiff"]
     _ = exported.extent  # once, before both threads ask for it
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(2 if exported.extent.count < SMALL else 1) as pool:
         # the last takes longest, so it begins
         writing = [pool.submit(each.write, exported, folder / each.file) for each in reversed(possible)]
     for each in writing:

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
+from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS, Motion, TrackedObject
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
@@ -76,7 +76,8 @@ class ChunkStore:
                 "files": checksums,
                 "counts": dict(chunk.stats.counts),
                 "skips": [asdict(skip) for skip in chunk.stats.skips],
-                "objects": [asdict(one) | {"path": one.path.tolist()} for one in chunk.objects],
+                "objects": [_about(one) for one in chunk.objects if one.points >= LEAST_TRACKED_POINTS],
+                "untracked": sum(one.points < LEAST_TRACKED_POINTS for one in chunk.objects),
             }
             write_whole(beside / RECORD, json.dumps({"sha256": _checksum(body), "record": body}).encode())
             beside.rename(self.folder / str(chunk.number))
@@ -105,8 +106,12 @@ class ChunkStore:
         return list(self._records)
 
     def objects(self) -> tuple[TrackedObject, ...]:
-        """The moving objects of all chunks."""
+        """The tracked objects of all chunks."""
         return tuple(_object(one) for record in self._records for one in record["objects"])
+
+    def untracked(self) -> int:
+        """How many objects had too few points to be tracked: most of them, so they are only counted."""
+        return sum(record["untracked"] for record in self._records)
 
     def tiles(self) -> list[Tile]:
         """The tiles that any chunk has voxels in, in order."""
@@ -187,10 +192,15 @@ def _content(path: Path, checksum: str) -> bytes:
     return content
 
 
+def _about(one: TrackedObject) -> dict[str, Any]:
+    """An object without its segments, whose numbers say nothing outside their chunk."""
+    return asdict(one) | {"path": one.path.tolist(), "segments": ()}
+
+
 def _object(content: Mapping[str, Any]) -> TrackedObject:
     given = {
         "motion": Motion(content["motion"]),
-        "segments": tuple(content["segments"]),
+        "segments": (),
         "path": np.array(content["path"], np.float64).reshape(-1, 2),
     }
     return TrackedObject(**{**content, **given})

@@ -164,6 +164,8 @@ class RefinementReport:
     """Objects through time, with the evidence of their motion."""
     systematic_errors: float = 0.0
     """Share of observations that are wrong in all views alike, as far as the map can tell."""
+    untracked: int = 0
+    """Objects that had too few points to be tracked."""
 
     def to_json(self) -> dict[str, Any]:
         """What it says of a tile, without objects through time; `from_json` reads it back."""
@@ -211,6 +213,7 @@ class RefinementReport:
             tuple(replace(thing, number=number) for number, thing in enumerate(objects)),
             (*self.tracked, *other.tracked),
             max(self.systematic_errors, other.systematic_errors),
+            self.untracked + other.untracked,
         )
 
 

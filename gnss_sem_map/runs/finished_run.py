@@ -200,7 +200,7 @@ class Run:
                 drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter
             )
             refined = pipeline.refine(folder, settings, stats, progress)
-            refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
+            refined = replace(refined, report=run_folder.with_objects(refined.report, mapped))
             run_folder.write_again(
                 folder,
                 self.folder,

@@ -18,7 +18,6 @@ import numpy as np
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
-from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
@@ -84,7 +83,7 @@ def write_run(
     write_labels: bool,
 ) -> None:
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
-    refined = replace(refined, report=replace(refined.report, tracked=mapped.objects))
+    refined = replace(refined, report=with_objects(refined.report, mapped))
     with mapped.stats.stage("export"):
         write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
         write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
@@ -310,9 +309,13 @@ def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
     }
 
 
+def with_objects(report: RefinementReport, mapped: Mapped) -> RefinementReport:
+    """The report of a refinement, with the objects that were found while the drive was mapped."""
+    return replace(report, tracked=mapped.objects, untracked=mapped.untracked)
+
+
 def _about_refinement(report: RefinementReport) -> dict[str, Any]:
     """Steps and objects, for run.json; objects of a few points are only counted."""
-    followed = [thing for thing in report.tracked if thing.points >= LEAST_TRACKED_POINTS]
     return {
         "steps": [
             {
@@ -335,9 +338,9 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
                 "last_stamp": thing.last_stamp,
                 "path": thing.path.round(2).tolist(),
             }
-            for thing in followed
+            for thing in report.tracked
         ],
-        "untracked_segments": len(report.tracked) - len(followed),
+        "untracked_segments": report.untracked,
     }
 
 

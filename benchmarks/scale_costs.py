@@ -28,9 +28,9 @@ Row = tuple[str, ...]
 
 
 def constants(measured: dict[str, Any]) -> dict[str, float]:
-    """Per scan, voxel, and km, from a run of 60 s and one of 480 s; a drive of 60 s sees each street once."""
+    """Per scan, voxel, and km, from a run of 480 s."""
     memory = measured["memory"]
-    short, long, seconds = memory["sizes_60_s"], memory["sizes_480_s"], memory["seconds_by_stage_480_s"]
+    long, seconds = memory["sizes_480_s"], memory["seconds_by_stage_480_s"]
     of_drive = sum(seconds[stage] for stage in SHARED) / sum(seconds.values())
     cpu_s = memory["cpu_ms_per_scan_480_s"] * long["scans"] / 1000
     per_voxel = {part: size / long["voxels"] for part, size in long["bytes"].items()}
@@ -41,8 +41,8 @@ def constants(measured: dict[str, Any]) -> dict[str, float]:
         "of it trajectory and mapping, ms": of_drive * memory["cpu_ms_per_scan_480_s"],
         "refinement and exports, µs per voxel": 1e6 * (1 - of_drive) * cpu_s / long["voxels"],
         "reads of a scan": measured["reads"]["reads_of_a_scan_mean"],
-        "voxels per km of street": short["voxels"] / short["km"],
-        "tiles per km of street": short["tiles"] / short["km"],
+        "voxels per km of street": long["voxels"] / long["km"],
+        "tiles per km of street": long["tiles"] / long["km"],
         "`map/`, B per voxel": per_voxel["map"],
         "`refined/`, B per voxel": per_voxel["refined"],
         "`evidence/moved/`, B per voxel of the map": per_voxel["evidence/moved"],
@@ -88,7 +88,8 @@ def limits(constant: dict[str, float]) -> dict[str, float]:
         "km of street until `refined/map.json` is full": LARGEST_JSON
         / per_tile
         / constant["tiles per km of street"],
-        "km until `run.json` is full": LARGEST_JSON / (1e3 * constant["`run.json`, kB per km"]),
+        "km of one drive until its `run.json` is full": LARGEST_JSON
+        / (1e3 * constant["`run.json`, kB per km"]),
         "hours of one drive in 16 GB of memory": 16_000 / constant["smoothing, MB per hour of a drive"],
         "MB/s that a core reads while it maps": 1e-6 * per_core,
     }
@@ -123,11 +124,11 @@ def main() -> None:
     page = PAGE.read_text()
     for name, made in tables.items():
         print(made, end="\n\n")
-        begin, end = f"<!-- {name} -->\n", "\n<!-- end -->"
+        begin, end = f"<!-- {name} -->\n", "<!-- end -->"
         before, found, rest = page.partition(begin)
         if not found or end not in rest:
             raise SystemExit(f"{PAGE}: no place for the table '{name}'; expected {begin!r} and {end!r}")
-        page = before + begin + made + rest[rest.index(end) :]
+        page = f"{before}{begin}{made}\n{rest[rest.index(end) :]}"
     PAGE.write_text(page)
 
 

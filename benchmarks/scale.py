@@ -203,6 +203,25 @@ def refinement(drives: Drives, out: Path) -> Figures:
     return {"refinement_us_per_voxel": 1e6 * float(told.rpartition("TOOK ")[2]) / voxels}
 
 
+def stages(drives: Drives, out: Path) -> Figures:
+    """A long drive on one process and on two, of one thread each: whole run, and its stages; the same bytes."""
+    found: Figures = {}
+    for count in (1, 2):
+        words = drives.words(drives.of(480)[:1], out / f"{count}", "--workers", f"{count}")
+        figures = run(words, threads=1)
+        seconds = json.loads((out / f"{count}" / "run.json").read_text())["seconds"]
+        found |= {
+            f"wall_s_{count}": figures["wall_s"],
+            f"real_time_factor_{count}": 480 / figures["wall_s"],
+            f"seconds_by_stage_{count}": seconds,
+        }
+    for stage in ("trajectory", "mapping", "refinement"):
+        found[f"two_over_one_{stage}"] = (
+            found["seconds_by_stage_1"][stage] / found["seconds_by_stage_2"][stage]
+        )
+    return found | {"same_bytes": checksums(out / "1") == checksums(out / "2")}
+
+
 def workers(drives: Drives, out: Path) -> Figures:
     """Two processes over one, and Dask over processes, for six drives; the same bytes from all."""
     some = drives.of(30)[:6]
@@ -262,7 +281,7 @@ def _dask(count: int) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
 
 
 CASES: dict[str, Callable[[Drives, Path], Figures]] = {
-    one.__name__: one for one in (memory, reads, disk, refinement, workers, twenty)
+    one.__name__: one for one in (memory, reads, disk, refinement, stages, workers, twenty)
 }
 
 

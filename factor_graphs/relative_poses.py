@@ -57,6 +57,14 @@ class RelativePoses:
                     f"RelativePoses[{row}], {earlier:.3f} to {later:.3f} s: {what}; leave such pairs out"
                 )
 
+    def __add__(self, other: RelativePoses) -> RelativePoses:
+        return RelativePoses(
+            *(
+                np.concatenate([getattr(self, field.name), getattr(other, field.name)])
+                for field in fields(self)
+            )
+        )
+
     def __len__(self) -> int:
         return len(self.stamps)
 

@@ -31,12 +31,14 @@ from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
 from gnss_sem_map.mapping.trajectory import (
     DriveTrajectory,
+    Matcher,
     check_georeference,
     estimate_trajectory,
     in_frame,
     locate,
 )
 from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
@@ -77,6 +79,7 @@ def run(
     *,
     origin: LocalFrame | None = None,
     resume: bool = False,
+    match: Matcher | None = None,
     elsewhere: Elsewhere | None = None,
     labels_from: str = "",
     force: bool = False,
@@ -85,15 +88,15 @@ def run(
 
     Without a segmenter, or without images, the map has no labels. The frame of the map is that of the drive, or
     `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
-    for this and `elsewhere` see `mapping.fusion.map_scans`. With `force`, a red pre-flight does not stop the run.
+    for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` `mapping.trajectory.locate`. With `force`, a
+    red pre-flight does not stop the run.
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
     check_georeference(log, origin)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
-    page = check_drive(log, segmenter, settings, stats, force)
-    found, sharpness = _located(log, settings, stats, progress, page.solution)
+    page, found, sharpness = _checked_and_located(log, segmenter, settings, stats, progress, force, match)
     log, trajectory = in_frame(log, found.trajectory, origin)
     drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     mapped = map_drive(
@@ -102,14 +105,35 @@ def run(
     return replace(mapped, solution=found.solution, sharpness=sharpness, preflight=page)
 
 
+def _checked_and_located(
+    log: SensorLog,
+    segmenter: Segmenter | None,
+    settings: Settings,
+    stats: RunStats,
+    progress: Progress,
+    force: bool,
+    match: Matcher | None,
+) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
+    """All that comes before the map; the sweeps that the check has read are not read again."""
+    sweeps = KeptSweeps()
+    page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
+    found, sharpness = _located(sweeps.taking(log), settings, stats, progress, page.solution, match)
+    return page, found, sharpness
+
+
 def _located(
-    log: SensorLog, settings: Settings, stats: RunStats, progress: Progress, first: Solution | None
+    log: SensorLog,
+    settings: Settings,
+    stats: RunStats,
+    progress: Progress,
+    first: Solution | None,
+    match: Matcher | None,
 ) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
     """The trajectory of a drive, and how sharp a map it makes; the sweeps that tell it are not held any longer."""
     sample = SweepSample(log)
     with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
-        found = locate(sample.listening(), settings, stats, progress, first)
+        found = locate(sample.listening(), settings, stats, progress, first, match)
         progress("trajectory", 1, 1)
     with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]

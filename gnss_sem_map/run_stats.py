@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import ctypes
 import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.sensor_log import Skip
 
 Progress = Callable[[str, int, int], None]
@@ -18,12 +18,6 @@ Progress = Callable[[str, int, int], None]
 
 def silent(stage: str, done: int, total: int) -> None:
     """Progress that is not shown."""
-
-
-def release_memory() -> None:
-    """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Readers of drives: each reads one folder layout into a `SensorLog`.
 
 A reader is a module of this folder with `FORMAT` (its name), `SIGNS` (the content of such a drive, in words),
-`is_drive(folder)` and `read(folder)`.
+`is_drive(folder)` and `read(folder, with_imu)`.
 """
 
 from __future__ import annotations
@@ -38,10 +38,13 @@ def detect_format(drive: Path) -> str:
     raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}")
 
 
-def open_drive(drive: Path | str, drive_format: str | None = None) -> SensorLog:
-    """Open a drive of any known format; scans and images are read later, when they are needed."""
+def open_drive(drive: Path | str, drive_format: str | None = None, with_imu: bool = True) -> SensorLog:
+    """Open a drive of any known format; scans and images are read later, when they are needed.
+
+    `with_imu`: False for those who have a trajectory. A reader may then leave out what takes long to read.
+    """
     drive = Path(drive)
     if drive_format is not None and drive_format not in readers():
         raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
-    log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive)
+    log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive, with_imu)
     return log

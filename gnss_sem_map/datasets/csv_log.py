@@ -88,7 +88,7 @@ def is_drive(drive: Path) -> bool:
     return is_file(drive / "imu.csv") or is_file(drive / "gnss.csv")
 
 
-def read(drive: Path) -> SensorLog:
+def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
     about = _about(drive / "log.yaml")
     imu_rows = _table(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)

@@ -36,7 +36,7 @@ def is_drive(drive: Path) -> bool:
     return is_file(drive / "calib.txt") or is_file(drive / "poses.txt")
 
 
-def read(sequence: Path) -> SensorLog:
+def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     """Open an odometry sequence; raises DataError when calibration, poses or times are missing or malformed."""
     file = sequence / "calib.txt"
     rows = kitti_calibration.read_rows(file, {"P2": 12, "Tr": 12})

@@ -64,8 +64,11 @@ def is_drive(drive: Path) -> bool:
     return is_folder(drive / "oxts")
 
 
-def read(drive: Path) -> SensorLog:
-    """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed."""
+def read(drive: Path, with_imu: bool = True) -> SensorLog:
+    """Open a KITTI raw drive; raises DataError when calibration, oxts or stamps are missing or malformed.
+
+    Without `with_imu`, the thousands of files of its `_extract` twin are not read.
+    """
     calibration = _calibration(_date_folder(drive), has_images=is_folder(drive / "image_02"))
     oxts_ns, oxts, skips = _oxts(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
@@ -85,7 +88,9 @@ def read(drive: Path) -> SensorLog:
         stamps[is_fix], frame.to_map(*fixes[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
     )
     reference = Trajectory(gnss.stamps, _reference_poses(gnss.positions, fixes))
-    imu_stamps, imu_rows, imu_skips = _imu_rows(drive, epoch_ns, stamps, oxts)
+    imu_stamps, imu_rows, imu_skips = (
+        _imu_rows(drive, epoch_ns, stamps, oxts) if with_imu else (stamps, oxts, [])
+    )
     scans, scan_skips = _scans(drive, epoch_ns)
     images, image_skips = _images(drive, epoch_ns, calibration.image_size)
     return SensorLog(

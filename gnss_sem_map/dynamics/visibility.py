@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ APART_M, APART_S = 2.0, 2.0
 """Distance and time between keyframe scans, whichever comes first: the scans take no more memory than the map."""
 NEAREST_M = 3.0
 """A scan nearer to a position than this is no evidence: the vehicle itself is in the way."""
+SCANS_PER_PART = 64
+"""Scans of a part: 8 MB of range images."""
 MARGIN_M, MARGIN_RATIO = 0.3, 0.01
 """A range within this, plus this share of the range, of a position is a hit: noise of ranges and poses."""
 
@@ -54,10 +57,24 @@ class KeyframeScans:
         """Range images with their poses, at least one."""
         return cls(np.stack([one.image for one in scans]), np.stack([one.T_lidar_map for one in scans]))
 
-    def near(self, positions: NDArray[np.float64], reach_m: float) -> KeyframeScans:
-        """The scans at most `reach_m` from the bounding box of positions (m, 3) m: few scans of a long drive."""
-        close = are_near(self.T_lidar_map, positions, reach_m)
-        return self if close.all() else KeyframeScans(self.images[close], self.T_lidar_map[close])
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def parts(self) -> Iterator[KeyframeScans]:
+        """The scans, some at a time."""
+        for start in range(0, len(self), SCANS_PER_PART):
+            part = slice(start, start + SCANS_PER_PART)
+            yield KeyframeScans(self.images[part], self.T_lidar_map[part])
+
+
+class Keyframes(Protocol):
+    """Keyframe scans that need not be in memory."""
+
+    def __len__(self) -> int:
+        """The number of scans."""
+
+    def parts(self) -> Iterator[KeyframeScans]:
+        """The scans, some at a time."""
 
 
 def are_near(

@@ -2,7 +2,8 @@
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
-          job.json, trajectory.npz   what other processes need to map chunks (`runs.chunk_tasks`)
+          job.json, trajectory.npz   what other processes need to map chunks (`runs.drive_job`)
+          matches/               LiDAR odometry of sections of the drive (`runs.match_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
@@ -21,7 +22,8 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, ANSWERS, DRIVES, TILES, PART, OLD = "chunks.json", "answers", "drives", "tiles", "part", "old"
+CHUNKS, MATCHES, ANSWERS, DRIVES = "chunks.json", "matches", "answers", "drives"
+TILES, PART, OLD = "tiles", "part", "old"
 JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
@@ -30,6 +32,7 @@ OF_CHUNKS = re.compile(
 )
 OURS = re.compile(
     r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"|matches/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -65,7 +68,10 @@ def refuse_foreign(folder: Path) -> None:
 def holds_work(folder: Path) -> bool:
     """Whether there are intermediate results for --resume."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
-    return done or any((folder / ANSWERS).glob("*.npz")) or any((folder / DRIVES).glob("*/run.json"))
+    return done or any(
+        any((folder / place).glob(files))
+        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "*.npz"), (DRIVES, "*/run.json"))
+    )
 
 
 def clear(folder: Path) -> None:
@@ -76,6 +82,7 @@ def clear(folder: Path) -> None:
     if not folder.is_dir() or folder.is_symlink():
         return
     remove_chunks(folder)
+    remove_matches(folder)
     remove_answers(folder)
     remove_drives(folder)
     drop_results(folder)
@@ -88,6 +95,11 @@ def remove_drives(folder: Path) -> None:
     """Remove the maps of single drives, and tiles that were made from them; raises OSError."""
     _remove_ours(folder / DRIVES)
     _remove_ours(folder / TILES)
+
+
+def remove_matches(folder: Path) -> None:
+    """Remove saved LiDAR odometry; raises OSError."""
+    _remove_known(folder, folder / MATCHES)
 
 
 def remove_answers(folder: Path) -> None:

@@ -1,13 +1,13 @@
 """One pass over the scans of a drive, chunk by chunk: all points are fused, and those that moved are subtracted.
 
-A chunk is two windows of scans (`dynamics.window_scans`). What moved in it is decided by its own scans, the range
-images of a window of scans before it, and the segments of a window of scans after it. So no chunk depends on what was
-decided elsewhere: the map is the same for any division of the chunks among processes, and after any interruption.
+A chunk is a window of scans (`dynamics.window_scans`). What moved in it is decided by its own scans, the range images
+of a window before it, and the segments of a window after it. So no chunk depends on what was decided elsewhere: the map
+is the same for any division of the chunks among processes, and after any interruption.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,13 +25,11 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_scan
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
 from gnss_sem_map.mapping.waiting_points import WaitingPoints
-from gnss_sem_map.run_stats import Progress, RunStats, release_memory, silent
+from gnss_sem_map.memory import release_memory
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
-
-WINDOWS = 2
-"""Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +53,7 @@ class MappedChunk:
 def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
     """The scans of every chunk; the last one has up to a window more, so that every other has a window after it."""
     scans, window = drive.log.scans, drive.settings.dynamics.window_scans
-    count = 1 + max(0, len(scans) - window) // (WINDOWS * window)
-    edges = [*range(0, count * WINDOWS * window, WINDOWS * window), len(scans)]
+    edges = [*range(0, max(len(scans) - window, 0) + 1, window), len(scans)]
     return [scans[start:end] for start, end in pairwise(edges)]
 
 
@@ -76,7 +73,7 @@ def map_chunks(
     done = 0
     for number in numbers:
         chunk = _Chunk(drive, number, folder)
-        for place, seen in enumerate(_observed(drive, chunks[number], chunk.stats), 1):
+        for place, seen in enumerate(_observed(drive, chunks[number], chunk.stats, chunk.put_aside), 1):
             if seen is not None:
                 chunk.add(*seen)
             if undecided is not None and place == window:
@@ -90,23 +87,38 @@ def map_chunks(
         yield undecided.decided(before, _observations(drive, after))
 
 
-Seen = tuple[LabelledScan, tuple[Observation, NearPoints] | None]
+Seen = tuple[LabelledScan, Observation | None]
+PutAside = Callable[[LabelledScan, NearPoints], None]
 
 
-def _observed(drive: Drive, scans: Sequence[Scan], stats: RunStats) -> Iterator[Seen | None]:
-    """Every scan, with what it tells of motion if that is sought; None for one that cannot be used."""
+def _observed(
+    drive: Drive, scans: Sequence[Scan], stats: RunStats, put_aside: PutAside | None = None
+) -> Iterator[Seen | None]:
+    """Every scan, with what it tells of motion if that is sought; None for one that cannot be used.
+
+    Threads call `put_aside` with the points that may have moved.
+    """
     is_sought = drive.settings.dynamics.enabled
     labelled = label_each_scan(drive, scans, stats, keep_points=is_sought)
     if not is_sought:
         return (None if seen is None else (seen, None) for seen in labelled)
-    observing = prefetch(lambda seen: None if seen is None else observe_scan(seen), labelled, THREADS)
-    return (None if seen is None else (seen, observed) for seen, observed in observing)
+
+    def observe(seen: LabelledScan | None) -> Observation | None:
+        if seen is None:
+            return None
+        observation, near = observe_scan(seen)
+        if put_aside is not None:
+            put_aside(seen, near)
+        return observation
+
+    observing = prefetch(observe, labelled, THREADS)
+    return (None if seen is None else (seen, observation) for seen, observation in observing)
 
 
 def _observations(drive: Drive, scans: Sequence[Scan]) -> list[Observation]:
     """What scans of another chunk tell of motion; they are counted there."""
     seen = _observed(drive, scans, RunStats())
-    return [one[1][0] for one in seen if one is not None and one[1] is not None]
+    return [one[1] for one in seen if one is not None and one[1] is not None]
 
 
 class _Chunk:
@@ -118,19 +130,20 @@ class _Chunk:
         self.observations: list[Observation] = []
         self.stats = RunStats()
 
-    def add(self, seen: LabelledScan, observed: tuple[Observation, NearPoints] | None) -> None:
-        self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)
-        if observed is None:
-            return
-        observation, near = observed
+    def put_aside(self, seen: LabelledScan, near: NearPoints) -> None:
+        """Write the points that may have moved; raises DataError."""
         try:
-            WaitingPoints.of(seen, near).write(self._waiting(observation.number))
+            WaitingPoints.of(seen, near).write(self._waiting(seen.scan.number))
         except OSError as error:
             raise DataError(
                 f"{self._folder}: cannot be written ({error.strerror}); free the disk, then --resume"
             ) from None
-        self._keyframes.add(observation.stamp, observation.seen)
-        self.observations.append(observation)
+
+    def add(self, seen: LabelledScan, observation: Observation | None) -> None:
+        self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)
+        if observation is not None:
+            self._keyframes.add(observation.stamp, observation.seen)
+            self.observations.append(observation)
 
     def decided(self, before: Sequence[RangeImage], after: Sequence[Observation]) -> MappedChunk:
         """The chunk, once the scans before and after it are known."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -31,8 +31,8 @@ FOLDER = "evidence"
 MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
 MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand."""
-FILES_HELD = 4
-"""Files of keyframes in memory at a time, some 40 MB each."""
+FILES_HELD = 8
+"""Files of keyframes in memory at a time, some 9 MB each."""
 
 PACKING = 2
 """Level of compression: 5 % larger than with zlib's usual 6, in a quarter of its time (0.5 s of a drive of 30 s)."""
@@ -60,27 +60,37 @@ class RunEvidence:
         """T_lidar_map (k, 4, 4) of the keyframe scans of every file; raises DataError."""
         return {path: read_poses(path) for path in self.keyframes}
 
-    def keyframes_near(self, positions: NDArray[np.float64], reach_m: float) -> KeyframeScans | None:
+    def keyframes_near(self, positions: NDArray[np.float64], reach_m: float) -> NearKeyframes | None:
         """The keyframe scans at most `reach_m` from the bounding box of positions (m, 3) m; None if there are none.
 
-        Raises DataError.
+        Reading them raises DataError.
         """
-        paths = [path for path, T in self.poses.items() if are_near(T, positions, reach_m).any()]
-        count = sum(int(are_near(self.poses[path], positions, reach_m).sum()) for path in paths)
-        if count == 0:
-            return None
-        found, start = KeyframeScans(np.empty((count, *IMAGE_SHAPE), np.uint16), np.empty((count, 4, 4))), 0
-        for path in paths:  # into place: the images of a tile take a hundred megabytes
-            near = self._read_keyframes(path).near(positions, reach_m)
-            found.images[start : start + len(near.images)] = near.images
-            found.T_lidar_map[start : start + len(near.images)] = near.T_lidar_map
-            start += len(near.images)
-        return found
+        near = {path: np.flatnonzero(are_near(T, positions, reach_m)) for path, T in self.poses.items()}
+        chosen = {path: scans for path, scans in near.items() if len(scans)}
+        return NearKeyframes(chosen, self._read_keyframes) if chosen else None
 
     @cached_property
     def _read_keyframes(self) -> Callable[[Path], KeyframeScans]:
         """Reads files, and holds some; another run may have files of the same names."""
         return lru_cache(FILES_HELD)(read_keyframes)
+
+
+@dataclass(frozen=True, eq=False)
+class NearKeyframes:
+    """Keyframe scans of some files, read when they are needed: those of a tile take a hundred megabytes."""
+
+    chosen: Mapping[Path, NDArray[np.intp]]
+    """File -> places of the scans that are meant."""
+    read: Callable[[Path], KeyframeScans]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.chosen.values()))
+
+    def parts(self) -> Iterator[KeyframeScans]:
+        """The scans, file by file; raises DataError."""
+        for path, scans in self.chosen.items():
+            of_file = self.read(path)
+            yield KeyframeScans(of_file.images[scans], of_file.T_lidar_map[scans])
 
 
 def write(moving_points: Iterable[bytes], keyframes: Iterable[bytes], run: Path) -> None:

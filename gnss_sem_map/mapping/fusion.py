@@ -137,8 +137,8 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
         log.name, labels_from, list(names), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
-        [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
-        [(image.number, image.stamp, _state(image)) for image in log.images], _states(labels_from),
+        [(scan.name, scan.number, scan.stamp, state_of(scan)) for scan in log.scans],
+        [(image.number, image.stamp, state_of(image)) for image in log.images], _states(labels_from),
         log.calibration.image_size, log.calibration.camera_time_offset_s,
     ]  # fmt: skip
     digest = hashlib.sha256(repr(said).encode())
@@ -153,12 +153,12 @@ def probabilities_fingerprint(drive: Drive, labels_from: str) -> str:
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
         log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_size,
-        [(image.number, _state(image)) for image in log.images], _states(labels_from),
+        [(image.number, state_of(image)) for image in log.images], _states(labels_from),
     ]  # fmt: skip
     return hashlib.sha256(repr(said).encode()).hexdigest()
 
 
-def _state(item: Scan | Image) -> tuple[int, int] | None:
+def state_of(item: Scan | Image) -> tuple[int, int] | None:
     """Size and time of the file of a scan or an image."""
     path = file_of(item)
     return None if path is None else _size_and_time(path)

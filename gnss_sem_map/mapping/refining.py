@@ -30,7 +30,7 @@ from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles, on_tiles
 from gnss_sem_map.refinement import kerb_points
-from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_of
+from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_halo_m, sums_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.state import Evidence
@@ -202,6 +202,7 @@ class _Inputs:
         self.steps, self.model = opened.refinement, opened_sensor_model(opened)
         self.raw = open_raw(Path(run), open_label_set(opened.classes))
         self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
+        self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
     def beside(self, tile: Tile, around: VoxelMap, moved: VoxelMap) -> Evidence:
         own = around.indices[places_around(around, tile, 0)]
@@ -223,7 +224,7 @@ def measure_tiles(
     """Sums of tiles, saved with the digest of what is around each: a task."""
     inputs, found = _inputs(run, settings, call), []
     for x, y, around in of_tiles:
-        voxels, _ = inputs.raw.around((x, y), inputs.halo)
+        voxels, _ = inputs.raw.around((x, y), inputs.sums_halo)
         sums = sums_of((x, y), voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
         write_record({"around": around, "sums": sums}, _sums_file((x, y), Path(made_in)))
         found.append(sums)

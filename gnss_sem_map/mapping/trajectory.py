@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from factor_graphs.geodesy import LocalFrame
@@ -10,12 +11,16 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
-from gnss_sem_map.scans.lidar_odometry import TrajectorySettings, match_scans
+from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
 from gnss_sem_map.sensor_log import SensorLog
 
 MATCHED_SHARE = 0.95
 """With this share of matched scans, poses are accurate enough to tell slow objects from static ones."""
+
+Matcher = Callable[[SensorLog, Trajectory, Settings, Progress], ScanMatches]
+"""LiDAR odometry with a first trajectory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +50,12 @@ def locate(
     stats: RunStats,
     progress: Progress = silent,
     first: Solution | None = None,
+    match: Matcher | None = None,
 ) -> DriveTrajectory:
     """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
-    `first` is the result of `smooth_log` for this log, if it is known already.
+    `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
+    default `match_scans` in this process.
     """
     if log.given is not None:
         return DriveTrajectory(log.given)
@@ -56,7 +63,8 @@ def locate(
     found = first if first is not None else smooth_log(log, settings.trajectory)
     from_lidar_odometry, without_lidar = False, None
     if settings.trajectory.lidar_odometry and log.scans:
-        matches = match_scans(log, found.trajectory, settings.trajectory.scan_matching, progress)
+        matches = (match or _in_this_process)(log, found.trajectory, settings, progress)
+        release_memory()  # of the local map
         stats.counts.update(matches.counts)
         # a scan that cannot be used at all is reported when the map is built
         stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
@@ -66,6 +74,12 @@ def locate(
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
     stats.warnings.extend(found.notes)
     return DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
+
+
+def _in_this_process(
+    log: SensorLog, trajectory: Trajectory, settings: Settings, progress: Progress
+) -> ScanMatches:
+    return match_scans(log, trajectory, settings.trajectory.scan_matching, progress)
 
 
 def in_frame(

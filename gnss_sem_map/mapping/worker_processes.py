@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess, parent_process
 from pathlib import Path
@@ -38,24 +38,33 @@ class Processes:
     With fewer tasks than `workers`, there is one for each. A worker ends after `tasks_per_worker` tasks, which frees
     whatever they left behind. One that holds more than `memory_bytes` (None: the memory of the machine divided by their
     number + 1, as the main process has a share too), or works on one task for more than `timeout_s`, is killed; what a
-    dead worker had under way is called again in a new one.
+    dead worker had under way is called again in a new one. With `keep`, workers wait for the tasks of the next call
+    until `close`: a new one takes seconds to start.
     """
 
     workers: int
     memory_bytes: int | None = None
     timeout_s: float = 3600.0
     tasks_per_worker: int = 10
+    keep: bool = False
     allowed: str = ALLOWED
+    _idle: list[_Worker] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    def close(self) -> None:
+        """End the workers that were kept."""
+        while self._idle:
+            self._idle.pop().end()
 
     def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
         """Call all tasks; yields each with its result when it is done."""
         count = min(self.workers, len(tasks))
         most_bytes = self.memory_bytes or machine_memory_bytes() // (count + 1)
         waiting, losses = deque(tasks), Losses()
-        team: list[_Worker] = []
+        own_threads = max(threads() // max(count, 1), 1)
+        team = self._kept(count, own_threads)
         try:
             while waiting or any(worker.task for worker in team):
-                self._give(waiting, team, count)
+                self._give(waiting, team, count, own_threads)
                 wait([worker.connection for worker in team], WATCH_S)
                 for worker in list(team):
                     task = worker.task
@@ -70,9 +79,19 @@ class Processes:
                             yield from losses.add(task, lost, waiting)
         finally:
             for worker in team:
-                worker.end()
+                if self.keep and worker.task is None:
+                    self._idle.append(worker)
+                else:
+                    worker.end()
 
-    def _give(self, waiting: deque[Task], team: list[_Worker], count: int) -> None:
+    def _kept(self, count: int, own_threads: int) -> list[_Worker]:
+        """At most `count` workers of an earlier call, alive and with as many threads; the others end."""
+        fit = [worker for worker in self._idle if worker.is_alive and worker.threads == own_threads][:count]
+        self._idle[:] = [worker for worker in self._idle if worker not in fit]
+        self.close()
+        return fit
+
+    def _give(self, waiting: deque[Task], team: list[_Worker], count: int, own_threads: int) -> None:
         """Give every idle one of `count` workers a task; workers that have done their share are replaced."""
         for worker in [worker for worker in team if worker.task is None]:
             if worker.tasks_done >= self.tasks_per_worker:
@@ -81,7 +100,7 @@ class Processes:
             elif waiting:
                 worker.give(waiting.popleft(), self.allowed)
         while waiting and len(team) < count:
-            team.append(_Worker(max(threads() // count, 1)))
+            team.append(_Worker(own_threads))
             team[-1].give(waiting.popleft(), self.allowed)
 
 
@@ -91,8 +110,13 @@ class _Worker:
     def __init__(self, own_threads: int) -> None:
         with _environment(dict.fromkeys(THREADS_VARIABLES, str(own_threads))):
             self.connection, self._process = _start()
+        self.threads = own_threads
         self.task: Task | None = None
         self.tasks_done = 0
+
+    @property
+    def is_alive(self) -> bool:
+        return self._process.is_alive()
 
     def give(self, task: Task, allowed: str) -> None:
         self.task, self._since = task, time.monotonic()

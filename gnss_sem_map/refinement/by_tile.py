@@ -41,16 +41,23 @@ WORTH_CUTTING_M = 2.0
 
 
 def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
-    """How far around a tile voxels are read, m: for its height over ground, and for all steps or for the sums."""
-    reaches = _reach_from(0, settings, voxel_size_m), _sums_reach_m(settings, voxel_size_m)
-    return height_above_ground.REACH_M + max(reaches)
+    """How far around a tile voxels are read to refine it, m: for its height over ground, and for all steps."""
+    return max(
+        height_above_ground.REACH_M + _reach_from(0, settings, voxel_size_m),
+        sums_halo_m(settings, voxel_size_m),
+    )
+
+
+def sums_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
+    """How far around a tile voxels are read for its sums, m."""
+    return height_above_ground.REACH_M + _sums_reach_m(settings, voxel_size_m)
 
 
 def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
     """What a tile adds to the figures of the whole map, from the voxels of the tile and its halo."""
-    reach = _sums_reach_m(settings, around.voxel_size_m)
-    state = MapState.of(around[places_around(around, tile, reach + height_above_ground.REACH_M)], beside)
-    state = state[places_around(state.voxels, tile, reach)]
+    size = around.voxel_size_m
+    state = MapState.of(around[places_around(around, tile, sums_halo_m(settings, size))], beside)
+    state = state[places_around(state.voxels, tile, _sums_reach_m(settings, size))]
     state, _ = do(STEPS[0], state, settings)
     images = state.scores
     state, _ = do(STEPS[1], state, settings)

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.dynamics.visibility import KeyframeScans, hits_and_misses
+from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import State
@@ -56,21 +56,30 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     return replace(state, decided=replace(state.decided, states=states))
 
 
-def traversed(voxels: VoxelMap, keyframes: KeyframeScans, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
+def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
     """Which voxels (v,) are free space, by the rays through their centres.
 
     Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
-    because grazing rays traverse them.
+    because grazing rays traverse them. A voxel is looked at until even misses in all the scans left would not make it
+    free: so most static ones are decided by a part of the scans.
     """
     stands = _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M])
-    high = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * len(keyframes.images)))
-    hits, misses = hits_and_misses(voxels.centres[high], keyframes, settings.farthest_m)
-    empty = misses >= settings.least_misses
-    empty &= misses > settings.misses_per_hit * hits
-    empty &= voxels.hits[high] < POINTS_PER_MISS * misses
-    cleared = np.zeros(len(voxels), np.bool_)
-    cleared[high[empty]] = True
-    return cleared
+    left = len(keyframes)
+    undecided = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * left))
+    counts = np.zeros((2, len(undecided)), np.int32)
+    for part in keyframes.parts():
+        counts += hits_and_misses(voxels.centres[undecided], part, settings.farthest_m)
+        left -= len(part)
+        hits, most_misses = counts[0], counts[1] + left
+        may_be_free = most_misses >= settings.least_misses
+        may_be_free &= most_misses > settings.misses_per_hit * hits
+        may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * most_misses
+        undecided, counts = undecided[may_be_free], counts[:, may_be_free]
+        if not len(undecided):
+            break
+    free = np.zeros(len(voxels), np.bool_)
+    free[undecided] = True
+    return free
 
 
 def _stands_over(keys: NDArray[np.int64], under: Sequence[int]) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.dynamics.motion_state import Motion
-from gnss_sem_map.dynamics.visibility import KeyframeScans
+from gnss_sem_map.dynamics.visibility import Keyframes
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement.figures import Figures
@@ -47,7 +47,7 @@ class Evidence:
     """The points of moving objects, which were kept out of the map."""
     sensor_model: LabelCalibration | None = None
     """Where the classes were found to stand, in place of rules, and a temperature."""
-    keyframes: KeyframeScans | None = None
+    keyframes: Keyframes | None = None
     """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
 
 

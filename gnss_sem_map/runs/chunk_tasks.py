@@ -1,25 +1,13 @@
-"""Ranges of chunks of one drive as tasks: a worker opens the drive again, and maps its range into the work folder.
-
-WORK/job.json          what the worker opens, the settings, and the fingerprint that it must find
-     trajectory.npz    the trajectory itself: nothing is rounded, so the map has the same bytes
-"""
+"""Ranges of chunks of one drive as tasks: a worker opens the drive again, and maps its range into the work folder."""
 
 from __future__ import annotations
 
-import io
-import json
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.ownership import write_whole
-from gnss_sem_map.files.work_folder import JOB, TRAJECTORY
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fusion
 from gnss_sem_map.mapping.checkpoints import ChunkStore
@@ -27,12 +15,13 @@ from gnss_sem_map.mapping.dask_cluster import Cluster
 from gnss_sem_map.mapping.execution import Task, run_tasks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 
-RANGES_PER_WORKER = 2
-"""A worker reads the scans between its chunks once; shorter ranges end more evenly."""
-CHUNKS_ON_CLUSTER = 4
+RANGES_PER_WORKER, LEAST_CHUNKS = 2, 4
+"""Shorter ranges end more evenly, but each processes a window of scans before it and one after it as well."""
+CHUNKS_ON_CLUSTER = 8
 """Chunks of a range on a cluster, whose workers come and go."""
 
 
@@ -51,23 +40,24 @@ class ChunkTasks:
             Task(
                 f"{drive.log.name}, chunks {numbers.start} to {numbers.stop - 1}",
                 "gnss_sem_map.runs.chunk_tasks:map_range",
-                (str(work), numbers.start, numbers.stop),
+                (str(work), store.fingerprint, numbers.start, numbers.stop),
             )
             for numbers in fusion.ranges(pending, self._length(len(pending)))
         ]
         for task, _ in run_tasks(tasks, self.executor):
-            yield range(*task.arguments[1:])
+            yield range(*task.arguments[2:])
 
     def _length(self, chunks: int) -> int:
         """Chunks of a range."""
         if isinstance(self.executor, Cluster):
             return CHUNKS_ON_CLUSTER
-        return -(-chunks // (RANGES_PER_WORKER * self.executor.workers))
+        of_worker = math.ceil(chunks / self.executor.workers)
+        return max(math.ceil(of_worker / RANGES_PER_WORKER), min(of_worker, LEAST_CHUNKS))
 
 
-def map_range(work: str, start: int, stop: int) -> None:
+def map_range(work: str, fingerprint: str, start: int, stop: int) -> None:
     """Map the chunks of a range that are not mapped yet: a task. Raises DataError if the drive is another one here."""
-    drive, store = _read_job(Path(work))
+    drive, store = _opened(work, fingerprint)
     left = sorted(set(range(start, stop)) - store.done())
     if left:
         fusion.map_range(drive, store, range(left[0], stop))
@@ -75,41 +65,24 @@ def map_range(work: str, start: int, stop: int) -> None:
 
 def _write_job(work: Path, source: Source, drive: Drive, store: ChunkStore) -> None:
     cache = drive.segmenter.folder.resolve() if isinstance(drive.segmenter, CachedSegmenter) else None
-    about = {
-        "source": asdict(source),
-        "settings": drive.settings.model_dump(mode="json"),
-        "from_lidar_odometry": drive.from_lidar_odometry,
-        "probabilities": None if cache is None else str(cache),
-        "fingerprint": store.fingerprint,
-        "chunks": store.count,
-    }
-    arrays = {field.name: getattr(drive.trajectory, field.name) for field in fields(Trajectory)}
-    file = io.BytesIO()
-    np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
-    try:
-        write_whole(work / TRAJECTORY, file.getvalue())
-        write_whole(work / JOB, json.dumps(about).encode())
-    except OSError as error:
-        raise DataError(
-            f"{work}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
+    write_job(
+        work, source, drive.settings, drive.trajectory, store.fingerprint,
+        from_lidar_odometry=drive.from_lidar_odometry,
+        probabilities=None if cache is None else str(cache),
+        chunks=store.count,
+    )  # fmt: skip
 
 
-def _read_job(work: Path) -> tuple[Drive, ChunkStore]:
-    about: dict[str, Any] = json.loads((work / JOB).read_text("utf-8"))
-    settings, source = Settings.model_validate(about["settings"]), Source(**about["source"])
+@lru_cache(1)
+def _opened(work: str, fingerprint: str) -> tuple[Drive, ChunkStore]:
+    """The drive of a job: opened once for all tasks of a worker."""
+    about, source, settings, log, trajectory = read_job(Path(work))
     label_set = open_label_set(settings.classes)
-    log = source.open_log().in_our_conventions(settings.sensors)
     network, size = source.open_network(settings, log), log.calibration.image_size
     if about["probabilities"] and network is not None and size is not None:
         network = CachedSegmenter(network, label_set, size, Path(about["probabilities"]))
-    with np.load(work / TRAJECTORY) as arrays:
-        trajectory = Trajectory(**arrays)
     drive = Drive(log, trajectory, network, settings, from_lidar_odometry=about["from_lidar_odometry"])
-    if fusion.fingerprint(drive, source.labels_from) != about["fingerprint"]:
-        raise DataError(
-            f"{source.drive}: a worker finds another drive or other labels than the main process: files were changed,"
-            " are not the same on its machine, or a script changed the log; take one worker, or the files as they are"
-        )
-    voxel_size_m = settings.mapping.voxel_size_m
-    return drive, ChunkStore(work, about["fingerprint"], about["chunks"], voxel_size_m, label_set)
+    if not fusion.fingerprint(drive, source.labels_from) == about["fingerprint"] == fingerprint:
+        raise other_drive(source)
+    store = ChunkStore(Path(work), fingerprint, about["chunks"], settings.mapping.voxel_size_m, label_set)
+    return drive, store

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from gnss_sem_map.files import work_folder
@@ -12,14 +14,19 @@ LONGEST_TASK_S = 86_400.0
 """A worker that is busy with one drive, or a part of it, for longer is replaced."""
 
 
-def executor_of(workers: int, scheduler: str | None, work: Path) -> Processes | Cluster | None:
+@contextmanager
+def executor_of(workers: int, scheduler: str | None, work: Path) -> Iterator[Processes | Cluster | None]:
     """Processes, or the workers of the Dask scheduler at an address; None for this process.
 
     `work` is the work folder of the run. Raises ConfigError and DataError for a cluster that cannot do the tasks.
     """
-    if scheduler is None:
-        return Processes(workers, timeout_s=LONGEST_TASK_S) if workers > 1 else None
-    work_folder.make(work)
-    cluster = Cluster(scheduler, work, timeout_s=LONGEST_TASK_S)
-    cluster.check()
-    return cluster
+    if scheduler is not None:
+        work_folder.make(work)
+        cluster = Cluster(scheduler, work, timeout_s=LONGEST_TASK_S)
+        cluster.check()
+        yield cluster
+    elif workers > 1:
+        with closing(Processes(workers, timeout_s=LONGEST_TASK_S, keep=True)) as processes:
+            yield processes
+    else:
+        yield None

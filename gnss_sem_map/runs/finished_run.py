@@ -35,6 +35,7 @@ from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
+from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
@@ -78,16 +79,18 @@ def run(
         log = log or source.open_log()
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
-        executor = executor_of(workers, scheduler, claim.work)
-        elsewhere = None if executor is None else ChunkTasks(source, executor)
         with new_folder(out) as folder:
-            mapped = pipeline.run(
-                log, network, settings, folder, claim.work, progress,
-                origin=origin, resume=resume, elsewhere=elsewhere, labels_from=source.labels_from, force=force,
-            )  # fmt: skip
-            refined = pipeline.refine(
-                folder, settings, mapped.stats, progress, executor=executor, work=claim.work
-            )
+            with executor_of(workers, scheduler, claim.work) as executor:
+                match = SavedMatches(source, claim.work, executor, resume)
+                elsewhere = None if executor is None else ChunkTasks(source, executor)
+                mapped = pipeline.run(
+                    log, network, settings, folder, claim.work, progress,
+                    origin=origin, resume=resume, match=match, elsewhere=elsewhere, labels_from=source.labels_from,
+                    force=force,
+                )  # fmt: skip
+                refined = pipeline.refine(
+                    folder, settings, mapped.stats, progress, executor=executor, work=claim.work
+                )
             run_folder.write_run(folder, source, mapped, refined, settings, write_labels)
     return Run(out)
 

@@ -37,6 +37,7 @@ from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.executors import executor_of
+from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
@@ -97,9 +98,11 @@ def run_drives(
     """
     drives = [_absolute(drive) for drive in drives]
     _check_distinct([(drive.name, drive) for drive in drives])
-    with run_folder.claimed_run(out, drives) as claim:
-        frame = origin or _frame_of(drives, how.drive_format)
-        executor = executor_of(workers, scheduler, claim.work) or InProcess()
+    with (
+        run_folder.claimed_run(out, drives) as claim,
+        executor_of(workers, scheduler, claim.work) as workers_of_run,
+    ):
+        frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
         failed = _map_all(drives, claim, settings, how, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
@@ -168,7 +171,8 @@ def _map_one(source: Source, folder: Path, settings: Settings, frame: LocalFrame
         with new_folder(folder) as part:
             mapped = pipeline.run(
                 log, network, settings, part, claim.work,
-                origin=frame, resume=True, labels_from=source.labels_from, force=force,
+                origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),
+                labels_from=source.labels_from, force=force,
             )  # fmt: skip
             run_folder.write_drive(part, source, mapped, settings)
 
@@ -324,7 +328,7 @@ def _frame_of(drives: Sequence[Path], drive_format: str | None) -> LocalFrame:
     """The frame of the first drive that can be read and has one."""
     for drive in drives:
         try:
-            frame = open_drive(drive, drive_format).frame
+            frame = open_drive(drive, drive_format, with_imu=False).frame
         except (SemMapError, FactorGraphError):
             continue  # its own task says why
         if frame is not None:

@@ -44,9 +44,9 @@ class Source:
             "frames": self.frames,
         }
 
-    def open_log(self) -> SensorLog:
+    def open_log(self, with_imu: bool = True) -> SensorLog:
         """The log, with the scans of `frames`; raises DataError and ConfigError."""
-        return open_drive(self.drive, self.drive_format).between(self.frames)
+        return open_drive(self.drive, self.drive_format, with_imu).between(self.frames)
 
     def open_network(self, settings: Settings, log: SensorLog) -> Segmenter | None:
         """The segmenter for the images of this log; None for geometry only. Raises DataError and ConfigError."""

@@ -3,6 +3,9 @@
 The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP). This module adds an initial
 guess from the trajectory, a covariance that is large in degenerate directions, and a check of every match. The factor
 graph uses relative poses, because absolute positions drift. There is no loop closure.
+
+A long drive is matched in sections, which may be matched at the same time. A section begins with the last sweeps of the
+one before, for a local map to start with.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
+from itertools import pairwise
+from operator import add
 
 import numpy as np
 import small_gicp
@@ -40,6 +45,8 @@ COARSE_M, FINE_M = 0.01, 0.001
 NEIGHBOURS = 6
 # Sweeps overlap, so every other matched one is added to the local map: on simulated drives the poses drift no more.
 EVERY_NTH_IN_MAP = 2
+# So many sweeps are matched before a section, for its local map.
+WARM_UP_SCANS = 50
 
 
 class ScanMatchingSettings(BaseModel):
@@ -63,6 +70,11 @@ class ScanMatchingSettings(BaseModel):
     )
     max_correction_deg: float = Field(5.0, gt=0, description="Likewise, in rotation.")
     max_gap_s: float = Field(1.0, gt=0, description="After a longer gap a new local map is started.")
+    section_scans: int = Field(
+        600,
+        gt=0,
+        description="Sections of a long drive, of so many sweeps, are matched each with its own local map.",
+    )
     steps: tuple[int, ...] = Field((1, 10), min_length=1, description="Relative poses over so many sweeps.")
     # Halves of the sweeps of a real drive (KITTI 0005), matched separately, show the true noise of a match: 2 to 7 mm
     # and 0.2 to 0.5 mrad over a second, several times the value that follows from the number of points.
@@ -97,6 +109,12 @@ class ScanMatches:
     counts: Counter[str]
     """"scans matched", "scans not matched", "scans with an open direction", "local maps"."""
 
+    def __add__(self, later: ScanMatches) -> ScanMatches:
+        """Of two sections."""
+        return ScanMatches(
+            self.relative_poses + later.relative_poses, self.skips + later.skips, self.counts + later.counts
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class _Match:
@@ -125,14 +143,36 @@ def match_scans(
     cannot be read or matched are left out and reported in `skips`.
     """
     settings = settings or ScanMatchingSettings()
+    sections = sections_of(len(log.scans), settings)
+    return reduce(add, (match_section(log, trajectory, settings, part, progress) for part in sections))
+
+
+def sections_of(count: int, settings: ScanMatchingSettings) -> list[range]:
+    """The sections of a drive of so many sweeps; the last one has up to twice as many."""
+    edges = [*range(0, max(count - settings.section_scans, 0) + 1, settings.section_scans), count]
+    return [range(start, end) for start, end in pairwise(edges)]
+
+
+def match_section(
+    log: SensorLog,
+    trajectory: Trajectory,
+    settings: ScanMatchingSettings,
+    section: range,
+    progress: Progress = silent,
+) -> ScanMatches:
+    """Relative poses of the sweeps of a section to earlier ones; see `match_scans`."""
     odometry = _Odometry(settings)
     matches: list[_Match] = []
-    skips = []
+    skips: list[Skip] = []
+    first = max(section.start - WARM_UP_SCANS, 0)
+    before = 0  # matches of the section before
     # the next sweeps are read, downsampled and deskewed on a second core while one is matched
     prepare = partial(
         _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
     )
-    for done, (scan, sweep) in enumerate(prefetch(prepare, log.scans), 1):
+    for number, (scan, sweep) in enumerate(prefetch(prepare, log.scans[first : section.stop]), first):
+        if number == section.start:
+            before, skips = len(matches), []
         try:
             if isinstance(sweep, Skip):
                 skips.append(sweep)
@@ -140,16 +180,16 @@ def match_scans(
                 matches.append(odometry.match(scan, sweep))
         except _NoMatch as error:
             skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
-        progress("scan matching", done, len(log.scans))
+        progress("scan matching", number + 1, len(log.scans))
     counts = Counter(
         {
-            "scans matched": len(matches),
+            "scans matched": len(matches) - before,
             "scans not matched": len(skips),
-            "scans with an open direction": sum(match.is_open for match in matches),
+            "scans with an open direction": sum(match.is_open for match in matches[before:]),
             "local maps": odometry.local_maps,
         }
     )
-    pairs = [pair for step in settings.steps for pair in _pairs(matches, step)]
+    pairs = [pair for step in settings.steps for pair in _pairs(matches, step, before)]
     return ScanMatches(_relative_poses(pairs, log.calibration.T_imu_lidar, settings), tuple(skips), counts)
 
 
@@ -265,13 +305,14 @@ def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> Non
         )
 
 
-def _pairs(matches: list[_Match], step: int) -> Iterator[tuple[_Match, _Match]]:
+def _pairs(matches: list[_Match], step: int, before: int = 0) -> Iterator[tuple[_Match, _Match]]:
     """Pairs of matched sweeps of one local map, `step` apart (sweeps without a match are not counted).
 
+    The later one is not among the first ones, the matches `before` this section.
     For `step` > 1, pairs with a degenerate match in between are left out: there the local map itself may have moved.
     """
     slips = np.cumsum([0, *(match.is_open for match in matches)])
-    for i in range(len(matches) - step):
+    for i in range(max(before - step, 0), len(matches) - step):
         earlier, later = matches[i], matches[i + step]
         if earlier.local_map == later.local_map and (step == 1 or slips[i] == slips[i + step + 1]):
             yield earlier, later

@@ -92,9 +92,14 @@ class Image:
 
 
 def file_of(item: Scan | Image) -> Path | None:
-    """The file that a scan or an image is read from: the first argument of its `read`; None where there is none."""
-    first = item.read.args[:1] if isinstance(item.read, partial) else ()
-    return next((path for path in first if isinstance(path, Path)), None)
+    """The file that a scan or an image is read from; None where there is none.
+
+    The first argument of its `read`, or what this one is read from: a scan that is kept when it is read.
+    """
+    first = item.read.args[0] if isinstance(item.read, partial) and item.read.args else None
+    if isinstance(first, Scan | Image):
+        return file_of(first)
+    return first if isinstance(first, Path) else None
 
 
 @dataclass(frozen=True, eq=False)

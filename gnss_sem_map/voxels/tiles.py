@@ -29,7 +29,7 @@ from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 Z_ORDER_BITS = AXIS_BITS - TILE_BITS
-TILES_HELD = 16
+TILES_HELD = 6
 """Tiles of a map in memory at a time: each is read again with its neighbours."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def stop(
         return faults, outcome
     faults += ["a result"] * (folder / "out").exists()
     beside = {path.name for path in folder.iterdir()} - {"trial"}
-    kept = any(name.endswith("record.json") for name in content(folder / ".out.work"))
+    kept = any(re.search(r"record\.json$|^matches/\d+\.npz$", name) for name in content(folder / ".out.work"))
     faults += [f"left {beside}"] * (beside != ({".out.work"} if kept else set()))
     faults += ["does not name --resume"] * (kept and "--resume" not in outcome.err)
     faults += ["names --resume, but nothing is kept"] * (not kept and "--resume" in outcome.err)

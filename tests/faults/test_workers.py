@@ -56,8 +56,8 @@ def test_a_script_without_a_guard_gets_an_error_and_does_not_hang(small_drive, t
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         trial("workers", ["hang"])
-    last = err.splitlines()[-1]
-    faults = ["not explained"] * ("a worker process died" not in last or "__main__" not in last)
+    told = next((line for line in err.splitlines() if "given up after" in line), "")
+    faults = ["not explained"] * ("a worker process died" not in told or "__main__" not in told)
     trial("workers", [*faults, *["orphans"] * (not wait_until(lambda: not group(process.pid)))], err)
 
 

@@ -52,7 +52,7 @@ def source(small_drive: Street) -> Source:
 @pytest.fixture(scope="module")
 def drive(source: Source) -> Drive:
     """In six chunks, with poses that quaternions would round."""
-    log, settings = open_drive(source.drive), Settings.model_validate({"dynamics": {"window_scans": 1}})
+    log, settings = open_drive(source.drive), Settings.model_validate({"dynamics": {"window_scans": 2}})
     assert log.reference is not None
     return Drive(log, log.reference, source.open_network(settings, log), settings)
 
@@ -112,11 +112,11 @@ def test_a_task_that_is_called_again_goes_on_where_it_stopped(
     first, last = (work / "0/record.json").stat(), work / "2/record.json"
     for name in ("1", "2"):
         (work / name).rename(tmp_path / name)
-    map_range(str(work), 0, 3)
+    map_range(str(work), store.fingerprint, 0, 3)
     assert files_of(store) == expected
     assert (work / "0/record.json").stat() == first
     before = last.stat()
-    map_range(str(work), 0, 3)
+    map_range(str(work), store.fingerprint, 0, 3)
     assert last.stat() == before
 
 

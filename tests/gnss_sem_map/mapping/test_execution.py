@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,23 @@ def test_a_container_has_the_memory_that_it_may_use(monkeypatch: pytest.MonkeyPa
     for text, expected in (("1000000\n", 1000000), ("max\n", machine), ("", machine)):
         limit.write_text(text)
         assert machine_memory_bytes() == expected
+
+
+@integration
+def test_workers_that_are_kept_do_the_next_tasks_too(tmp_path: Path) -> None:
+    with closing(processes(2, keep=True)) as kept:
+        asked = [task("process_and_threads", str(tmp_path)) for _ in range(4)]
+        first, second = ({pid for pid, *_ in run_and_list(asked, kept)} for _ in range(2))
+        assert second <= first
+        os.kill(min(first), signal.SIGKILL)
+        assert not {pid for pid, *_ in run_and_list(asked, kept)} & {min(first)}  # nothing was lost with it
+        last = {worker._process.pid for worker in kept._idle}
+        assert last
+    assert not any(map(is_alive, last))
+
+
+def run_and_list(tasks: Sequence[Task], executor: Executor) -> list[Any]:
+    return [result for _, result in run_tasks(tasks, executor)]
 
 
 @integration

@@ -85,6 +85,19 @@ def test_too_few_witnesses_clear_nothing_and_nothing_low_is_cleared(monkeypatch:
     assert not cleared(voxels).any()
 
 
+@pytest.mark.parametrize("scans_per_part", [1, 3, 1000])
+def test_it_does_not_matter_how_many_witnesses_are_asked_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, scans_per_part: int
+) -> None:
+    """Voxels that cannot become free are asked about no longer: the rest is decided by all scans."""
+    voxels = street_map(GHOST)
+    at_once = cleared(voxels)
+    monkeypatch.setattr(visibility, "SCANS_PER_PART", scans_per_part)
+    np.testing.assert_array_equal(cleared(voxels), at_once)
+    assert at_once.any()
+    assert not at_once.all()
+
+
 @pytest.mark.parametrize("reach_m", [10.0, 40.0])
 def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> None:
     """In a drive of kilometres most scans are far from a place: leaving them out changes nothing."""
@@ -95,7 +108,7 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     )
     places = rng.uniform([0, -8, 0], [2000, 8, 3], (POINTS_PER_BLOCK + 5000, 3))
     places = places[np.argsort(places[:, 0])]
-    assert len(witnesses.near(places[:1000], reach_m).images) < len(far) / 5
+    assert visibility.are_near(witnesses.T_lidar_map, places[:1000], reach_m).sum() < len(far) / 5
     looks = visibility.hits_and_misses(places, witnesses, reach_m)
     hits, misses = np.zeros((2, len(places)), np.int32)
     range_images.count_hits_and_misses(

@@ -17,6 +17,7 @@ from factor_graphs.accuracy import anees_band, nees
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans import lidar_odometry
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, ScanMatchingSettings, match_scans
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
@@ -358,3 +359,27 @@ def half_of(log: SensorLog, which: int) -> SensorLog:
         return points[np.arange(len(points.xyz)) // 2000 % 2 == which]
 
     return replace(log, scans=tuple(replace(s, read=partial(read, s)) for s in log.scans))
+
+
+@pytest.mark.parametrize("section_scans", [5, 8, 16])
+def test_sections_bind_every_sweep_as_closely_as_the_whole_drive(
+    section_scans: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each pair of sweeps is bound once, whichever sections they are in."""
+    monkeypatch.setattr(lidar_odometry, "WARM_UP_SCANS", 11)
+    log, truth = street()
+    found = match_scans(log, truth, ScanMatchingSettings(section_scans=section_scans))
+    whole, parts = (sorted(map(tuple, one.relative_poses.stamps)) for one in (matched(), found))
+    assert parts == whole
+    assert found.counts["scans matched"] == matched().counts["scans matched"]
+    off, of_whole = (errors(one.relative_poses, truth) for one in (found, matched()))
+    assert np.abs(off).max() < 1.5 * np.abs(of_whole).max()
+
+
+def test_a_sweep_before_a_section_is_reported_once() -> None:
+    log, truth = street()
+    few = Points(np.ones((3, 3), np.float32), np.zeros(3, np.float32), None)
+    found = match_scans(with_scan(log, 7, few), truth, ScanMatchingSettings(section_scans=8))
+    assert [skip.where for skip in found.skips] == ["frame 7"]
+    assert found.counts["scans not matched"] == 1
+    assert found.counts["scans matched"] == SWEEPS - 1

@@ -1,0 +1,171 @@
+"""LiDAR odometry of a run: sections are saved in the work folder, and may be matched by several workers.
+
+WORK/matches/job.json, trajectory.npz    the drive, for the workers (`runs.drive_job`)
+             N.npz, N.json               relative poses of section N; its counts and skips, and the checksum of N.npz
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache, reduce
+from operator import add
+from pathlib import Path
+
+import numpy as np
+
+from factor_graphs.relative_poses import RelativePoses
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files import work_folder
+from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.work_folder import MATCHES
+from gnss_sem_map.mapping.dask_cluster import Cluster
+from gnss_sem_map.mapping.execution import Task, run_tasks
+from gnss_sem_map.mapping.fusion import state_of
+from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
+from gnss_sem_map.runs.source import Source
+from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of
+from gnss_sem_map.sensor_log import SensorLog, Skip
+
+
+@dataclass(frozen=True)
+class SavedMatches:
+    """Matches the sections of a drive, here or on the workers of an executor; see `mapping.trajectory.locate`.
+
+    With `resume`, the sections of an interrupted run are taken.
+    """
+
+    source: Source
+    work: Path
+    executor: Processes | Cluster | None = None
+    resume: bool = False
+
+    def __call__(
+        self, log: SensorLog, trajectory: Trajectory, settings: Settings, progress: Progress
+    ) -> ScanMatches:
+        """Relative poses from all sweeps, as `match_scans` finds them; raises DataError."""
+        sections = sections_of(len(log.scans), settings.trajectory.scan_matching)
+        fingerprint = fingerprint_of(log, trajectory, settings)
+        work_folder.make(self.work)
+        if not self.resume:
+            work_folder.remove_matches(self.work)
+        folder = (self.work / MATCHES).resolve()
+        folder.mkdir(exist_ok=True)
+        pending = [n for n in range(len(sections)) if _read(folder, n, fingerprint) is None]
+        done = len(log.scans) - sum(len(sections[n]) for n in pending)  # of an interrupted run
+        for n in self._matched(log, trajectory, settings, pending, folder, fingerprint, progress):
+            done += len(sections[n])
+            progress("scan matching", done, len(log.scans))
+        return reduce(add, self._all(folder, len(sections), fingerprint))
+
+    def _matched(
+        self,
+        log: SensorLog,
+        trajectory: Trajectory,
+        settings: Settings,
+        pending: list[int],
+        folder: Path,
+        fingerprint: str,
+        progress: Progress,
+    ) -> Iterator[int]:
+        """Match sections, and yield the number of each when it is saved."""
+        if self.executor is None or len(pending) < 2:
+            for n in pending:
+                _save(_match(log, trajectory, settings, n, progress), folder, n, fingerprint)
+                yield n
+            return
+        write_job(folder, self.source, settings, trajectory, fingerprint)
+        function = f"{match_one.__module__}:{match_one.__name__}"
+        tasks = [
+            Task(f"{log.name}, section {n} of its scans", function, (str(folder), fingerprint, n))
+            for n in pending
+        ]
+        for task, _ in run_tasks(tasks, self.executor):
+            yield task.arguments[-1]
+
+    def _all(self, folder: Path, count: int, fingerprint: str) -> Iterator[ScanMatches]:
+        for n in range(count):
+            found = _read(folder, n, fingerprint)
+            if found is None:
+                raise DataError(
+                    f"{folder}: section {n} of the scans that was matched is not there, or damaged; do all workers see"
+                    " this folder?"
+                )
+            yield found
+
+
+def match_one(folder: str, fingerprint: str, number: int) -> None:
+    """Match one section, and save it: a task. Raises DataError if the drive is another one here."""
+    if _read(Path(folder), number, fingerprint) is None:
+        log, trajectory, settings = _opened(folder, fingerprint)
+        _save(_match(log, trajectory, settings, number), Path(folder), number, fingerprint)
+
+
+def _match(
+    log: SensorLog, trajectory: Trajectory, settings: Settings, number: int, progress: Progress = silent
+) -> ScanMatches:
+    matching = settings.trajectory.scan_matching
+    section = sections_of(len(log.scans), matching)[number]
+    return match_section(log, trajectory, matching, section, progress)
+
+
+@lru_cache(1)
+def _opened(folder: str, fingerprint: str) -> tuple[SensorLog, Trajectory, Settings]:
+    """The drive of a job: opened once for all tasks of a worker."""
+    _, source, settings, log, trajectory = read_job(Path(folder))
+    if fingerprint_of(log, trajectory, settings) != fingerprint:
+        raise other_drive(source)
+    return log, trajectory, settings
+
+
+def fingerprint_of(log: SensorLog, trajectory: Trajectory, settings: Settings) -> str:
+    """Digest of everything that decides the matches."""
+    said = [
+        log.name, settings.trajectory.scan_matching.model_dump_json(),
+        [(scan.name, scan.number, scan.stamp, state_of(scan)) for scan in log.scans],
+    ]  # fmt: skip
+    digest = hashlib.sha256(repr(said).encode())
+    for array in (trajectory.stamps, trajectory.T_map_imu, log.calibration.T_imu_lidar):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> None:
+    file, poses = io.BytesIO(), found.relative_poses
+    np.savez(file, **{field.name: getattr(poses, field.name) for field in fields(RelativePoses)})
+    about = {
+        "fingerprint": fingerprint,
+        "sha256": hashlib.sha256(file.getvalue()).hexdigest(),
+        "counts": dict(found.counts),
+        "skips": [asdict(skip) for skip in found.skips],
+    }
+    try:
+        write_whole(folder / f"{number}.npz", file.getvalue())
+        write_whole(folder / f"{number}.json", json.dumps(about).encode())
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+        ) from None
+
+
+def _read(folder: Path, number: int, fingerprint: str) -> ScanMatches | None:
+    """A section that was saved; None where there is none of this run, or it is damaged."""
+    try:
+        about = json.loads((folder / f"{number}.json").read_text("utf-8"))
+        content = (folder / f"{number}.npz").read_bytes()
+    except (OSError, ValueError):
+        return None
+    if about["fingerprint"] != fingerprint or about["sha256"] != hashlib.sha256(content).hexdigest():
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        poses = RelativePoses(**arrays)
+    skips = tuple(Skip(**skip) for skip in about["skips"])
+    return ScanMatches(poses, skips, Counter(about["counts"]))

@@ -15,8 +15,8 @@ ALLOWANCE_M = 50.0
 BELIEVED_RUNS = 20
 # Who reports positions more often than this, s, reports what a filter makes of them.
 DRIFTING_BELOW_S = 0.5
-# So many fixes in one correlation time tell all that more of them would.
-FIXES_PER_CORRELATION_TIME = 20
+# So many fixes in one correlation time tell all that more of them would; of one second, ten with uneven stamps are kept.
+FIXES_PER_CORRELATION_TIME = 12
 
 
 def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:

@@ -16,7 +16,7 @@ from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
 def by_chunks(drive: Drive, window_scans: int) -> Drive:
-    """The drive, in chunks of so many scans."""
+    """The drive, with two windows of so many scans in a chunk."""
     dynamics = drive.settings.dynamics.model_copy(update={"window_scans": window_scans})
     return replace(drive, settings=drive.settings.model_copy(update={"dynamics": dynamics}))
 

@@ -52,7 +52,7 @@ def source(small_drive: Street) -> Source:
 @pytest.fixture(scope="module")
 def drive(source: Source) -> Drive:
     """In six chunks, with poses that quaternions would round."""
-    log, settings = open_drive(source.drive), Settings.model_validate({"dynamics": {"window_scans": 2}})
+    log, settings = open_drive(source.drive), Settings.model_validate({"dynamics": {"window_scans": 1}})
     assert log.reference is not None
     return Drive(log, log.reference, source.open_network(settings, log), settings)
 

@@ -38,8 +38,8 @@ def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None
 
 
 KILLED = 137
-LIVE = ("--set", "dynamics.window_scans=4", "--write-labels")
-SMALL = ("--set", "dynamics.window_scans=2")
+LIVE = ("--set", "dynamics.window_scans=2", "--write-labels")
+SMALL = ("--set", "dynamics.window_scans=1")
 """Two scans in a chunk."""
 COMMAND = """
 import os, re, sys

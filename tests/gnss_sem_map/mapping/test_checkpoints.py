@@ -46,7 +46,7 @@ def test_chunks_give_the_same_map_and_stats(
 ) -> None:
     stats = RunStats()
     store = map_scans(by_chunks(drive, window), tmp_path / "work", stats)
-    assert store.count == {1: 12, 2: 6, 100: 1}[window]
+    assert store.count == {1: 6, 2: 3, 100: 1}[window]
     assert_same_as(at_once, store, stats)
 
 

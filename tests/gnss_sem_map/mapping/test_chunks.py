@@ -23,7 +23,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
-SWEEPS, WINDOW = 20, 6
+SWEEPS, WINDOW = 20, 3
 DAMAGED = 6
 """The first scan of the second chunk: it is in the window of the first."""
 CARS = [  # one ahead, one that comes towards us, and one that overtakes
@@ -72,13 +72,13 @@ def told(chunk: MappedChunk) -> Iterator[tuple[str, object]]:
     yield "skips", chunk.stats.skips
 
 
-def test_every_chunk_but_the_last_has_a_window_of_scans_and_one_after_it(moving: Drive) -> None:
+def test_every_chunk_but_the_last_has_two_windows_of_scans_and_one_after_it(moving: Drive) -> None:
     for count in range(1, SWEEPS + 1):
         scans = moving.log.scans[:count]
         chunks = chunks_of(replace(moving, log=replace(moving.log, scans=scans)))
         assert [scan for chunk in chunks for scan in chunk] == list(scans)
-        assert all(len(chunk) == WINDOW for chunk in chunks[:-1])
-        assert len(chunks) == 1 or WINDOW <= len(chunks[-1]) < 2 * WINDOW
+        assert all(len(chunk) == 2 * WINDOW for chunk in chunks[:-1])
+        assert len(chunks) == 1 or WINDOW <= len(chunks[-1]) < 3 * WINDOW
 
 
 @pytest.mark.parametrize("ranges", [[range(1), range(1, 2), range(2, 3)], [range(2), range(2, 3)]])
@@ -111,7 +111,7 @@ def counting(drive: Drive, reads: Counter[int]) -> Drive:
 
 @pytest.mark.parametrize(
     ("numbers", "first", "last"),
-    [(range(3), 0, 20), (range(1), 0, 12), (range(1, 2), 0, 18), (range(2, 3), 6, 20)],
+    [(range(3), 0, 20), (range(1), 0, 9), (range(1, 2), 3, 15), (range(2, 3), 9, 20)],
 )
 def test_a_range_of_chunks_reads_its_scans_and_a_window_on_either_side_once(
     moving: Drive, numbers: range, first: int, last: int, tmp_path: Path

@@ -15,7 +15,7 @@ ALLOWANCE_M = 50.0
 BELIEVED_RUNS = 20
 # Who reports positions more often than this, s, reports what a filter makes of them.
 DRIFTING_BELOW_S = 0.5
-# So many fixes in one correlation time tell all that more of them would; of one second, ten with uneven stamps are kept.
+# So many fixes of one correlation time tell all; of a second, that is ten with uneven stamps.
 FIXES_PER_CORRELATION_TIME = 12
 
 

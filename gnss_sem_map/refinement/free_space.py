@@ -60,8 +60,8 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     """Which voxels (v,) are free space, by the rays through their centres.
 
     Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
-    because grazing rays traverse them. A voxel is looked at until even misses in all the scans left would not make it
-    free: so most static ones are decided by a part of the scans.
+    because grazing rays traverse them. Scans are read part by part. A voxel is asked about no longer once even misses
+    in all the scans left would not make it free.
     """
     stands = _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M])
     left = len(keyframes)

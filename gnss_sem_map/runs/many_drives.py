@@ -217,7 +217,7 @@ def _map_all(
         )
         tasks.append(Task(drive.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
     found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
-    return {task.name: reason for task, reason in found if reason}
+    return {task.name: reason.removeprefix(f"{task.name}: ") for task, reason in found if reason}
 
 
 def _write(

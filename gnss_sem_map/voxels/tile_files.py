@@ -30,6 +30,8 @@ HITS_REMOVED = "hits_removed"
 """Column of maps in which objects moved through static voxels."""
 HEIGHTS = "heights"
 """Column of maps that know how high the surface in a voxel lies."""
+PACKING = 4
+"""Level of compression: 2 % smaller than with 1, in a third more time (0.05 s of a drive of 30 s)."""
 Tile = tuple[int, int]
 
 
@@ -117,7 +119,8 @@ def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
     whole = [name for name in columns if name != "confidence"]
     sink = pa.BufferOutputStream()
     pq.write_table(
-        pa.table(columns), sink, compression="zstd", use_dictionary=False, write_statistics=False,
+        pa.table(columns), sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
+        write_statistics=False, store_schema=False,
         column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED")
         | {name: "BYTE_STREAM_SPLIT" for name in columns if name == "confidence"},
     )  # fmt: skip

@@ -45,6 +45,8 @@ finally:
     print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
 """
 Figures = dict[str, Any]
+TILED = ("trajectory", "mapping", "refinement")
+"""Stages that workers share: sections, chunks and tiles."""
 DASK = Path(sys.executable).with_name("dask")
 
 
@@ -215,10 +217,10 @@ def stages(drives: Drives, out: Path) -> Figures:
             f"real_time_factor_{count}": 480 / figures["wall_s"],
             f"seconds_by_stage_{count}": seconds,
         }
-    for stage in ("trajectory", "mapping", "refinement"):
-        found[f"two_over_one_{stage}"] = (
-            found["seconds_by_stage_1"][stage] / found["seconds_by_stage_2"][stage]
-        )
+    one, two = (found[f"seconds_by_stage_{count}"] for count in (1, 2))
+    for stage in TILED:
+        found[f"two_over_one_{stage}"] = one[stage] / two[stage]
+    found["two_over_one"] = sum(map(one.get, TILED)) / sum(map(two.get, TILED))
     return found | {"same_bytes": checksums(out / "1") == checksums(out / "2")}
 
 

@@ -40,6 +40,8 @@ def constants(measured: dict[str, Any]) -> dict[str, float]:
         "CPU per scan, ms": memory["cpu_ms_per_scan_480_s"],
         "of it trajectory and mapping, ms": of_drive * memory["cpu_ms_per_scan_480_s"],
         "refinement and exports, µs per voxel": 1e6 * (1 - of_drive) * cpu_s / long["voxels"],
+        "speed over real time, one process": measured["stages"]["real_time_factor_1"],
+        "the same, two processes": measured["stages"]["real_time_factor_2"],
         "reads of a scan": measured["reads"]["reads_of_a_scan_mean"],
         "voxels per km of street": long["voxels"] / long["km"],
         "tiles per km of street": long["tiles"] / long["km"],

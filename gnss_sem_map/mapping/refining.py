@@ -223,14 +223,15 @@ def measure_tiles(
     run: str, settings: str, call: str, made_in: str, of_tiles: list[tuple[int, int, str]]
 ) -> list[dict[str, int]]:
     """Sums of tiles, saved with the digest of what is around each: a task."""
-    inputs, found = _inputs(run, settings, call), []
-    for x, y, around in of_tiles:
-        release_memory()  # of the last tile
-        voxels, _ = inputs.raw.around((x, y), inputs.sums_halo)
-        sums = sums_of((x, y), voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
-        write_record({"around": around, "sums": sums}, _sums_file((x, y), Path(made_in)))
-        found.append(sums)
-    return found
+    inputs = _inputs(run, settings, call)
+    return [_measure((x, y), inputs, around, Path(made_in)) for x, y, around in of_tiles]
+
+
+def _measure(tile: Tile, inputs: _Inputs, around: str, made_in: Path) -> dict[str, int]:
+    voxels, _ = inputs.raw.around(tile, inputs.sums_halo)
+    sums = sums_of(tile, voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
+    write_record({"around": around, "sums": sums}, _sums_file(tile, made_in))
+    return sums
 
 
 def refine_tiles(
@@ -244,16 +245,20 @@ def refine_tiles(
     """Refine tiles, and save each with what `map.json` is to say of it and its report: a task."""
     inputs = _inputs(run, settings, call)
     for x, y, about in of_tiles:
-        release_memory()  # of the last tile: a large one leaves 300 MB in pieces
-        voxels, moved = inputs.raw.around((x, y), inputs.halo)
-        beside = inputs.beside((x, y), voxels, moved)
-        state, report = refine_tile((x, y), voxels, beside, inputs.steps, Figures(**figures))
-        about["said"]["report"] = report.to_json()
-        assert state.decided is not None
-        # heights are in the raw map: here they would take a sixth of the bytes
-        voxels_only = replace(state.decided.voxels, heights=None)
-        save((x, y), replace(state.decided, voxels=voxels_only), about, _packed(state.kerbs), Path(made_in))
+        _refine((x, y), inputs, Figures(**figures), about, Path(made_in))
+        release_memory()  # a large tile leaves 300 MB in pieces
     return [None] * len(of_tiles)
+
+
+def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
+    voxels, moved = inputs.raw.around(tile, inputs.halo)
+    beside = inputs.beside(tile, voxels, moved)
+    state, report = refine_tile(tile, voxels, beside, inputs.steps, figures)
+    about["said"]["report"] = report.to_json()
+    assert state.decided is not None
+    # heights are in the raw map: here they would take a sixth of the bytes
+    voxels_only = replace(state.decided.voxels, heights=None)
+    save(tile, replace(state.decided, voxels=voxels_only), about, _packed(state.kerbs), made_in)
 
 
 MEASURE_TILES, REFINE_TILES = (f"{f.__module__}:{f.__name__}" for f in (measure_tiles, refine_tiles))

@@ -67,6 +67,8 @@ def write_tiles(
                 content = tile_files.encode(piece)
                 (beside / name).write_bytes(content)
                 files[name] = tile_files.describe(piece, content)
+                del content
+            del piece  # before the next one is made
         about = describe(voxel_size_m, label_set, frame, dict(sorted(files.items())))
         (beside / MAP_JSON).write_text(json.dumps(about, indent=1) + "\n", "utf-8")
         beside.rename(folder)

@@ -45,6 +45,14 @@ finally:
     print("READS", json.dumps(sorted(counts.values())), file=sys.stderr)
 """
 Figures = dict[str, Any]
+DASK_SETTINGS = {
+    "GNSS_SEM_MAP_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "1",
+    "MALLOC_TRIM_THRESHOLD_": f"{128 << 20}",
+    "MALLOC_MMAP_THRESHOLD_": f"{32 << 20}",
+}
+"""Environment of the workers."""
 TILED = ("trajectory", "mapping", "refinement")
 """Stages that workers share: sections, chunks and tiles."""
 DASK = Path(sys.executable).with_name("dask")
@@ -262,15 +270,18 @@ def twenty(drives: Drives, out: Path) -> Figures:
 
 @contextmanager
 def _dask(count: int) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
-    """A scheduler and workers, each in a process of its own with one thread."""
+    """A scheduler and workers, each in a process of its own with one thread, set as docs/cluster.md advises."""
     address = "tcp://127.0.0.1:8786"
     words = (
         ["scheduler", "--port", "8786", "--no-dashboard"],
         *[["worker", address, "--nthreads", "1", "--no-dashboard"]] * count,
     )
     quiet = subprocess.DEVNULL
+    environment = os.environ | DASK_SETTINGS
     processes = [
-        subprocess.Popen([DASK, *each], stdout=quiet, stderr=quiet, text=True, start_new_session=True)
+        subprocess.Popen(
+            [DASK, *each], stdout=quiet, stderr=quiet, text=True, start_new_session=True, env=environment
+        )
         for each in words
     ]
     try:

@@ -37,6 +37,7 @@ from gnss_sem_map.mapping.trajectory import (
     in_frame,
     locate,
 )
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.segmentation import Segmenter
@@ -163,6 +164,7 @@ def map_drive(
             elsewhere=elsewhere,
             labels_from=labels_from,
         )
+        release_memory()  # of the chunks
         write_raw(store, folder, drive.log.frame)
     if stats.counts["points"] - stats.counts["points left out"] == stats.counts["points of moving objects"]:
         stats.warnings.append("all points were removed as moving: the pictures show the removed points")

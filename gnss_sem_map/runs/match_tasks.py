@@ -25,10 +25,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.work_folder import MATCHES
-from gnss_sem_map.mapping.dask_cluster import Cluster
-from gnss_sem_map.mapping.execution import Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.mapping.fusion import state_of
-from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
@@ -45,7 +43,7 @@ class SavedMatches:
 
     source: Source
     work: Path
-    executor: Processes | Cluster | None = None
+    executor: Executor | None = None
     resume: bool = False
 
     def __call__(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import clear
-from gnss_sem_map.mapping.execution import InProcess
+from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import silent
 from gnss_sem_map.runs import match_tasks
@@ -62,7 +61,12 @@ def assert_same(found: ScanMatches, expected: ScanMatches) -> None:
 
 @pytest.mark.parametrize("executor", [None, InProcess()])
 def test_what_is_saved_comes_back(
-    log: SensorLog, guess: Trajectory, expected: ScanMatches, source: Source, tmp_path: Path, executor: Any
+    log: SensorLog,
+    guess: Trajectory,
+    expected: ScanMatches,
+    source: Source,
+    tmp_path: Path,
+    executor: Executor | None,
 ) -> None:
     assert_same(SavedMatches(source, tmp_path / "w", executor)(log, guess, SETTINGS, silent), expected)
     clear(tmp_path / "w")
@@ -86,7 +90,12 @@ def test_an_interrupted_run_matches_only_what_is_missing_or_damaged(
     (tmp_path / "matches/1.npz").write_bytes(damage)
     matched: list[int] = []
     save = match_tasks._save
-    monkeypatch.setattr(match_tasks, "_save", lambda *a: matched.append(a[2]) or save(*a))  # type: ignore[func-returns-value]
+
+    def noted(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> None:
+        matched.append(number)
+        save(found, folder, number, fingerprint)
+
+    monkeypatch.setattr(match_tasks, "_save", noted)
     assert_same(match(log, guess, SETTINGS, silent), expected)
     assert matched == [1]
     matched.clear()
@@ -111,4 +120,4 @@ def test_a_worker_that_finds_another_drive_says_so(
 ) -> None:
     shorter = replace(log, scans=log.scans[:-1])
     with pytest.raises(DataError, match="a worker finds another drive"):
-        SavedMatches(source, tmp_path, InProcess())(shorter, guess, SETTINGS, silent)  # type: ignore[arg-type]
+        SavedMatches(source, tmp_path, InProcess())(shorter, guess, SETTINGS, silent)

@@ -22,7 +22,7 @@ from factor_graphs.graph import (
 from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import correlation_times, decorrelate, inside, plausible, telling
+from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
@@ -56,8 +56,8 @@ RELATIVE_LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
 class Problem:
     """Measurements ready for the graph, keyframes, first guess.
 
-    `usable` (m,) says which of the fixes given are possible, `used` (m,) and `relative_used` (r,) which of them and of
-    the relative poses take part; `at` and `relative_at` (k, 2) are the keyframes of those that do.
+    `used` (m,) and `relative_used` (r,) say which of the fixes and relative poses given take part; `at` and
+    `relative_at` (k, 2) are the keyframes of those that do.
     """
 
     settings: SmootherSettings
@@ -65,7 +65,6 @@ class Problem:
     p_imu_antenna: Array
     intervals: ImuIntervals
     noise: ImuNoise
-    usable: NDArray[np.bool_]
     used: NDArray[np.bool_]
     fixes: GnssFixes
     at: NDArray[np.intp]
@@ -108,13 +107,11 @@ def pose_problem(
     relative: RelativePoses = NO_RELATIVE_POSES,
 ) -> Problem:
     """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
-    usable, notes = _usable(fixes, imu, settings.max_speed_mps)
+    used, notes = _usable(fixes, imu, settings.max_speed_mps)
     relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
     relative = relative[relative_used]
-    correlation_times_s = correlation_times(fixes[usable], settings, relative.stamps)
-    told, used = telling(fixes[usable], correlation_times_s), usable.copy()
-    used[usable] = told
-    kept = decorrelate(fixes[used], correlation_times_s[told], settings.min_fix_stddev_m)
+    correlation_times_s = correlation_times(fixes[used], settings, relative.stamps)
+    kept = decorrelate(fixes[used], correlation_times_s, settings.min_fix_stddev_m)
     marks = np.concatenate([kept.stamps, relative.stamps.ravel()])
     intervals = split(imu, marks, settings.keyframe_interval_s)
     if intervals.blind.any():
@@ -130,7 +127,6 @@ def pose_problem(
         p_imu_antenna=p_imu_antenna,
         intervals=intervals,
         noise=noise,
-        usable=usable,
         used=used,
         fixes=kept,
         at=intervals.keyframe_of(kept.stamps),
@@ -209,15 +205,14 @@ def optimise(
         values=values,
         iterations=iterations,
         squares=squares,
-        weights=weights_of(kernel, squares),
+        weights=_weights(kernel, squares),
         relative_squares=relative_squares,
-        relative_weights=weights_of(relative_kernel, relative_squares),
+        relative_weights=_weights(relative_kernel, relative_squares),
         chi2_per_dof=_chi2_per_dof(2 * motion.error(values), squares, relative_squares),
     )
 
 
-def weights_of(kernel: gtsam.noiseModel.mEstimator.Base | None, squares: Array) -> Array:
-    """What a loss leaves of the weight of measurements with these squared whitened residuals (m,), from 0 to 1."""
+def _weights(kernel: gtsam.noiseModel.mEstimator.Base | None, squares: Array) -> Array:
     return np.array([1.0 if kernel is None else kernel.weight(r) for r in np.sqrt(squares)])  # type: ignore[attr-defined]
 
 

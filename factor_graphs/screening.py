@@ -15,8 +15,6 @@ ALLOWANCE_M = 50.0
 BELIEVED_RUNS = 20
 # Who reports positions more often than this, s, reports what a filter makes of them.
 DRIFTING_BELOW_S = 0.5
-# So many fixes of one correlation time tell all; of a second, that is ten with uneven stamps.
-FIXES_PER_CORRELATION_TIME = 12
 
 
 def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
@@ -71,20 +69,6 @@ def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_sta
         drift = max(settings.fix_correlation_time_s, settings.drift_correlation_time_s)
         times[begun > ended] = drift
     return times
-
-
-def telling(fixes: GnssFixes, correlation_times_s: Array) -> Mask:
-    """The fixes that tell something new: not those that soon follow another, of the same error, (m,).
-
-    Each fix needs a keyframe of its own, unless a scan has the same stamp. An inertial unit's positions, ten a second,
-    of which a hundred weigh as one, would take as much time and memory as all relative poses.
-    """
-    apart_s = correlation_times_s / FIXES_PER_CORRELATION_TIME
-    told, last = np.zeros(len(fixes), dtype=bool), -np.inf
-    for i, (stamp, apart) in enumerate(zip(fixes.stamps.tolist(), apart_s.tolist(), strict=True)):
-        told[i] = stamp - last >= apart
-        last = stamp if told[i] else last
-    return told
 
 
 def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev_m: float) -> GnssFixes:

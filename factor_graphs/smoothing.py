@@ -15,15 +15,7 @@ from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise,
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.problem import (
-    LOSSES,
-    REJECTION,
-    RELATIVE_REJECTION,
-    Fit,
-    Problem,
-    pose_problem,
-    weights_of,
-)
+from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
@@ -107,14 +99,13 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     covariances = keyframe_covariances(fit.graph, fit.values, len(T))
     of_poses = covariances[:, :6, :6]
-    if are_drifting(fixes[problem.usable]):
-        of_poses = _no_better_than(fixes[problem.usable], of_poses, T[:, :3, :3])
+    if are_drifting(fixes[problem.used]):
+        of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
     noise = problem.noise.scaled(fit.inflation)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
-    residuals = _residuals(keyframes, fixes, calibration)
-    squares = _squares(problem, fit, residuals)
-    rejected = squares > REJECTION
+    weights, rejected = np.zeros(len(fixes)), ~problem.used
+    weights[problem.used], rejected[problem.used] = fit.weights, fit.squares > REJECTION
     relative_weights, relative_rejected = np.zeros(len(problem.relative_used)), ~problem.relative_used
     relative_weights[problem.relative_used] = fit.relative_weights
     relative_rejected[problem.relative_used] = fit.relative_squares > RELATIVE_REJECTION
@@ -123,8 +114,8 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         keyframes=keyframes,
         biases=biases,
         state_covariances=covariances,
-        fix_weights=np.where(problem.usable, weights_of(LOSSES[fit.loss], squares), 0.0),
-        fix_residuals=residuals,
+        fix_weights=weights,
+        fix_residuals=_residuals(keyframes, fixes, calibration),
         rejected=rejected,
         relative_weights=relative_weights,
         relative_rejected=relative_rejected,
@@ -148,19 +139,6 @@ def _no_better_than(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> A
     placed = covariances.copy()
     placed[:, 3:, 3:] += np.swapaxes(R_map_imu, 1, 2) * lacking @ R_map_imu
     return placed
-
-
-def _squares(problem: Problem, fit: Fit, residuals: Array) -> Array:
-    """Squared whitened residuals of all fixes given (m,); infinite for one that cannot be used.
-
-    A fix that soon follows another, and so does not take part, is as accurate as the nearest one that does.
-    """
-    squares = np.full(len(residuals), np.inf)
-    squares[problem.used] = fit.squares
-    beside = np.flatnonzero(problem.usable & ~problem.used)
-    nearest = np.searchsorted(np.flatnonzero(problem.used), beside) - 1
-    squares[beside] = np.sum((residuals[beside] / problem.fixes.stddevs[nearest]) ** 2, axis=1)
-    return squares
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:

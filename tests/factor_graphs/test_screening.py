@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.screening import correlation_times, decorrelate, inside, plausible, telling
+from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 
@@ -55,19 +55,6 @@ def test_fixes_drift_together_only_where_an_inertial_unit_reports_them_and_relat
     np.testing.assert_array_equal(correlation_times(unit, settings, np.empty((0, 2))), 1.0)
     receiver = fixes_along(5 * np.arange(20.0))
     np.testing.assert_array_equal(correlation_times(receiver, settings, pairs), 1.0)
-
-
-def test_a_dozen_fixes_tell_all_of_a_correlation_time():
-    stamps = np.arange(0.0, 60.0, 0.1)
-    unit = fixes_along(5 * stamps, stamps)
-    assert telling(unit, np.full(len(unit), 1.0)).all()  # ten a second: fewer
-    assert telling(unit, np.zeros(len(unit))).all()  # independent
-    told = telling(unit, np.full(len(unit), 10.0))
-    assert told[0]
-    np.testing.assert_allclose(np.diff(stamps[told]), 0.9)
-    thinned = decorrelate(unit[told], 10.0, 0.02)
-    weight_per_10_s = np.mean(1 / thinned.stddevs[12:-12, 0] ** 2) * 10 / 0.9
-    assert np.isclose(weight_per_10_s, 1.0, rtol=0.15)  # as much as all of them together
 
 
 def test_fixes_of_different_correlation_times_lose_weight_each_by_its_own():

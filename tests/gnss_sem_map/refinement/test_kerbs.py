@@ -148,22 +148,19 @@ Told = dict[str, dict[str, list[PointLabels]]]
 
 
 @pytest.fixture(scope="module")
-def streets(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Told]]:
-    """Twice two simulated seconds, whose label images are true, and what is told of them."""
-    found = []
-    for seed in (1, 3):
-        street = simulate(tmp_path_factory.mktemp("street"), 2.0, seed)
-        found.append((street, told(street, tmp_path_factory.mktemp("run"))))
-    return found
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two simulated seconds, whose label images are true."""
+    return simulate(tmp_path_factory.mktemp("street"), 2.0, 1)
 
 
-def told(street: Path, folder: Path) -> Told:
+@pytest.fixture(scope="module")
+def told(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
     """Setting -> scan -> what the raw map and the refined one say of its points."""
     log = open_drive(street)
     segmenter = open_segmenter(
         f"labels:{street / 'truth' / 'train_ids'}", URBAN, expected_size=log.calibration.image_size
     )
-    settings = config.Settings()
+    folder, settings = tmp_path_factory.mktemp("run"), config.Settings()
     mapped = pipeline.run(log, segmenter, settings, folder, folder / "work")
     kerbs = pipeline.refine(folder, settings, mapped.stats).kerbs
     maps = [tiles.open_map(folder / name) for name in ("map", "refined")]
@@ -176,12 +173,9 @@ def told(street: Path, folder: Path) -> Told:
 
 
 @pytest.mark.integration
-def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(
-    streets: list[tuple[Path, Told]],
-) -> None:
-    (_, scans), *_ = streets
-    for name, on in scans["on"].items():
-        off = scans["off"][name]
+def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(told: Told) -> None:
+    for name, on in told["on"].items():
+        off = told["off"][name]
         np.testing.assert_array_equal(on[0].labels, off[0].labels)
         np.testing.assert_array_equal(on[1].removed, off[1].removed)
         differ = on[1].labels != off[1].labels
@@ -192,14 +186,13 @@ def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(
 
 @pytest.mark.integration
 def test_on_a_simulated_street_two_of_five_points_on_the_wrong_side_of_a_kerb_come_right(
-    streets: list[tuple[Path, Told]],
+    told: Told, street: Path
 ) -> None:
     tables, ids = Tables.of(URBAN), np.append(URBAN.semantic_kitti_ids, 0).astype(np.uint32)
     wrong = {}
     for setting in ("on", "off"):
         counts = np.zeros((5, 6), np.int64)
-        scans = [(street, *scan) for street, found in streets for scan in found[setting].items()]
-        for street, name, (_, refined) in scans:
+        for name, (_, refined) in told[setting].items():
             truth = read_labels(street / "truth" / "labels" / f"{name}.label")
             counts += confusion(ids[refined.labels], truth, tables, name)
         wrong[setting] = counts[ROAD, SIDEWALK] + counts[SIDEWALK, ROAD]

@@ -24,6 +24,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.mapping.fusion import state_of
@@ -32,6 +33,7 @@ from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of
 from gnss_sem_map.sensor_log import SensorLog, Skip
+from gnss_sem_map.voxels.reuse import read_record
 
 
 @dataclass(frozen=True)
@@ -156,14 +158,16 @@ def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> No
 
 def _read(folder: Path, number: int, fingerprint: str) -> ScanMatches | None:
     """A section that was saved; None where there is none of this run, or it is damaged."""
-    try:
-        about = json.loads((folder / f"{number}.json").read_text("utf-8"))
-        content = (folder / f"{number}.npz").read_bytes()
-    except (OSError, ValueError):
+    about = read_record(folder / f"{number}.json")
+    if about is None or about.get("fingerprint") != fingerprint:
         return None
-    if about["fingerprint"] != fingerprint or about["sha256"] != hashlib.sha256(content).hexdigest():
+    try:
+        content = read_bytes(folder / f"{number}.npz")
+        if about["sha256"] != hashlib.sha256(content).hexdigest():
+            return None
+        skips = tuple(Skip(**skip) for skip in about["skips"])
+        counts = Counter(about["counts"])
+    except (DataError, KeyError, TypeError):
         return None
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        poses = RelativePoses(**arrays)
-    skips = tuple(Skip(**skip) for skip in about["skips"])
-    return ScanMatches(poses, skips, Counter(about["counts"]))
+        return ScanMatches(RelativePoses(**arrays), skips, counts)

@@ -80,14 +80,17 @@ def test_processes_find_the_same(
     assert_same(SavedMatches(source, tmp_path, Processes(2))(log, guess, SETTINGS, silent), expected)
 
 
-@pytest.mark.parametrize("damage", [b"", b"no archive"])
+@pytest.mark.parametrize(
+    ("file", "damage"),
+    [("1.npz", b""), ("1.npz", b"no archive"), ("1.json", b"[]"), ("1.json", b"{"), ("1.json", b"{}")],
+)
 def test_an_interrupted_run_matches_only_what_is_missing_or_damaged(
     log: SensorLog, guess: Trajectory, expected: ScanMatches, source: Source, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch, damage: bytes,
+    monkeypatch: pytest.MonkeyPatch, file: str, damage: bytes,
 ) -> None:  # fmt: skip
     match = SavedMatches(source, tmp_path, resume=True)
     match(log, guess, SETTINGS, silent)
-    (tmp_path / "matches/1.npz").write_bytes(damage)
+    (tmp_path / "matches" / file).write_bytes(damage)
     matched: list[int] = []
     save = match_tasks._save
 

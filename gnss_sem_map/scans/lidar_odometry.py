@@ -45,6 +45,9 @@ COARSE_M, FINE_M = 0.01, 0.001
 NEIGHBOURS = 6
 # Sweeps overlap, so every other matched one is added to the local map: on simulated drives the poses drift no more.
 EVERY_NTH_IN_MAP = 2
+# Anchors are so many sweeps apart, and each is bound to so many before it. Sweeps that were each bound to the tenth
+# before it would take twice the time and three times the memory of the graph, for the same accuracy.
+ANCHOR_SCANS, ANCHORS_BOUND = 10, 3
 # So many sweeps are matched before a section, for its local map.
 WARM_UP_SCANS = 50
 
@@ -75,7 +78,6 @@ class ScanMatchingSettings(BaseModel):
         gt=0,
         description="Sections of a long drive, of so many sweeps, are matched each with its own local map.",
     )
-    steps: tuple[int, ...] = Field((1, 10), min_length=1, description="Relative poses over so many sweeps.")
     # Halves of the sweeps of a real drive (KITTI 0005), matched separately, show the true noise of a match: 2 to 7 mm
     # and 0.2 to 0.5 mrad over a second, several times the value that follows from the number of points.
     translation_stddev_m: float = Field(0.005, gt=0, description="Least standard deviation of translation.")
@@ -118,8 +120,10 @@ class ScanMatches:
 
 @dataclass(frozen=True, eq=False)
 class _Match:
-    """Pose of a sweep in the local map; `covariance` (6, 6) of the tangent in LiDAR axes."""
+    """Pose of a sweep in the local map; `number` counts the sweeps of the drive, `covariance` (6, 6) is of the tangent
+    in LiDAR axes."""
 
+    number: int
     scan: Scan
     local_map: int
     T_local_lidar: Array
@@ -177,7 +181,7 @@ def match_section(
             if isinstance(sweep, Skip):
                 skips.append(sweep)
             else:
-                matches.append(odometry.match(scan, sweep))
+                matches.append(odometry.match(number, scan, sweep))
         except _NoMatch as error:
             skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
         progress("scan matching", number + 1, len(log.scans))
@@ -189,7 +193,7 @@ def match_section(
             "local maps": odometry.local_maps,
         }
     )
-    pairs = [pair for step in settings.steps for pair in _pairs(matches, step, before)]
+    pairs = list(_pairs(matches, before))
     return ScanMatches(_relative_poses(pairs, log.calibration.T_imu_lidar, settings), tuple(skips), counts)
 
 
@@ -238,7 +242,7 @@ class _Odometry:
         self._settings = settings
         self._last: tuple[Scan, Array, Array] | None = None
 
-    def match(self, scan: Scan, sweep: _Sweep) -> _Match:
+    def match(self, number: int, scan: Scan, sweep: _Sweep) -> _Match:
         """Register a sweep, and add every other one to the local map; raises _NoMatch, with the map unchanged."""
         if self._last is None or scan.stamp - self._last[0].stamp > self._settings.max_gap_s:
             self._map = small_gicp.GaussianVoxelMap(self._settings.voxel_size_m)
@@ -254,7 +258,7 @@ class _Odometry:
             self._map.insert(sweep.points, T)
         self._matched += 1
         self._last = scan, T, sweep.T_map_lidar
-        return _Match(scan, self.local_maps, T, covariance, is_open)
+        return _Match(number, scan, self.local_maps, T, covariance, is_open)
 
     def _register(self, points: small_gicp.PointCloud, guess: Array) -> tuple[Array, Array, bool]:
         settings = self._settings
@@ -305,17 +309,26 @@ def _refuse_divergence(correction: Array, settings: ScanMatchingSettings) -> Non
         )
 
 
-def _pairs(matches: list[_Match], step: int, before: int = 0) -> Iterator[tuple[_Match, _Match]]:
-    """Pairs of matched sweeps of one local map, `step` apart (sweeps without a match are not counted).
+def _pairs(matches: list[_Match], before: int) -> Iterator[tuple[_Match, _Match]]:
+    """Every matched sweep with the one before and the last anchor, and an anchor with the last ANCHORS_BOUND.
 
-    The later one is not among the first ones, the matches `before` this section.
-    For `step` > 1, pairs with a degenerate match in between are left out: there the local map itself may have moved.
+    The later one is not among the first ones, the matches `before` this section. The first matched of ANCHOR_SCANS
+    sweeps is an anchor. All are of one local map, and between a sweep and an anchor there is no degenerate match: there
+    the local map itself may have moved.
     """
-    slips = np.cumsum([0, *(match.is_open for match in matches)])
-    for i in range(max(before - step, 0), len(matches) - step):
-        earlier, later = matches[i], matches[i + step]
-        if earlier.local_map == later.local_map and (step == 1 or slips[i] == slips[i + step + 1]):
-            yield earlier, later
+    anchors: list[_Match] = []
+    for i, later in enumerate(matches):
+        follows = i > 0 and matches[i - 1].local_map == later.local_map
+        if later.is_open or not follows:
+            anchors = []
+        is_anchor = not anchors or anchors[-1].number // ANCHOR_SCANS != later.number // ANCHOR_SCANS
+        bound = anchors[-ANCHORS_BOUND:] if is_anchor else anchors[-1:]
+        if follows and matches[i - 1] not in bound:
+            bound = [*bound, matches[i - 1]]
+        if i >= before:
+            yield from ((earlier, later) for earlier in bound)
+        if is_anchor and not later.is_open:
+            anchors.append(later)
 
 
 def _relative_poses(

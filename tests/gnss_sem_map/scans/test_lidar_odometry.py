@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -67,11 +68,26 @@ def test_relative_poses_are_those_of_the_exact_motion() -> None:
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.015
 
 
-def test_every_sweep_is_matched_with_the_one_before_and_the_tenth_before() -> None:
-    steps = np.round(np.diff(matched().relative_poses.stamps, axis=1)[:, 0] / scenes.SWEEP_S).astype(int)
-    assert np.bincount(steps)[[1, 10]].tolist() == [SWEEPS - 1, SWEEPS - 10]
+def test_every_sweep_is_bound_to_the_one_before_and_to_the_last_anchor_and_anchors_to_three(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     assert matched().counts["scans matched"] == SWEEPS
     assert matched().counts["local maps"] == 1
+    assert pairs_of(matched()) == {
+        *((k - 1, k) for k in range(1, SWEEPS)), *((0, k) for k in range(1, 11)), *((10, k) for k in range(11, SWEEPS))
+    }  # fmt: skip
+    monkeypatch.setattr(lidar_odometry, "ANCHOR_SCANS", 2)
+    assert pairs_of(match_scans(*street())) == {
+        *((k - 1, k) for k in range(1, SWEEPS)),
+        *((k - back, k) for k in range(0, SWEEPS, 2) for back in (2, 4, 6) if k >= back),
+    }
+
+
+def pairs_of(found: ScanMatches) -> set[tuple[int, int]]:
+    """The numbers of the sweeps that are bound; raises AssertionError if two are bound twice."""
+    pairs = np.round(found.relative_poses.stamps / scenes.SWEEP_S - 0.5).astype(int).tolist()
+    assert len(pairs) == len(set(map(tuple, pairs)))
+    return {(earlier, later) for earlier, later in pairs}
 
 
 def whole_sweep_errors(seed: int, settings: ScanMatchingSettings) -> SensorLog:
@@ -93,21 +109,24 @@ def whole_sweep_errors(seed: int, settings: ScanMatchingSettings) -> SensorLog:
 
 @cache
 def of_shifted_sweeps() -> list[RelativePoses]:
-    """What is found in six drives with errors of whole sweeps."""
+    """What is found in six drives with errors of whole sweeps, with every other sweep an anchor."""
     settings = ScanMatchingSettings()
-    return [match_scans(whole_sweep_errors(seed, settings), street()[1]).relative_poses for seed in range(6)]
+    with patch.object(lidar_odometry, "ANCHOR_SCANS", 2):
+        return [
+            match_scans(whole_sweep_errors(seed, settings), street()[1]).relative_poses for seed in range(6)
+        ]
 
 
-@pytest.mark.parametrize(("step", "count"), [(1, SWEEPS // 2), (10, SWEEPS - 10)])
-def test_covariances_are_honest(step: int, count: int) -> None:
+@pytest.mark.parametrize(("step", "apart"), [(1, 2), (6, 8)])
+def test_covariances_are_honest(step: int, apart: int) -> None:
     """Only pairs that share no sweep: they are independent, and their mean NEES has known bounds."""
     squares = []
     for pairs in of_shifted_sweeps():
         first, second = np.round(pairs.stamps / scenes.SWEEP_S - 0.5).astype(int).T
-        rows = (second - first == step) & ((step > 1) | (first % 2 == 0))
+        rows = (second - first == step) & (first % apart == 0)
         squares.append(nees(errors(pairs, street()[1]), pairs.covariances)[rows])
-    assert [len(of_drive) for of_drive in squares] == [count] * 6
-    low, high = anees_band(6, 6 * count)
+    assert [len(of_drive) for of_drive in squares] == [SWEEPS // apart] * 6
+    low, high = anees_band(6, 6 * SWEEPS // apart)
     assert low < np.mean(squares) < high
 
 
@@ -325,7 +344,7 @@ def test_a_drive_without_sweeps_has_no_relative_poses() -> None:
     assert found.counts["local maps"] == 0
 
 
-@pytest.mark.parametrize("setting", [{"voxel_size_m": 0}, {"steps": ()}, {"voxel_sise_m": 1}])
+@pytest.mark.parametrize("setting", [{"voxel_size_m": 0}, {"section_scans": 0}, {"voxel_sise_m": 1}])
 def test_settings_that_make_no_sense_are_refused(setting: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         ScanMatchingSettings.model_validate(setting)
@@ -367,12 +386,13 @@ def test_sections_bind_every_sweep_as_closely_as_the_whole_drive(
 ) -> None:
     """Each pair of sweeps is bound once, whichever sections they are in."""
     monkeypatch.setattr(lidar_odometry, "WARM_UP_SCANS", 11)
+    monkeypatch.setattr(lidar_odometry, "ANCHOR_SCANS", 3)
     log, truth = street()
+    whole = match_scans(log, truth)
     found = match_scans(log, truth, ScanMatchingSettings(section_scans=section_scans))
-    whole, parts = (sorted(map(tuple, one.relative_poses.stamps)) for one in (matched(), found))
-    assert parts == whole
-    assert found.counts["scans matched"] == matched().counts["scans matched"]
-    off, of_whole = (errors(one.relative_poses, truth) for one in (found, matched()))
+    assert pairs_of(found) == pairs_of(whole)
+    assert found.counts["scans matched"] == whole.counts["scans matched"]
+    off, of_whole = (errors(one.relative_poses, truth) for one in (found, whole))
     assert np.abs(off).max() < 1.5 * np.abs(of_whole).max()
 
 

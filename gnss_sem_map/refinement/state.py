@@ -99,6 +99,8 @@ class MapState:
 
     def __getitem__(self, chosen: NDArray[np.int64]) -> MapState:
         """The voxels at increasing places, with all that is known of them."""
+        if len(chosen) == len(self.voxels):
+            return self
         voxels = self.voxels[chosen]
         return replace(
             self,

@@ -141,20 +141,27 @@ class VoxelMap:
         is_part = self.voxel_size_m == part.voxel_size_m and self.label_set.names == part.label_set.names
         if not is_part or (rows < 0).any() or (self.hits[rows] < part.hits).any():
             raise DataError("cannot subtract a map that is not part of the other; were both of one run?")
-        evidence, hits, heights = self.evidence.copy(), self.hits.copy(), self._known_heights.copy()
-        evidence[rows] -= part.evidence
-        hits[rows] -= part.hits
-        heights[rows] -= part._known_heights
-        if evidence[hits == 0].any():
+        stays = self.hits[rows] > part.hits  # else all points of the voxel are of the part
+        gone = rows[~stays]
+        if (self.evidence[gone] != part.evidence[~stays]).any():
             raise DataError("cannot subtract a map with other evidence; were both of one run?")
+        kept = np.delete(np.arange(len(self)), gone)
+        evidence, hits, heights = self.evidence.take(kept, axis=0), self.hits[kept], self._known_heights[kept]
+        places = np.searchsorted(kept, rows[stays])
+        evidence[places] -= part.evidence[stays]
+        hits[places] -= part.hits[stays]
+        heights[places] -= part._known_heights[stays]
         are_known = self.heights is not None and part.heights is not None
-        return replace(self, evidence=evidence, hits=hits, heights=heights if are_known else None)[hits > 0]
+        return VoxelMap(
+            self.voxel_size_m, self.label_set, self.keys[kept], evidence, hits, heights if are_known else None
+        )
 
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
         """The voxels of a boolean mask (v,), or those at increasing indices."""
-        places = np.arange(len(self))[
-            selection
-        ]  # with them, `take` of rows is four times as fast as indexing
+        # with indices, `take` of rows is four times as fast as indexing with a mask
+        places = np.arange(len(self))[selection]
+        if len(places) == len(self):
+            return self
         return VoxelMap(
             self.voxel_size_m,
             self.label_set,

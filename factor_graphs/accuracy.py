@@ -12,6 +12,9 @@ from factor_graphs.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+# Ellipsoids in which errors are counted hold these shares of them when covariances are true.
+SHARES = (0.5, 0.9, 0.95)
+
 
 @dataclass(frozen=True, eq=False)
 class Errors:
@@ -105,8 +108,17 @@ def nees(error: ArrayLike, covariance: ArrayLike) -> Array:
     return np.asarray(np.sum(e * solved, axis=-1), dtype=np.float64)
 
 
-def pose_nees(estimate: Trajectory, reference: Trajectory) -> tuple[Array, Array]:
-    """NEES of position and of orientation, 3 degrees of freedom each, at the stamps that `errors` compares: (k,), (k,).
+@dataclass(frozen=True, eq=False)
+class PoseNees:
+    """NEES of `position` (k,), 3 degrees of freedom, its `horizontal` part (k,), 2, and `orientation` (k,), 3."""
+
+    position: Array
+    horizontal: Array
+    orientation: Array
+
+
+def pose_nees(estimate: Trajectory, reference: Trajectory) -> PoseNees:
+    """NEES of poses at the stamps that `errors` compares.
 
     The covariance is that of the nearest stamp of the estimate. Raises MeasurementError without covariances, or when
     the two do not overlap.
@@ -118,11 +130,35 @@ def pose_nees(estimate: Trajectory, reference: Trajectory) -> tuple[Array, Array
     before = np.maximum(after - 1, 0)
     nearer = off.stamps - estimate.stamps[before] < estimate.stamps[after] - off.stamps
     covariances = estimate.covariances[np.where(nearer, before, after)]
-    R_imu_map = np.swapaxes(
-        estimate.at(off.stamps)[:, :3, :3], 1, 2
-    )  # covariances are in the axes of the imu
-    rotation, position = ((R_imu_map @ e[..., None])[..., 0] for e in (off.rotation, off.position))
-    return nees(position, covariances[:, 3:, 3:]), nees(rotation, covariances[:, :3, :3])
+    R_map_imu = estimate.at(off.stamps)[:, :3, :3]  # covariances are in the axes of the imu
+    rotation, position = (
+        R_map_imu @ of_part @ np.swapaxes(R_map_imu, 1, 2)
+        for of_part in (covariances[:, :3, :3], covariances[:, 3:, 3:])
+    )
+    return PoseNees(
+        position=nees(off.position, position),
+        horizontal=nees(off.position[:, :2], position[:, :2, :2]),
+        orientation=nees(off.rotation, rotation),
+    )
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How true covariances are.
+
+    `inside`: of the errors, the shares inside the ellipsoids that should hold SHARES of them. `scale_gap`: the median
+    NEES over its expected value; above 1 the variances are so many times too small, below 1 too large.
+    """
+
+    inside: tuple[float, ...]
+    scale_gap: float
+
+
+def coverage(squares: ArrayLike, dof: int) -> Coverage:
+    """How true covariances are, by the NEES (k,) of errors with `dof` degrees of freedom each."""
+    found = np.asarray(squares, dtype=np.float64)
+    inside = tuple(float(np.mean(found <= quantile(share, dof))) for share in SHARES)
+    return Coverage(inside, float(np.median(found)) / quantile(0.5, dof))
 
 
 def anees_band(dof: int, runs: int, confidence: float = 0.99) -> tuple[float, float]:

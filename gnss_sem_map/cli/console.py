@@ -139,6 +139,11 @@ def print_metrics(metrics: dict[str, Any]) -> None:
                 f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
                 " consistent covariances give 1 on average over many drives"
             )
+            inside = ", ".join(_percent(t[f"position_inside_{share}"]) for share in (50, 90, 95))
+            lines.append(
+                f"  positions inside the ellipsoids that should hold 50, 90, 95 %: {inside} %; variances too small by"
+                f" k = {t['position_scale_gap']:.2f}"
+            )
     for line in lines:
         console.print(line, highlight=False)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.accuracy import errors, pose_nees, relative_error
+from factor_graphs.accuracy import SHARES, coverage, errors, pose_nees, relative_error
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.datasets.label_files import label_files, read_confidence, read_labels, truth_folder
@@ -120,7 +120,8 @@ def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     """Absolute trajectory error without alignment and after the best rigid alignment; relative error over a second.
 
-    Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom.
+    Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom,
+    and the `coverage` of the position and of its horizontal part.
     """
     error = errors(estimate, truth)
     stamps = error.stamps
@@ -138,11 +139,15 @@ def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float
     }
     if estimate.covariances is None:
         return scores
-    position, orientation = pose_nees(estimate, truth)
-    return scores | {
-        "position_nees_per_dof": float(position.mean()) / 3,
-        "orientation_nees_per_dof": float(orientation.mean()) / 3,
-    }
+    found = pose_nees(estimate, truth)
+    scores["position_nees_per_dof"] = float(found.position.mean()) / 3
+    scores["orientation_nees_per_dof"] = float(found.orientation.mean()) / 3
+    for name, squares, dof in (("position", found.position, 3), ("horizontal", found.horizontal, 2)):
+        honest = coverage(squares, dof)
+        for share, inside in zip(SHARES, honest.inside, strict=True):
+            scores[f"{name}_inside_{100 * share:.0f}"] = inside
+        scores[f"{name}_scale_gap"] = honest.scale_gap
+    return scores
 
 
 def _aligned_rms(points: NDArray[np.float64], reference: NDArray[np.float64]) -> float:

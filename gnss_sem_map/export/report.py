@@ -26,6 +26,7 @@ FILES = {
     "trajectory.png": PICTURES["trajectory.png"],
     "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
     "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
+    "trajectory_covariance.tum": "the same with the covariance of every pose, for smfeval",
     "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
     "map": "the map before refinement, with all evidence, as Parquet tiles",
@@ -50,6 +51,13 @@ WORDS = {
     "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of freedom)",
     "position_nees_per_dof": "squared position error / claimed variance (NEES per degree of freedom)",
     "orientation_nees_per_dof": "squared orientation error / claimed variance (NEES per degree of freedom)",
+    **{
+        f"{part}_inside_{share}": f"{part}: errors inside the ellipsoid that should hold {share} %"
+        for part in ("position", "horizontal")
+        for share in (50, 90, 95)
+    },
+    "position_scale_gap": "position: how many times too small the variances are (scale gap k)",
+    "horizontal_scale_gap": "horizontal: how many times too small the variances are (scale gap k)",
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260

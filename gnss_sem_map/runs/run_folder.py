@@ -22,7 +22,7 @@ from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.report import FILES, write_report
-from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectories import write_covariance_tum, write_geojson, write_kitti, write_tum
 from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
@@ -202,6 +202,8 @@ def write_trajectory_files(
 ) -> None:
     trajectory.save(folder / "trajectory.parquet")
     write_tum(trajectory, folder / "trajectory.tum")
+    if trajectory.covariances is not None:
+        write_covariance_tum(trajectory, folder / "trajectory_covariance.tum")
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
     if log.frame is not None:
         write_geojson(trajectory, log.frame, folder / "trajectory.geojson")

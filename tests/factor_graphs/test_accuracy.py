@@ -7,8 +7,9 @@ from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from factor_graphs.accuracy import anees_band, errors, nees, pose_nees, relative_error, state_error
+from factor_graphs.accuracy import anees_band, coverage, errors, nees, pose_nees, relative_error, state_error
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 
@@ -102,12 +103,24 @@ def honest_pair(seed: int, k: int = 4000) -> tuple[Trajectory, Trajectory]:
 
 def test_nees_of_an_honest_trajectory_is_its_degrees_of_freedom_whichever_way_it_looks():
     estimate, truth = honest_pair(1)
-    low, high = anees_band(3, len(truth), confidence=0.999)
-    for found in pose_nees(estimate, truth):
-        assert low < found.mean() < high
     boast = Trajectory(estimate.stamps, estimate.T_map_imu, covariances=estimate.covariances / 4)
-    for found, honest in zip(pose_nees(boast, truth), pose_nees(estimate, truth), strict=True):
-        np.testing.assert_allclose(found, 4 * honest)
+    honest, boasted = pose_nees(estimate, truth), pose_nees(boast, truth)
+    for part, dof in (("position", 3), ("horizontal", 2), ("orientation", 3)):
+        low, high = anees_band(dof, len(truth), confidence=0.999)
+        assert low < getattr(honest, part).mean() < high
+        np.testing.assert_allclose(getattr(boasted, part), 4 * getattr(honest, part))
+
+
+@pytest.mark.parametrize("dof", [2, 3])
+@pytest.mark.parametrize("too_small", [0.5, 1.0, 4.0])
+def test_coverage_is_what_chi_square_says_and_the_scale_gap_what_the_variances_lack(
+    dof: int, too_small: float
+):
+    e = np.random.default_rng(dof).standard_normal((20000, dof))
+    found = coverage(nees(e, np.broadcast_to(np.eye(dof) / too_small, (len(e), dof, dof))), dof)
+    expected = chi2.cdf(chi2.ppf([0.5, 0.9, 0.95], dof) / too_small, dof)
+    np.testing.assert_allclose(found.inside, expected, atol=4 * 0.5 / np.sqrt(len(e)))
+    assert found.scale_gap == pytest.approx(too_small, rel=0.05)
 
 
 def test_nees_takes_the_covariance_of_the_nearest_stamp():
@@ -116,9 +129,9 @@ def test_nees_takes_the_covariance_of_the_nearest_stamp():
     estimate = Trajectory(np.array([0.0, 1.0, 2.0]), T, covariances=covariances)
     moved = np.tile(np.eye(4), (5, 1, 1))
     moved[:, 0, 3] = 4.0
-    position, orientation = pose_nees(estimate, Trajectory(np.array([0.0, 0.4, 0.6, 1.4, 2.0]), moved))
-    np.testing.assert_allclose(position, [16.0, 16.0, 4.0, 4.0, 1.0])
-    np.testing.assert_allclose(orientation, 0.0)
+    found = pose_nees(estimate, Trajectory(np.array([0.0, 0.4, 0.6, 1.4, 2.0]), moved))
+    np.testing.assert_allclose(found.position, [16.0, 16.0, 4.0, 4.0, 1.0])
+    np.testing.assert_allclose(found.orientation, 0.0)
     with pytest.raises(MeasurementError, match="no covariances"):
         pose_nees(Trajectory(estimate.stamps, T), estimate)
 

@@ -5,15 +5,35 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pytest
 from pyproj import Geod
+from scipy.spatial.transform import Rotation
+from smfeval.cli.main import main as smfeval
+from smfeval.io.load import load_estimate
 
+from factor_graphs.accuracy import coverage, pose_nees
+from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectories import write_covariance_tum, write_geojson, write_kitti, write_tum
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # evo's imports warn, not we
     from evo.tools import file_interface
+
+
+@pytest.fixture
+def uncertain(track: Trajectory) -> Trajectory:
+    """The track with covariances like those of a drive: no axis like another, and no block without correlation."""
+    root = np.random.default_rng(3).standard_normal((len(track), 6, 6)) * [
+        [1e-3],
+        [2e-3],
+        [4e-3],
+        [0.1],
+        [0.3],
+        [0.6],
+    ]
+    return Trajectory(track.stamps, track.T_map_imu, covariances=root @ np.swapaxes(root, 1, 2))
 
 
 def test_evo_reads_the_tum_file_back(track: Trajectory, tmp_path: Path) -> None:
@@ -21,6 +41,46 @@ def test_evo_reads_the_tum_file_back(track: Trajectory, tmp_path: Path) -> None:
     read = file_interface.read_tum_trajectory_file(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(read.timestamps, track.stamps, atol=1e-9)
     np.testing.assert_allclose(np.array(read.poses_se3), track.T_map_imu, atol=1e-6)
+
+
+def test_smfeval_reads_the_covariances_back(uncertain: Trajectory, tmp_path: Path) -> None:
+    write_covariance_tum(uncertain, tmp_path / "trajectory_covariance.tum")
+    header, steps = load_estimate(tmp_path / "trajectory_covariance.tum", body_frame="imu")
+    assert (header.tangent_order.value, header.tangent_convention.value) == (
+        "translation_rotation",
+        "right_perturbation",
+    )
+    np.testing.assert_allclose([step.timestamp for step in steps], uncertain.stamps, atol=1e-9)
+    np.testing.assert_allclose([step.translation for step in steps], uncertain.positions, atol=1e-6)
+    swapped = np.roll(np.roll([step.covariance for step in steps], 3, axis=1), 3, axis=2)
+    np.testing.assert_allclose(swapped, uncertain.covariances, rtol=1e-7)
+
+
+def test_smfeval_finds_the_coverage_that_we_find(
+    uncertain: Trajectory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert uncertain.covariances is not None
+    roots = np.linalg.cholesky(1.5 * uncertain.covariances)
+    tangent = (roots @ np.random.default_rng(5).standard_normal((len(uncertain), 6, 1)))[:, :, 0]
+    off = np.tile(np.eye(4), (len(uncertain), 1, 1))
+    off[:, :3, :3], off[:, :3, 3] = Rotation.from_rotvec(tangent[:, :3]).as_matrix(), tangent[:, 3:]
+    truth = Trajectory(uncertain.stamps, uncertain.T_map_imu @ off)
+    write_covariance_tum(uncertain, tmp_path / "estimate.tum")
+    write_tum(truth, tmp_path / "truth.tum")
+    files = [str(tmp_path / name) for name in ("estimate.tum", "truth.tum")]
+    smfeval(["nees", *files, "--est-body-frame=imu", "--ref-body-frame=imu", "--align=none", "--json"])
+    theirs = json.loads(capsys.readouterr().out)
+    ours = coverage(pose_nees(uncertain, truth).position, 3)
+    assert ours.scale_gap == pytest.approx(theirs["k"], rel=0.02)  # they take the logarithm of the pose
+    assert ours.inside[1] == pytest.approx(theirs["coverage"], abs=1.5 / len(uncertain))  # one on the edge
+
+
+def test_a_trajectory_without_covariances_is_refused(track: Trajectory, tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match="no covariances"):
+        write_covariance_tum(
+            Trajectory(track.stamps, track.T_map_imu), tmp_path / "trajectory_covariance.tum"
+        )
+    assert not list(tmp_path.iterdir())
 
 
 def test_evo_reads_the_kitti_file_back(track: Trajectory, tmp_path: Path) -> None:

@@ -17,13 +17,15 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import anees_band, errors, nees, state_error
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.kalman import kalman_smooth
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, clean_imu
+from factor_graphs.rigid_motion import Mounted, RigidMotion, drone, hand_held
 from factor_graphs.settings import SmootherSettings
-from factor_graphs.simulation import Motion, random_drive, simulate_biases, simulate_gnss, simulate_imu
+from factor_graphs.simulation import random_drive, simulate_biases, simulate_gnss, simulate_imu
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.streaming import StreamingSmoother
 from factor_graphs.trajectory import Trajectory
@@ -32,11 +34,25 @@ FRAME = LocalFrame(49.0, 8.4, 115.0)
 LEVER = np.array([0.5, 0.3, 1.0])
 STDDEVS = (1.0, 1.0, 2.0)
 OUTAGES = ((100.0, 130.0), (250.0, 310.0), (450.0, 480.0))
+
+
+def mounted(seconds: float, rng: np.random.Generator) -> Mounted:
+    """A random drive, seen by an IMU that looks 2° left and 1° down, 1.2 m ahead of the rear axle."""
+    T_vehicle_imu = np.eye(4)
+    T_vehicle_imu[:3, :3] = Rotation.from_euler("ZYX", [2.0, 1.0, 0.0], degrees=True).as_matrix()
+    T_vehicle_imu[0, 3] = 1.2
+    return Mounted(random_drive(seconds, rng), T_vehicle_imu)
+
+
 CASES: dict[str, dict[str, Any]] = {
     "clean": {},
     "outages of 30, 60, 30 s": {"outages": OUTAGES},
     "10 % outliers": {"outlier_share": 0.1},
     "30 % outliers": {"outlier_share": 0.3},
+    "IMU 2°, 1°, 1.2 m off the axle": {"moves": mounted},
+    "the same with outages": {"moves": mounted, "outages": OUTAGES},
+    "hand-held": {"moves": hand_held},
+    "drone": {"moves": drone},
 }
 PLAIN = SmootherSettings(standing_stddev_mps=None, vehicle_constraint="off")
 GRAPHS = {
@@ -48,11 +64,14 @@ Figures = dict[str, float]
 
 
 def simulate(
-    seed: int, seconds: float = 600.0, **gnss: Any
-) -> tuple[Motion, ImuSamples, GnssFixes, NDArray[np.float64]]:
+    seed: int,
+    seconds: float = 600.0,
+    moves: Callable[[float, np.random.Generator], RigidMotion] = random_drive,
+    **gnss: Any,
+) -> tuple[RigidMotion, ImuSamples, GnssFixes, NDArray[np.float64]]:
     """A drive of `seconds` s, its MEMS-grade IMU at 100 Hz, its fixes at 1 Hz, and the true biases."""
     rng = np.random.default_rng(seed)
-    motion = random_drive(seconds, rng)
+    motion = moves(seconds, rng)
     stamps, noise = np.arange(0.0, seconds, 0.01), ImuNoise()
     biases = simulate_biases(stamps, noise, rng)
     imu = simulate_imu(motion, stamps, FRAME, noise, rng, biases=biases)
@@ -64,7 +83,7 @@ def simulate(
     )
 
 
-def judge(found: Trajectory, motion: Motion) -> Figures:
+def judge(found: Trajectory, motion: RigidMotion) -> Figures:
     """Horizontal, vertical and heading error; and the horizontal error inside the outages."""
     e = errors(found, motion.trajectory(found.stamps))
     inside = e.within(OUTAGES)

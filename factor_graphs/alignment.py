@@ -72,18 +72,19 @@ def constant_velocity(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array,
     kalman.H = np.eye(3, 6)
     stamps = intervals.keyframes
     fix_at = dict(zip(intervals.keyframe_of(fixes.stamps).tolist(), range(len(fixes)), strict=True))
-    means, covariances, Fs, Qs = [], [], [], []
-    for i, dt in enumerate(np.diff(stamps, prepend=stamps[0])):
-        F = np.eye(6)
-        F[:3, 3:] = dt * np.eye(3)
-        Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], CRUISE_NOISE_DENSITY**2 * np.eye(3))
+    dt = np.diff(stamps, prepend=stamps[0])
+    Fs, Qs, axes = np.tile(np.eye(6), (len(dt), 1, 1)), np.zeros((len(dt), 6, 6)), np.arange(3)
+    Fs[:, axes, axes + 3] = dt[:, None]
+    Qs[:, axes, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 3 / 3
+    Qs[:, axes, axes + 3] = Qs[:, axes + 3, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 2 / 2
+    Qs[:, axes + 3, axes + 3] = CRUISE_NOISE_DENSITY**2 * dt[:, None]
+    means, covariances = [], []
+    for i, (F, Q) in enumerate(zip(Fs, Qs, strict=True)):
         kalman.predict(F=F, Q=Q)
         if i in fix_at:
             kalman.update(fixes.positions[fix_at[i]], R=np.diag(fixes.stddevs[fix_at[i]] ** 2))
         means.append(kalman.x)
         covariances.append(kalman.P)
-        Fs.append(F)
-        Qs.append(Q)
     smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0]
     return smoothed[:, :3], smoothed[:, 3:]
 

@@ -31,12 +31,10 @@ def non_holonomic_factors(
     """
     k, unit = len(stddevs), gtsam.noiseModel.Unit.Create(2)
     mounting, scale = values.atVector(M(k)), 1 / stddevs[:, :, None]
-    across = np.array([[-mounting[0], 1.0, 0.0], [-mounting[1], 0.0, 1.0]])
-    by_pose, by_mounting = np.zeros((k, 2, 6)), np.zeros((k, 2, 3))
+    across = motion.by_velocity(mounting)
+    by_pose, by_mounting = np.zeros((k, 2, 6)), -motion.by_mounting()
     by_pose[:, :, :3] = across @ np.cross(motion.velocity[:, None], np.eye(3)).swapaxes(1, 2)
     by_velocity = across @ motion.R_imu_map
-    by_mounting[:, 0, 0] = by_mounting[:, 1, 1] = -motion.velocity[:, 0]
-    by_mounting[:, 0, 2] = -motion.yaw_rate
     by_pose, by_velocity, by_mounting = by_pose * scale, by_velocity * scale, by_mounting * scale
     off = -motion.sliding(mounting) / stddevs
     for i in range(k):
@@ -44,7 +42,7 @@ def non_holonomic_factors(
             X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit
         )
         yield gtsam.LinearContainerFactor(row, values)
-    yield gtsam.PriorFactorVector(M(k), np.zeros(3), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
+    yield gtsam.PriorFactorVector(M(k), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
 
 
 def zero_velocity_factors(

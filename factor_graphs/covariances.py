@@ -25,7 +25,7 @@ INDEX_BITS = 56
 # Keyframes that are eliminated in one call; more take memory, fewer take time.
 TOGETHER = 20
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe.
-PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15), ord("m"): slice(0, 3)}
+PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15), ord("m"): slice(0, 4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def _split(key: int) -> tuple[int, int]:
 def keyframe_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
 ) -> tuple[Array, Array]:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); and of M(k), (3, 3), if it is there.
+    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); and of M(k), (4, 4), if it is there.
 
     M(k) is what all keyframes share, the mounting of the IMU: it is eliminated last, as if it were one more keyframe.
     """

@@ -24,8 +24,8 @@ INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
-# After the second linearisation the constraints are exact to three digits.
-CONSTRAINT_ROUNDS = 2
+# The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
+CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
 
 
 def fit_noise(
@@ -98,9 +98,10 @@ def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFact
     held = vehicle is not None and (settings.vehicle_constraint == "on" or not vehicle.doubt)
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
+    settled = not held
     for _ in range(CONSTRAINT_ROUNDS):
         stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
-        if not held and stood is not None and np.array_equal(stands, stood):
+        if settled and stood is not None and np.array_equal(stands, stood):
             break
         stood = stands
         factors = [*zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
@@ -110,10 +111,13 @@ def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFact
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)
-        motion = body_motion(problem, fit)
-        if held:
+        before, motion = motion, body_motion(problem, fit)
+        if vehicle is not None and held:
             mounting = fit.values.atVector(M(len(motion.velocity)))
-            vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            guessed, vehicle = vehicle, replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            settled = np.allclose(guessed.typical_slip, vehicle.typical_slip, rtol=SETTLED_SLIP) and bool(
+                np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS
+            )
     return fit, factors, vehicle
 
 

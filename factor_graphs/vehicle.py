@@ -1,8 +1,9 @@
 """Is it a wheeled vehicle? Mounting of the IMU, the axle that does not slide, and slip, seen in a solution.
 
 A point on the axle moves along the vehicle and nowhere else (non-holonomic constraint). In the imu's axes
-v_y = a v_x + l w_z and v_z = b v_x, up to slip: a and b are the slopes of the direction of travel, l is how far
-the IMU sits ahead of the axle. Going backwards changes the sign of v_x and nothing else.
+v_y = a v_x + l w_z + c |v_x| v_x w_z and v_z = b v_x, up to slip: a and b are the slopes of the direction of travel,
+l is how far the IMU sits ahead of the axle, and c the angle at which tyres roll under lateral acceleration v_x w_z.
+Going backwards changes the sign of v_x and nothing else.
 """
 
 from dataclasses import dataclass, replace
@@ -20,8 +21,8 @@ from factor_graphs.problem import Fit, Problem
 
 Array = NDArray[np.float64]
 
-# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle, m.
-MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0])
+# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s².
+MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01])
 # Slower than this, m/s, the direction of travel is not seen; seen for less long, s, or less far, m, it is not known.
 MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 # What slides more than this share of its speed, or looks farther off its course, is no vehicle with an IMU on it.
@@ -29,7 +30,7 @@ MOST_SLIP, MOST_SLOPE = 0.05, 0.3
 # Slip is never believed to be less, m/s; where it was not seen, it may be this.
 LEAST_SLIP, UNSEEN_SLIP = 0.03, 0.1
 # Slip lasts so long, s.
-SLIP_CORRELATION_S = 1.0
+SLIP_CORRELATION_S = 2.0
 # Yaw rate is the mean over so long: a single sample is noise.
 RATE_WINDOW_S = 0.1
 # Huber's loss for mounting, and where the residuals of slip are cut, in standard deviations.
@@ -54,11 +55,22 @@ class BodyMotion:
 
     def sliding(self, mounting: Array) -> Array:
         """Velocity of the axle across the direction of travel: lateral and vertical, (k, 2) m/s."""
-        ahead, left, up = self.velocity.T
-        return np.column_stack([
-            left - mounting[0] * ahead - mounting[2] * self.yaw_rate,
-            up - mounting[1] * ahead,
-        ])  # fmt: skip
+        across: Array = self.velocity[:, 1:] - self.by_mounting() @ mounting
+        return across
+
+    def by_velocity(self, mounting: Array) -> Array:
+        """How `sliding` changes with the velocity in the imu's axes, (k, 2, 3)."""
+        rows = np.tile([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (len(self.velocity), 1, 1))
+        rows[:, 0, 0] = -mounting[0] - 2 * mounting[3] * np.abs(self.velocity[:, 0]) * self.yaw_rate
+        rows[:, 1, 0] = -mounting[1]
+        return rows
+
+    def by_mounting(self) -> Array:
+        """Lateral and vertical velocity of a body that does not slide, by its mounting, (k, 2, 4)."""
+        ahead, rows = self.velocity[:, 0], np.zeros((len(self.velocity), 2, 4))
+        rows[:, 0, 0] = rows[:, 1, 1] = ahead
+        rows[:, 0, 2], rows[:, 0, 3] = self.yaw_rate, np.abs(ahead) * ahead * self.yaw_rate
+        return rows
 
     def grows_with(self) -> Array:
         """What the variance of slip is made of: a constant, speed squared, lateral acceleration squared, (k, 3)."""
@@ -133,17 +145,16 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     motion = motion[seen]
     if doubt := _too_little(motion):
         return Vehicle(
-            np.zeros(3), np.tile([UNSEEN_SLIP**2, 0.0, 0.0], (2, 1)), np.full(2, UNSEEN_SLIP), doubt
+            np.zeros(4), np.tile([UNSEEN_SLIP**2, 0.0, 0.0], (2, 1)), np.full(2, UNSEEN_SLIP), doubt
         )
-    ahead, left, up = motion.velocity.T
-    by_slip = motion.grows_with()
-    (a, lever), lateral = _robust_fit(
-        np.column_stack([ahead, motion.yaw_rate]), left, by_slip, motion.spacing, MOUNTING_STDDEVS[[0, 2]]
-    )
-    (b,), vertical = _robust_fit(ahead[:, None], up, by_slip, motion.spacing, MOUNTING_STDDEVS[[1]])
-    slip = np.array([lateral, vertical])
+    mounting, by_mounting, by_slip = np.zeros(4), motion.by_mounting(), motion.grows_with()
+    slip = np.empty((2, 3))
+    for row, of_row in enumerate(([0, 2, 3], [1])):
+        mounting[of_row], slip[row] = _robust_fit(
+            by_mounting[:, row, of_row], motion.velocity[:, 1 + row], by_slip, motion.spacing, MOUNTING_STDDEVS[of_row]
+        )
     typical = np.sqrt(np.average(by_slip @ slip.T, axis=0, weights=motion.spacing))
-    return Vehicle(np.array([a, b, lever]), slip, typical, _doubt(np.array([a, b]), typical, motion))
+    return Vehicle(mounting, slip, typical, _doubt(mounting[:2], typical, motion))
 
 
 def _too_little(motion: BodyMotion) -> str:

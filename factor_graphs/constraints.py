@@ -38,9 +38,7 @@ def non_holonomic_factors(
     by_pose, by_velocity, by_mounting = by_pose * scale, by_velocity * scale, by_mounting * scale
     off = -motion.sliding(mounting) / stddevs
     for i in range(k):
-        row = gtsam.JacobianFactor(
-            X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit
-        )
+        row = gtsam.JacobianFactor(X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit)
         yield gtsam.LinearContainerFactor(row, values)
     yield gtsam.PriorFactorVector(M(k), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
 

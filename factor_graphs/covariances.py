@@ -80,7 +80,7 @@ def _split(key: int) -> tuple[int, int]:
 def keyframe_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
 ) -> tuple[Array, Array]:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); and of M(k), (4, 4), if it is there.
+    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k), (4, 4), or (0, 0).
 
     M(k) is what all keyframes share, the mounting of the IMU: it is eliminated last, as if it were one more keyframe.
     """

@@ -62,7 +62,9 @@ class RigidMotion(ABC):
         return Trajectory(np.asarray(stamps, np.float64), self.poses(stamps), self.velocities(stamps))
 
     def _in_imu(self, stamps: ArrayLike, vectors: Array) -> Array:
-        return np.einsum("kji,kj->ki", self.poses(stamps)[:, :3, :3], np.broadcast_to(vectors, (np.size(stamps), 3)))
+        return np.einsum(
+            "kji,kj->ki", self.poses(stamps)[:, :3, :3], np.broadcast_to(vectors, (np.size(stamps), 3))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,9 @@ class Mounted(RigidMotion):
 
     def velocities(self, stamps: ArrayLike) -> Array:
         """Velocity in the map frame, (k, 3) m/s: v + w × l."""
-        return self.body.velocities(stamps) + self._in_map(stamps, np.cross(self.body.turn_rates(stamps), self._arm))
+        return self.body.velocities(stamps) + self._in_map(
+            stamps, np.cross(self.body.turn_rates(stamps), self._arm)
+        )
 
     def accelerations(self, stamps: ArrayLike) -> Array:
         """Acceleration in the map frame, (k, 3) m/s²: a + dw/dt × l (Euler) + w × (w × l) (centripetal)."""
@@ -133,21 +137,25 @@ class FreeMotion(RigidMotion):
     def poses(self, stamps: ArrayLike) -> Array:
         """T_map_imu, (k, 4, 4)."""
         T = np.tile(np.eye(4), (np.size(stamps), 1, 1))
-        T[:, :3, :3] = Rotation.from_euler("ZYX", self.euler(stamps)).as_matrix()
-        T[:, :3, 3] = self.position(stamps)
+        T[:, :3, :3] = Rotation.from_euler("ZYX", _at(self.euler, stamps)).as_matrix()
+        T[:, :3, 3] = _at(self.position, stamps)
         return T
 
     def velocities(self, stamps: ArrayLike) -> Array:
         """Velocity in the map frame, (k, 3) m/s."""
-        return np.asarray(self.position(stamps, 1))
+        return _at(self.position, stamps, 1)
 
     def accelerations(self, stamps: ArrayLike) -> Array:
         """Acceleration in the (rotating) map frame, (k, 3) m/s²."""
-        return np.asarray(self.position(stamps, 2))
+        return _at(self.position, stamps, 2)
 
     def turn_rates(self, stamps: ArrayLike) -> Array:
         """How fast the imu turns in the map frame, about its own axes, (k, 3) rad/s."""
-        return turn_rates(self.euler(stamps), self.euler(stamps, 1))
+        return turn_rates(_at(self.euler, stamps), _at(self.euler, stamps, 1))
+
+
+def _at(spline: BSpline, stamps: ArrayLike, derivative: int = 0) -> Array:
+    return np.asarray(spline(np.asarray(stamps, dtype=np.float64), derivative))
 
 
 def turn_rates(euler: Array, change: Array) -> Array:
@@ -173,7 +181,7 @@ def drone(seconds: float, rng: np.random.Generator) -> FreeMotion:
 def _wander(
     seconds: float, rng: np.random.Generator, speed: float, climb: float, every_s: float, turns: Array
 ) -> FreeMotion:
-    """Velocities and attitudes drawn every `every_s` s, `speed` along a course of their own, `climb` m/s, `turns` rad."""
+    """Every `every_s` s another course, climb (`climb` m/s) and attitude (`turns` rad: yaw changes, pitch, roll)."""
     t = np.arange(-3 * every_s, seconds + 4 * every_s, every_s)
     course = np.cumsum(rng.normal(0.0, 0.5, len(t)))
     steps = np.column_stack([np.cos(course), np.sin(course), climb / speed * rng.standard_normal(len(t))])

@@ -103,7 +103,7 @@ def _solution(
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     covariances, of_mounting = keyframe_covariances(fit.graph, fit.values, len(T))
     if vehicle is not None and vehicle.held:
-        vehicle = replace(vehicle, stddevs=np.sqrt(of_mounting.diagonal()))
+        vehicle = replace(vehicle, mounting_stddevs=np.sqrt(of_mounting.diagonal()))
     of_poses = covariances[:, :6, :6]
     if are_drifting(fixes[problem.used]):
         of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])

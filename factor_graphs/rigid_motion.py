@@ -62,9 +62,9 @@ class RigidMotion(ABC):
         return Trajectory(np.asarray(stamps, np.float64), self.poses(stamps), self.velocities(stamps))
 
     def _in_imu(self, stamps: ArrayLike, vectors: Array) -> Array:
-        return np.einsum(
-            "kji,kj->ki", self.poses(stamps)[:, :3, :3], np.broadcast_to(vectors, (np.size(stamps), 3))
-        )
+        R_imu_map = np.swapaxes(self.poses(stamps)[:, :3, :3], 1, 2)
+        turned: Array = (R_imu_map @ vectors[..., None])[..., 0]
+        return turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,8 @@ class Mounted(RigidMotion):
         return self.T_body_imu[:3, 3]
 
     def _in_map(self, stamps: ArrayLike, vectors: Array) -> Array:
-        return np.einsum("kij,kj->ki", self.body.poses(stamps)[:, :3, :3], vectors)
+        turned: Array = (self.body.poses(stamps)[:, :3, :3] @ vectors[..., None])[..., 0]
+        return turned
 
 
 @dataclass(frozen=True, eq=False)

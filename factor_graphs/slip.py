@@ -42,17 +42,22 @@ def explain(
 ) -> tuple[Array, Slip]:
     """The x (n,) of y = by x + slip, and the slip: each from the other in turn (iteratively reweighted least squares).
 
-    `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed, for the drift of
-    heading; `grows_with` (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
+    The mean slope of every `DRIFT_S` s is neither: it is the drift of heading.
+
+    `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
+    (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
     """
-    x, parts = np.zeros(len(stddevs)), np.zeros(3)
-    variance = np.full(len(y), max(robust_stddev(y), LEAST_SLIP) ** 2)
-    left = y
+    x, parts, window = np.zeros(len(stddevs)), np.zeros(3), (np.cumsum(spacing) / DRIFT_S).astype(int)
+    drift = np.zeros(window[-1] + 1)
+    left: Array = y
+    variance: Array = np.full(len(y), max(robust_stddev(y), LEAST_SLIP) ** 2)
     for _ in range(ROUNDS):
-        off = (y - by @ x) / np.sqrt(variance)
-        weights = spacing / variance * np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        weights = spacing * _huber(y - by @ x, variance)
         x = np.linalg.solve((by.T * weights) @ by + np.diag(stddevs**-2), (by.T * weights) @ y)
-        left = _without_drift(y - by @ x, ahead, spacing)
+        left = y - by @ x - drift[window] * ahead
+        weights = _huber(left, variance)
+        drift += np.bincount(window, weights * left * ahead) / np.bincount(window, weights * ahead**2 + 1e-12)
+        left = y - by @ x - drift[window] * ahead
         left = np.clip(left, -CUT * np.sqrt(variance), CUT * np.sqrt(variance))
         scale = np.sqrt(spacing) / variance
         parts = nnls(grows_with * scale[:, None], left**2 / LEFT * scale)[0]
@@ -62,26 +67,27 @@ def explain(
     return x, Slip(parts, _lasting(left / np.sqrt(variance), spacing), typical)
 
 
+def _huber(off: Array, variance: Array) -> Array:
+    """Weights of values under Huber's loss."""
+    weights: Array = np.minimum(1.0, HUBER * np.sqrt(variance) / np.maximum(np.abs(off), 1e-12)) / variance
+    return weights
+
+
 def robust_stddev(values: Array) -> float:
     """The standard deviation about zero of normal values, whatever a few others are (median absolute deviation)."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
-def _without_drift(off: Array, ahead: Array, spacing: Array) -> Array:
-    """What is left when the slope over every `DRIFT_S` s is taken out."""
-    window = (np.cumsum(spacing) / DRIFT_S).astype(int)
-    slope = np.bincount(window, off * ahead) / np.maximum(np.bincount(window, ahead**2), 1e-12)
-    left: Array = off - slope[window] * ahead
-    return left
-
-
 def _lasting(values: Array, spacing: Array) -> float:
-    """Integral of the autocorrelation, both sides, s: up to where values are no longer alike."""
+    """Integral of the autocovariance of whitened values, both sides, s: up to where they are no longer alike.
+
+    Where slip is smaller than what is believed of it, it counts as lasting less.
+    """
     step = float(np.median(spacing))
-    total = square = float(values @ values) / len(values)
+    total = float(values @ values) / len(values)
     for lag in range(1, min(int(DRIFT_S / 2 / step) + 1, len(values))):
         alike = float(values[lag:] @ values[:-lag]) / (len(values) - lag)
         if alike <= 0:
             break
         total += 2 * alike
-    return max(step * total / max(square, 1e-12), LEAST_LASTING_S)
+    return max(step * total, LEAST_LASTING_S)

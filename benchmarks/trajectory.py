@@ -9,7 +9,7 @@ import argparse
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import anees_band, errors, nees, state_error
+from factor_graphs.chi_square import quantile
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.kalman import kalman_smooth
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, clean_imu
@@ -83,14 +84,22 @@ def simulate(
     )
 
 
-def judge(found: Trajectory, motion: RigidMotion) -> Figures:
-    """Horizontal, vertical and heading error; and the horizontal error inside the outages."""
+def judge(found: Trajectory, motion: RigidMotion, outages: Sequence[tuple[float, float]] = ()) -> Figures:
+    """Horizontal, vertical and heading error, and the share of positions in their 90 % ellipsoid; also in outages."""
     e = errors(found, motion.trajectory(found.stamps))
-    inside = e.within(OUTAGES)
+    inside = e.within(outages)
     worst = np.linalg.norm(inside.position[:, :2], axis=1).max(initial=0.0)
+    assert found.covariances is not None
+    R = found.T_map_imu[:, :3, :3]
+    P = R @ found.covariances[:, 3:, 3:] @ np.swapaxes(R, 1, 2)
+    covered = [nees(e.position[:, :n], P[:, :n, :n]) < quantile(0.9, n) for n in (2, 3)]
+    lost = np.isin(e.stamps, inside.stamps)
     return {
         "horizontal_m": e.horizontal_rms_m, "vertical_m": e.vertical_rms_m, "heading_deg": e.heading_rms_deg,
         "inside_outages_m": inside.horizontal_rms_m, "inside_outages_max_m": float(worst),
+        "covered_horizontal": float(np.mean(covered[0])), "covered_3d": float(np.mean(covered[1])),
+        "covered_horizontal_inside_outages": float(np.mean(covered[0][lost])) if lost.any() else float("nan"),
+        "covered_3d_inside_outages": float(np.mean(covered[1][lost])) if lost.any() else float("nan"),
     }  # fmt: skip
 
 
@@ -108,16 +117,21 @@ def simulated(seeds: int) -> dict[str, dict[str, Figures]]:
         runs = []
         for seed in range(seeds):
             motion, imu, fixes, _ = simulate(seed, **gnss)
-            runs.append({name: judge(found, motion) for name, found in estimate(imu, fixes).items()})
-        print(f"\n{case:36} h rms m   u rms m  yaw rms °  in outages m (mean of worst)")
+            outages = gnss.get("outages", ())
+            runs.append({name: judge(found, motion, outages) for name, found in estimate(imu, fixes).items()})
+        print(f"\n{case:36} h rms m   u rms m  yaw rms °  90 % h, 3D  in outages m (mean of worst), 90 %")
         table[case] = {}
         for name in runs[0]:
             mean = {key: float(np.mean([run[name][key] for run in runs])) for key in runs[0][name]}
             outage = ""
             if "outages" in gnss:
-                outage = f"{mean['inside_outages_m']:8.3f} ({mean['inside_outages_max_m']:.2f})"
-            figures = (mean["horizontal_m"], mean["vertical_m"], mean["heading_deg"])
-            print(f"  {name:32}" + "{:9.3f} {:9.3f} {:9.3f}".format(*figures) + outage)
+                outage = "{inside_outages_m:8.3f} ({inside_outages_max_m:.2f})".format(**mean)
+                outage += " {covered_horizontal_inside_outages:.2f} {covered_3d_inside_outages:.2f}".format(
+                    **mean
+                )
+            line = "{horizontal_m:9.3f} {vertical_m:9.3f} {heading_deg:9.3f}"
+            line += "    {covered_horizontal:.2f} {covered_3d:.2f}"
+            print(f"  {name:32}" + line.format(**mean) + outage)
             table[case][name] = mean
     return table
 

@@ -11,7 +11,7 @@ from factor_graphs.chi_square import probability_below
 Array = NDArray[np.float64]
 
 # Slip is never believed to be less, m/s, nor to change faster, s.
-LEAST_SLIP, LEAST_LASTING_S = 0.03, 1.0
+LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
 # The heading of a solution drifts, and looks like slip; over this time, s, it does not.
 DRIFT_S = 20.0
 # Huber's loss of the fit, and where squares are cut, in standard deviations; what a cut leaves of a normal variance.
@@ -47,16 +47,18 @@ def explain(
     `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
     (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
     """
-    x, parts, window = np.zeros(len(stddevs)), np.zeros(3), (np.cumsum(spacing) / DRIFT_S).astype(int)
-    drift = np.zeros(window[-1] + 1)
-    left: Array = y
+    x: Array = np.zeros(len(stddevs))
+    window = (np.cumsum(spacing) / DRIFT_S).astype(int)
+    left, drift, parts = y, np.zeros(window[-1] + 1), np.zeros(3)
     variance: Array = np.full(len(y), max(robust_stddev(y), LEAST_SLIP) ** 2)
     for _ in range(ROUNDS):
         weights = spacing * _huber(y - by @ x, variance)
-        x = np.linalg.solve((by.T * weights) @ by + np.diag(stddevs**-2), (by.T * weights) @ y)
+        information = (by.T * weights) @ by + np.diag(stddevs**-2)
+        x = np.linalg.inv(information) @ (by.T * weights) @ y
         left = y - by @ x - drift[window] * ahead
         weights = _huber(left, variance)
-        drift += np.bincount(window, weights * left * ahead) / np.bincount(window, weights * ahead**2 + 1e-12)
+        lever = np.bincount(window, weights * ahead**2)
+        drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
         left = y - by @ x - drift[window] * ahead
         left = np.clip(left, -CUT * np.sqrt(variance), CUT * np.sqrt(variance))
         scale = np.sqrt(spacing) / variance

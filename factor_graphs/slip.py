@@ -39,10 +39,11 @@ class Slip:
 
 def explain(
     y: Array, by: Array, stddevs: Array, ahead: Array, grows_with: Array, spacing: Array
-) -> tuple[Array, Slip]:
+) -> tuple[Array, Slip, Array]:
     """The x (n,) of y = by x + slip, and the slip: each from the other in turn (iteratively reweighted least squares).
 
-    The mean slope of every `DRIFT_S` s is neither: it is the drift of heading.
+    Third, what is neither (k,) m/s: a skid, zero where there is none. The mean slope of every `DRIFT_S` s is the drift
+    of heading.
 
     `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
     (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
@@ -59,14 +60,15 @@ def explain(
         weights = _huber(left, variance)
         lever = np.bincount(window, weights * ahead**2)
         drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
-        left = y - by @ x - drift[window] * ahead
-        left = np.clip(left, -CUT * np.sqrt(variance), CUT * np.sqrt(variance))
+        left, most = y - by @ x - drift[window] * ahead, CUT * np.sqrt(variance)
         scale = np.sqrt(spacing) / variance
-        parts = nnls(grows_with * scale[:, None], left**2 / LEFT * scale)[0]
+        parts = nnls(grows_with * scale[:, None], np.clip(left, -most, most) ** 2 / LEFT * scale)[0]
         parts[0] = max(parts[0], LEAST_SLIP**2)
         variance = grows_with @ parts
     typical = float(np.sqrt(np.average(variance, weights=spacing)))
-    return x, Slip(parts, _lasting(left / np.sqrt(variance), spacing), typical)
+    off = left / np.sqrt(variance)
+    slip = Slip(parts, _lasting(np.clip(off, -CUT, CUT), spacing), typical)
+    return x, slip, np.where(np.abs(off) > CUT, left, 0.0)
 
 
 def _huber(off: Array, variance: Array) -> Array:

@@ -30,6 +30,8 @@ MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 MOST_SLIP, MOST_SLOPE = 0.04, 0.3
 # Slip, m/s, of what was not seen to slide.
 UNSEEN_SLIP = 0.1
+# A skid is so many times less certain than it is fast.
+SKID = 3.0
 # Yaw rate is the mean over so long, s: a single sample is noise.
 RATE_WINDOW_S = 0.1
 
@@ -80,11 +82,13 @@ class Vehicle:
 
     `mounting` (4,): slopes of the direction of travel in the imu's axes, to the left and upwards; how far the IMU is
     ahead of the axle, m; angle of the tyres, rad per m/s². `mounting_stddevs` (4,) once it was part of a graph.
-    `slip`: lateral and vertical. `doubt`: why it is no such vehicle, or nothing. `held`: the constraint is on.
+    `slip`: lateral and vertical; `skids` (k, 2) m/s: what does not fit it, zero where all fits. `doubt`: why it is no
+    such vehicle, or nothing. `held`: the constraint is on.
     """
 
     mounting: Array
     slip: tuple[Slip, Slip]
+    skids: Array
     doubt: str = ""
     held: bool = False
     mounting_stddevs: Array | None = None
@@ -101,7 +105,9 @@ class Vehicle:
 
     def slip_stddevs(self, motion: BodyMotion) -> Array:
         """Standard deviation of lateral and vertical slip at every keyframe, (k, 2) m/s."""
-        return np.column_stack([one.stddevs(motion.grows_with(), motion.spacing) for one in self.slip])
+        usual = np.column_stack([one.stddevs(motion.grows_with(), motion.spacing) for one in self.slip])
+        # where it skids it says nothing of its heading: so uncertain that it hardly counts
+        return np.asarray(np.hypot(usual, SKID * self.skids), np.float64)
 
     def __str__(self) -> str:
         (yaw, pitch), (lateral, vertical) = self.yaw_pitch_deg, self.typical_slip
@@ -132,15 +138,16 @@ def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
 def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
-    seen = motion[moving & _beside_fixes(problem, fit)]
+    where = moving & _beside_fixes(problem, fit)
+    seen, skids = motion[where], np.zeros((len(where), 2))
     time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
     if time < LEAST_TIME_S or way < LEAST_WAY_M:
         unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
         doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
-        return Vehicle(np.zeros(4), (unseen, unseen), doubt)
+        return Vehicle(np.zeros(4), (unseen, unseen), skids, doubt)
     mounting, by_mounting, slip = np.zeros(4), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):
-        mounting[part], its_slip = explain(
+        mounting[part], its_slip, skids[where, row] = explain(
             seen.velocity[:, 1 + row],
             by_mounting[:, row, part],
             MOUNTING_STDDEVS[part],
@@ -149,7 +156,7 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
             seen.spacing,
         )
         slip.append(its_slip)
-    return Vehicle(mounting, (slip[0], slip[1]), _doubt(mounting, seen))
+    return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))
 
 
 def _doubt(mounting: Array, motion: BodyMotion) -> str:

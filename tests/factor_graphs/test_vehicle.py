@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
-from factor_graphs.rigid_motion import Mounted, RigidMotion, drone, hand_held
+from factor_graphs.rigid_motion import FreeMotion, Mounted, RigidMotion, drone, hand_held
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import Motion, follow, random_drive
 from factor_graphs.slip import LEAST_SLIP, Slip, explain
@@ -40,6 +41,17 @@ def shunting(seconds: float, rng: np.random.Generator) -> Motion:
     return follow(np.column_stack([way, 15 * np.sin(way / 30), 0 * way]), t, speeds, suspension_deg=0.3)
 
 
+def skidding(seconds: float, rng: np.random.Generator) -> FreeMotion:
+    """A random drive whose tail breaks out by 12° for a second or two, four times."""
+    motion = random_drive(seconds, rng)
+    t = np.arange(0.0, motion.end, 0.05)
+    T, fast = motion.poses(t), np.linalg.norm(motion.velocities(t), axis=1) > 5.0
+    euler = np.unwrap(Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX"), axis=0)
+    for moment in rng.choice(t[fast & (t > 20.0) & (t < seconds - 20.0)], 4):
+        euler[:, 0] += np.radians(12.0) * np.exp(-0.5 * ((t - moment) / 1.2) ** 2)
+    return FreeMotion(make_interp_spline(t, T[:, :3, 3], k=5), make_interp_spline(t, euler, k=5))
+
+
 def seen(motion: RigidMotion, stamps: np.ndarray) -> BodyMotion:
     R_imu_map = np.swapaxes(motion.poses(stamps)[:, :3, :3], 1, 2)
     velocity = np.einsum("kij,kj->ki", R_imu_map, motion.velocities(stamps))
@@ -70,11 +82,13 @@ def test_slip_is_found_beside_skids_and_drift_with_its_size_and_its_duration(ski
     ahead = rng.uniform(5.0, 15.0, k)
     slip = 0.1 * gauss_markov(k, np.exp(-spacing / 1.0), rng)
     drift = 0.05 * np.sin(2 * np.pi * np.arange(k) * spacing / 300) * ahead
-    skids = np.where(rng.random(k) < skidding, 3.0, 0.0)
+    pushed = np.where(rng.random(k) < skidding, 3.0, 0.0)
     by, grows_with = ahead[:, None], np.column_stack([np.ones(k), ahead**2, np.zeros(k)])
-    y = 0.03 * ahead + slip + drift + skids
-    (slope,), found = explain(y, by, np.array([0.2]), ahead, grows_with, np.full(k, spacing))
+    y = 0.03 * ahead + slip + drift + pushed
+    (slope,), found, skids = explain(y, by, np.array([0.2]), ahead, grows_with, np.full(k, spacing))
     assert slope == pytest.approx(0.03, abs=0.005)
+    assert np.all(skids[pushed > 0] > 2.0)
+    assert np.mean(skids[pushed == 0] == 0) > 0.97
     assert found.typical == pytest.approx(0.1, rel=0.3)
     assert found.lasting_s == pytest.approx(2.0, rel=0.5 if skidding else 0.25)
 
@@ -84,7 +98,7 @@ def test_slip_that_grows_is_small_where_it_is_slow():
     ahead = rng.uniform(2.0, 20.0, k)
     grows_with = np.column_stack([np.ones(k), ahead**2, np.zeros(k)])
     y = 0.01 * ahead * rng.standard_normal(k)
-    _, slip = explain(y, ahead[:, None], np.array([0.2]), ahead, grows_with, np.ones(k))
+    _, slip, _ = explain(y, ahead[:, None], np.array([0.2]), ahead, grows_with, np.ones(k))
     slow, fast = np.array([[1.0, 0.0, 0.0], [1.0, 400.0, 0.0]]) @ slip.parts
     assert np.sqrt(fast) == pytest.approx(0.2, rel=0.15)
     assert np.sqrt(slow) < 2 * LEAST_SLIP
@@ -136,6 +150,20 @@ def test_a_vehicle_that_reverses_keeps_its_heading(simulate):
     assert solution.vehicle.held
     e = errors(solution.keyframes, drive.motion.trajectory(solution.keyframes.stamps))
     assert np.degrees(np.abs(e.rotation[:, 2])).max() < 0.5
+
+
+@pytest.mark.integration
+def test_a_skid_does_not_turn_the_heading(simulate):
+    off, found = [], []
+    for seed in (100, 101, 102):
+        drive = simulate(seed, seconds=200.0, noise=ImuNoise(), moves=skidding)
+        truth = drive.motion.trajectory
+        for wanted, heading in (("off", off), ("auto", found)):
+            s = smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(vehicle_constraint=wanted), LEVER)
+            heading.append(errors(s.keyframes, truth(s.keyframes.stamps)).heading_rms_deg)
+        assert s.vehicle.held
+        assert np.abs(s.vehicle.skids[:, 0]).max() > 1.0
+    assert np.mean(found) < np.mean(off)
 
 
 @pytest.mark.integration

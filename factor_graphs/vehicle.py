@@ -28,6 +28,8 @@ SIDEWAYS, UPWARDS = [0, 2, 3], [1]
 MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 # What slides more than this share of its speed, or looks farther off its course, is no vehicle with an IMU on it.
 MOST_SLIP, MOST_SLOPE = 0.04, 0.3
+# Farther than this from a fix, s, a solution is too uncertain to show slip.
+BESIDE_S = 2.0
 # Slip, m/s, of what was not seen to slide.
 UNSEEN_SLIP = 0.1
 # A skid is so many times less certain than it is fast.
@@ -178,7 +180,7 @@ def _beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
         return np.zeros(len(stamps), dtype=bool)
     after = np.searchsorted(good, stamps).clip(max=len(good) - 1)
     nearest = np.minimum(np.abs(good[after] - stamps), np.abs(good[np.maximum(after - 1, 0)] - stamps))
-    beside: NDArray[np.bool_] = nearest <= 1.5 * np.median(np.diff(good))
+    beside: NDArray[np.bool_] = nearest <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
 
 

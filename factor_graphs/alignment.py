@@ -25,6 +25,8 @@ CRUISE_NOISE_DENSITY = 1.5
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
 # The gyroscope's heading is tied to the course over this long, s.
 HEADING_WINDOW_S = 20.0
+# Over this long, s, a vehicle goes more forward than backward.
+FORWARD_WINDOW_S = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +74,19 @@ def constant_velocity(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array,
     kalman.H = np.eye(3, 6)
     stamps = intervals.keyframes
     fix_at = dict(zip(intervals.keyframe_of(fixes.stamps).tolist(), range(len(fixes)), strict=True))
-    means, covariances, Fs, Qs = [], [], [], []
-    for i, dt in enumerate(np.diff(stamps, prepend=stamps[0])):
-        F = np.eye(6)
-        F[:3, 3:] = dt * np.eye(3)
-        Q = np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], CRUISE_NOISE_DENSITY**2 * np.eye(3))
+    dt = np.diff(stamps, prepend=stamps[0])
+    Fs, Qs, axes = np.tile(np.eye(6), (len(dt), 1, 1)), np.zeros((len(dt), 6, 6)), np.arange(3)
+    Fs[:, axes, axes + 3] = dt[:, None]
+    Qs[:, axes, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 3 / 3
+    Qs[:, axes, axes + 3] = Qs[:, axes + 3, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 2 / 2
+    Qs[:, axes + 3, axes + 3] = CRUISE_NOISE_DENSITY**2 * dt[:, None]
+    means, covariances = [], []
+    for i, (F, Q) in enumerate(zip(Fs, Qs, strict=True)):
         kalman.predict(F=F, Q=Q)
         if i in fix_at:
             kalman.update(fixes.positions[fix_at[i]], R=np.diag(fixes.stddevs[fix_at[i]] ** 2))
         means.append(kalman.x)
         covariances.append(kalman.P)
-        Fs.append(F)
-        Qs.append(Q)
     smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0]
     return smoothed[:, :3], smoothed[:, 3:]
 
@@ -102,7 +105,11 @@ def attitudes(
     if attitude is not None:
         weight[0] = 1 / attitude.stddevs[2]
         ahead[0] = np.exp(1j * np.arctan2(attitude.R_map_imu[1, 0], attitude.R_map_imu[0, 0]))
-    heading = turned + np.angle(_smooth(intervals.keyframes, ahead, weight))
+    # the course is along the axis of the vehicle, whether it goes forward or reverses
+    axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_WINDOW_S)
+    axis = np.exp(0.5j * np.unwrap(np.angle(axis)))
+    forward = _smooth(intervals.keyframes, ahead * axis.conj(), weight, FORWARD_WINDOW_S).real
+    heading = turned + np.angle(np.where(forward < 0, -axis, axis))
     return (Rotation.from_euler("z", heading[:, None]) * Rotation.from_matrix(level)).as_matrix()
 
 
@@ -117,7 +124,9 @@ def _without_heading(R: Array) -> Array:
     return Rotation.from_euler("z", -np.arctan2(R[1, 0], R[0, 0])).as_matrix() @ R
 
 
-def _smooth(stamps: Array, directions: NDArray[np.complex128], weights: Array) -> NDArray[np.complex128]:
+def _smooth(
+    stamps: Array, directions: NDArray[np.complex128], weights: Array, window_s: float
+) -> NDArray[np.complex128]:
     """Weighted mean of unit numbers over a Gaussian window; the nearest known where the window is empty."""
     if not weights.any():
         return np.ones(len(stamps), dtype=complex)
@@ -125,7 +134,7 @@ def _smooth(stamps: Array, directions: NDArray[np.complex128], weights: Array) -
     cell = ((stamps - stamps[0]) / step).astype(int)
     total = np.zeros((3, cell[-1] + 1))
     np.add.at(total.T, cell, np.column_stack([weights, weights * directions.real, weights * directions.imag]))
-    total = gaussian_filter1d(total, HEADING_WINDOW_S / step, axis=1, mode="constant", truncate=4.0)
+    total = gaussian_filter1d(total, window_s / step, axis=1, mode="constant", truncate=4.0)
     known = np.flatnonzero(total[0] > 1e-3 * total[0].max())
     nearest = _nearest(known, np.arange(total.shape[1]))
     smoothed: NDArray[np.complex128] = (total[1] + 1j * total[2])[nearest][cell]

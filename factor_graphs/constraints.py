@@ -9,10 +9,11 @@ from collections.abc import Iterator
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import V, X
+from gtsam.symbol_shorthand import M, V, X
 from numpy.typing import NDArray
 
 from factor_graphs.intervals import ImuIntervals
+from factor_graphs.vehicle import MOUNTING_STDDEVS, BodyMotion
 
 Array = NDArray[np.float64]
 
@@ -20,26 +21,26 @@ Array = NDArray[np.float64]
 STANDING_SPEED, QUIET = 0.3, 2.0
 
 
-def body_velocity_factors(
-    T: Array, velocities: Array, axis: int, stddev_mps: float
-) -> Iterator[gtsam.LinearContainerFactor]:
-    """The velocity along one axis of the imu (1 lateral, 2 vertical) is zero, linearised at these states.
+def non_holonomic_factors(
+    values: gtsam.Values, motion: BodyMotion, stddevs: Array
+) -> Iterator[gtsam.NonlinearFactor]:
+    """The axle slides by `stddevs` (k, 2) m/s, lateral and vertical, linearised at `values`, which `motion` is of.
 
-    With v_imu = Rᵀ v and R perturbed on the right, d v_imu = [v_imu]× dθ + Rᵀ dv.
+    The mounting, M(k), is one unknown of all rows, and has a prior. With v_imu = Rᵀ v and R perturbed on the right,
+    d v_imu = [v_imu]× dθ + Rᵀ dv.
     """
-    model = gtsam.noiseModel.Unit.Create(1)
-    for i, (pose, velocity) in enumerate(zip(T, velocities, strict=True)):
-        R = pose[:3, :3]
-        in_imu = R.T @ velocity
-        by_pose, by_velocity = np.zeros((1, 6)), R.T[axis : axis + 1] / stddev_mps
-        by_pose[0, :3] = np.cross(in_imu, np.eye(3))[:, axis] / stddev_mps
-        row = gtsam.JacobianFactor(
-            X(i), by_pose, V(i), by_velocity, -in_imu[axis : axis + 1] / stddev_mps, model
-        )
-        here = gtsam.Values()
-        here.insert(X(i), gtsam.Pose3(pose))
-        here.insert(V(i), velocity)
-        yield gtsam.LinearContainerFactor(row, here)
+    k, unit = len(stddevs), gtsam.noiseModel.Unit.Create(2)
+    mounting, scale = values.atVector(M(k)), 1 / stddevs[:, :, None]
+    across = motion.by_velocity(mounting)
+    by_pose, by_mounting = np.zeros((k, 2, 6)), -motion.by_mounting()
+    by_pose[:, :, :3] = across @ np.cross(motion.velocity[:, None], np.eye(3)).swapaxes(1, 2)
+    by_velocity = across @ motion.R_imu_map
+    by_pose, by_velocity, by_mounting = by_pose * scale, by_velocity * scale, by_mounting * scale
+    off = -motion.sliding(mounting) / stddevs
+    for i in range(k):
+        row = gtsam.JacobianFactor(X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit)
+        yield gtsam.LinearContainerFactor(row, values)
+    yield gtsam.PriorFactorVector(M(k), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
 
 
 def zero_velocity_factors(

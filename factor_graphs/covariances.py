@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
@@ -25,7 +25,7 @@ INDEX_BITS = 56
 # Keyframes that are eliminated in one call; more take memory, fewer take time.
 TOGETHER = 20
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe.
-PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15)}
+PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15), ord("m"): slice(0, 4)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,14 +77,25 @@ def _split(key: int) -> tuple[int, int]:
     return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
 
-def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15)."""
-    net = list(eliminate(graph.linearize(values), k))
+def keyframe_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
+) -> tuple[Array, Array]:
+    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k), (4, 4), or (0, 0).
+
+    M(k) is what all keyframes share, the mounting of the IMU: it is eliminated last, as if it were one more keyframe.
+    """
+    shared = (M(k),) if values.exists(M(k)) else ()
+    net = list(eliminate(graph.linearize(values), k, shared))
     covariances = np.empty((k, SIZE, SIZE))
     # The joint covariance of a keyframe and of those it depends on. The IMU binds each keyframe to the next, so those
     # of the one before it are among them, and memory does not grow with the drive.
     known: list[int] = []
     joint = np.empty((0, 0))
+    of_shared = np.empty((0, 0))
+    if shared:
+        root = np.linalg.inv(net[3 * k].R)
+        of_shared = root @ root.T
+        known, joint = [k], np.pad(of_shared, (0, SIZE - len(of_shared)))
     for i in reversed(range(k)):
         R, later, S = _of_keyframe(i, net[3 * i : 3 * i + 3])
         own, _ = dtrtri(R)
@@ -95,7 +106,7 @@ def keyframe_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
         covariances[i] = (covariance + covariance.T) / 2
         joint = np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
         known = [i, *later]
-    return covariances
+    return covariances, of_shared
 
 
 def _of(keyframes: list[int], known: list[int], joint: Array) -> Array:
@@ -111,7 +122,7 @@ def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Ar
     later = sorted({index for row in keys for _, index in row} - {i})
     start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
     columns = np.zeros((SIZE, SIZE * (1 + len(later))))
-    for rows, part, row in zip(PLACES.values(), parts, keys, strict=True):
+    for rows, part, row in zip(PLACES.values(), parts, keys, strict=False):
         matrix, column = np.hstack([part.R, part.S]), 0
         for letter, index in row:
             place, first = PLACES[letter], start[index]

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.calibration import Calibration, correct
-from factor_graphs.constraints import body_velocity_factors, standing, zero_velocity_factors
-from factor_graphs.graph import from_values
+from factor_graphs.constraints import non_holonomic_factors, standing, zero_velocity_factors
 from factor_graphs.problem import Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
+from factor_graphs.vehicle import Vehicle, body_motion, observe, with_mounting
 
 Array = NDArray[np.float64]
 
@@ -23,8 +24,8 @@ INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
-# After the second linearisation the constraints are exact to three digits.
-CONSTRAINT_ROUNDS = 2
+# The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
+CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
 
 
 def fit_noise(
@@ -86,29 +87,38 @@ def calibrate(
     return problem, fit, calibration
 
 
-def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFactor]]:
+def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None]:
     """Add what a road vehicle cannot do, linearised at the solution, and again at the one that follows.
 
-    A vehicle that is known to stand shows more of the IMU's noise, so that is looked at again as well.
+    Slip is looked at again as well, for a heading that drifts looks like slip until it is held; and the IMU's noise,
+    which a vehicle that is known to stand shows better. The vehicle is None where the constraint is not wanted.
     """
-    settings = problem.settings
-    axes = [(1, settings.lateral_stddev_mps), (2, settings.vertical_stddev_mps)]
+    settings, motion = problem.settings, body_motion(problem, fit)
+    vehicle = None if settings.vehicle_constraint == "off" else observe(problem, fit, motion)
+    held = vehicle is not None and (settings.vehicle_constraint == "on" or not vehicle.doubt)
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
+    settled = not held
     for _ in range(CONSTRAINT_ROUNDS):
-        T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
-        stands = standing(problem.intervals, velocities) & (settings.standing_stddev_mps is not None)
-        rows = [
-            row for axis, s in axes if s is not None for row in body_velocity_factors(T, velocities, axis, s)
-        ]
-        if not rows and stood is not None and np.array_equal(stands, stood):
+        stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
+        if settled and stood is not None and np.array_equal(stands, stood):
             break
         stood = stands
-        factors = [*rows, *zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
+        factors = [*zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
+        if vehicle is not None and held:
+            fit = with_mounting(problem, fit, vehicle.mounting)
+            factors += non_holonomic_factors(fit.values, motion, vehicle.slip_stddevs(motion))
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)
-    return fit, factors
+        before, motion = motion, body_motion(problem, fit)
+        if vehicle is not None and held:
+            mounting = fit.values.atVector(M(len(motion.velocity)))
+            guessed, vehicle = vehicle, replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            settled = np.allclose(guessed.typical_slip, vehicle.typical_slip, rtol=SETTLED_SLIP) and bool(
+                np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS
+            )
+    return fit, factors, vehicle
 
 
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:

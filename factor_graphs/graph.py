@@ -38,7 +38,7 @@ def imu_factors(
 
     The keyframes are numbered from `first`.
     """
-    params = {id(n): preintegration_params(n, frame) for n in noise}
+    params = {key: preintegration_params(n, frame) for key, n in {id(n): n for n in noise}.items()}
     steps = zip(intervals.specific_force, intervals.angular_rate, intervals.durations.tolist(), strict=True)
     for i, (its_noise, count) in enumerate(
         zip(noise, np.diff(intervals.bounds).tolist(), strict=True), first

@@ -1,5 +1,7 @@
 """How the trajectory is estimated: every choice that a user may make, with its default and its reason."""
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.measurements import ImuNoise
@@ -39,13 +41,9 @@ class SmootherSettings(BaseModel):
     standing_stddev_mps: float | None = Field(
         0.03, gt=0, description="Velocity of a vehicle seen to stand (zero-velocity update). Empty: not used."
     )
-    lateral_stddev_mps: float | None = Field(
-        None,
-        gt=0,
-        description="Sideways velocity of a vehicle whose IMU looks straight ahead. Empty: not used.",
-    )
-    vertical_stddev_mps: float | None = Field(
-        None, gt=0, description="Vertical velocity in the IMU's own axes, likewise. Empty: not used."
+    vehicle_constraint: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="The axle of a vehicle does not slide. auto: where the drive itself shows that, and how little.",
     )
     start_tilt_stddev_rad: float = Field(0.2, gt=0, description="Unknown roll and pitch of the first guess.")
     start_heading_stddev_rad: float = Field(0.7, gt=0, description="Unknown heading of the first guess.")

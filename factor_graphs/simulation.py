@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.trajectory import Trajectory
+from factor_graphs.rigid_motion import RigidMotion, turn_rates
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ _SHARES = np.array([[0.7, 0.3], [0.7, 0.3]])
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class Motion(RigidMotion):
     """Exact motion: a path (spline of the way driven, m, to the map frame, m) driven at a speed over time.
 
     Heading follows the course and pitch the slope, both as functions of the way, so they are defined
@@ -73,26 +73,10 @@ class Motion:
         s, v, a = self.way(stamps), self._speed(stamps), self._speed(stamps, 1)
         return self.path(s, 2) * v**2 + self.path(s, 1) * a
 
-    def specific_force(self, stamps: ArrayLike, frame: LocalFrame) -> Array:
-        """What a perfect accelerometer reads, (k, 3) m/s², gravity and Coriolis included (Groves 2013)."""
-        coriolis = 2 * np.cross(frame.earth_rate, self.velocities(stamps))
-        force = self.accelerations(stamps) + coriolis + np.array([0.0, 0.0, frame.gravity])
-        return self._attitude(self.way(stamps)).inv().apply(force)
-
-    def angular_rate(self, stamps: ArrayLike, frame: LocalFrame) -> Array:
-        """What a perfect gyroscope reads, (k, 3) rad/s, the rotation of the Earth included."""
-        s = self.way(stamps)
-        (_, pitch, roll), (yaw_rate, pitch_rate, roll_rate) = self._euler(s)
-        in_imu = np.column_stack([
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
-            yaw_rate * np.cos(pitch) * np.cos(roll) - pitch_rate * np.sin(roll),
-        ])  # fmt: skip
-        return in_imu * self._speed(stamps) + self._attitude(s).inv().apply(frame.earth_rate)
-
-    def trajectory(self, stamps: ArrayLike) -> Trajectory:
-        """The exact trajectory at these stamps, with velocities."""
-        return Trajectory(np.asarray(stamps, np.float64), self.poses(stamps), self.velocities(stamps))
+    def turn_rates(self, stamps: ArrayLike) -> Array:
+        """How fast the body turns in the map frame, about its own axes, (k, 3) rad/s."""
+        euler, by_way = (np.column_stack(angles) for angles in self._euler(self.way(stamps)))
+        return turn_rates(euler, by_way) * self._speed(stamps)
 
     def _speed(self, stamps: ArrayLike, derivative: int = 0) -> Array:
         return np.asarray(self.speed(np.asarray(stamps, dtype=np.float64), derivative))[:, None]
@@ -117,15 +101,16 @@ class Motion:
 def follow(waypoints: ArrayLike, stamps: ArrayLike, speeds: ArrayLike, suspension_deg: float = 0.0) -> Motion:
     """The motion along a smooth path through waypoints, at given speeds.
 
-    `waypoints` (n, 3) m in the map frame, n >= 6, of the imu; `stamps` (m,) s; `speeds` (m,) m/s, not
-    negative, at those stamps and without overshoot between them (PCHIP): two zeros in a row are a real
-    stop. Raises MeasurementError for another shape and when the speeds drive beyond the last waypoint.
+    `waypoints` (n, 3) m in the map frame, n >= 6, of the imu; `stamps` (m,) s; `speeds` (m,) m/s, at
+    those stamps and without overshoot between them (PCHIP): two zeros in a row are a real stop, and below zero
+    the vehicle goes back along the path. Raises MeasurementError for another shape and when the speeds drive
+    beyond the first or last waypoint.
     """
     points, t, v = (np.asarray(a, dtype=np.float64) for a in (waypoints, stamps, speeds))
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 6 or not np.isfinite(points).all():
         raise MeasurementError(f"waypoints have shape {points.shape}; expected (n, 3), n >= 6, all finite")
-    if t.ndim != 1 or t.shape != v.shape or len(t) < 2 or np.any(np.diff(t) <= 0) or np.any(v < 0):
-        raise MeasurementError("stamps and speeds must be (m,), m >= 2, stamps increasing, speeds >= 0")
+    if t.ndim != 1 or t.shape != v.shape or len(t) < 2 or np.any(np.diff(t) <= 0):
+        raise MeasurementError("stamps and speeds must be (m,), m >= 2, stamps increasing")
     by_chord = make_interp_spline(_chord_length(points), points, k=5)
     # once more with the length of that curve as the parameter: then the speeds are metres per second
     chord = np.linspace(by_chord.t[0], by_chord.t[-1], max(20, int(by_chord.t[-1]) * 2))
@@ -134,11 +119,13 @@ def follow(waypoints: ArrayLike, stamps: ArrayLike, speeds: ArrayLike, suspensio
     motion = Motion(
         make_interp_spline(length, by_chord(chord), k=5), PchipInterpolator(t, v), np.radians(suspension_deg)
     )
-    driven = float(motion.speed.antiderivative()(t[-1]))
-    if driven > length[-1] + 1e-6:
+    driven = motion.speed.antiderivative()(np.linspace(t[0], t[-1], 20 * len(t)))
+    if driven.max() > length[-1] + 1e-6:
         raise MeasurementError(
-            f"the speeds drive {driven:.1f} m but the path is {length[-1]:.1f} m long; add waypoints"
+            f"the speeds drive {driven.max():.1f} m but the path is {length[-1]:.1f} m long; add waypoints"
         )
+    if driven.min() < -1e-6:
+        raise MeasurementError(f"the speeds drive back {-driven.min():.1f} m beyond the first waypoint")
     return motion
 
 
@@ -194,7 +181,7 @@ def simulate_biases(stamps: ArrayLike, noise: ImuNoise, rng: np.random.Generator
 
 
 def simulate_imu(
-    motion: Motion,
+    motion: RigidMotion,
     stamps: ArrayLike,
     frame: LocalFrame,
     noise: ImuNoise | None = None,
@@ -229,7 +216,7 @@ def simulate_imu(
 
 
 def simulate_gnss(
-    motion: Motion,
+    motion: RigidMotion,
     stamps: ArrayLike,
     stddevs: ArrayLike,
     p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),

@@ -1,7 +1,7 @@
 """The batch smoother: IMU and GNSS in, the most probable trajectory out, with covariance."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,7 @@ from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
+from factor_graphs.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,7 @@ class Solution:
     imu_noise: ImuNoise
     calibration: Calibration
     iterations: int
+    vehicle: Vehicle | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -90,14 +92,18 @@ def smooth(
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
-    fit, constraints = constrain(problem, fit)
+    fit, constraints, vehicle = constrain(problem, fit)
     fit = reject(problem, fit, constraints)
-    return _solution(problem, fit, fixes, calibration)
+    return _solution(problem, fit, fixes, calibration, vehicle)
 
 
-def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration) -> Solution:
+def _solution(
+    problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration, vehicle: Vehicle | None
+) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
-    covariances = keyframe_covariances(fit.graph, fit.values, len(T))
+    covariances, of_mounting = keyframe_covariances(fit.graph, fit.values, len(T))
+    if vehicle is not None and vehicle.held:
+        vehicle = replace(vehicle, mounting_stddevs=np.sqrt(of_mounting.diagonal()))
     of_poses = covariances[:, :6, :6]
     if are_drifting(fixes[problem.used]):
         of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])
@@ -124,7 +130,8 @@ def _solution(problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibra
         imu_noise=noise,
         calibration=calibration,
         iterations=fit.iterations,
-        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
+        vehicle=vehicle,
+        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration), *_on_wheels(vehicle)),
     )
 
 
@@ -168,6 +175,16 @@ def _doubts(
     heading = heading_stddevs(keyframes)
     if heading.min() > UNKNOWN_HEADING:
         yield f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): did the vehicle move?"
+
+
+def _on_wheels(vehicle: Vehicle | None) -> Iterator[str]:
+    """Whether the vehicle constraint took part, and what it is, in words."""
+    if vehicle is None:
+        return
+    if vehicle.held:
+        yield f"vehicle constraint on: {vehicle}"
+    if vehicle.doubt:
+        yield f"vehicle constraint {'in doubt' if vehicle.held else 'off'}: {vehicle.doubt}"
 
 
 def heading_stddevs(trajectory: Trajectory) -> Array:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.simulation import Motion, random_drive, simulate_biases, simulate_gnss, simulate_imu
+from factor_graphs.rigid_motion import RigidMotion
+from factor_graphs.simulation import random_drive, simulate_biases, simulate_gnss, simulate_imu
 from factor_graphs.smoothing import Solution, smooth
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
@@ -23,16 +24,22 @@ STDDEVS = (1.0, 1.0, 2.0)
 class Drive:
     """What happened, and what the sensors said of it."""
 
-    motion: Motion
+    motion: RigidMotion
     imu: ImuSamples
     fixes: GnssFixes
     biases: NDArray[np.float64]
 
 
-def drive(seed: int, seconds: float = 120.0, noise: ImuNoise | None = None, **gnss: object) -> Drive:
+def drive(
+    seed: int,
+    seconds: float = 120.0,
+    noise: ImuNoise | None = None,
+    moves: Callable[[float, np.random.Generator], RigidMotion] = random_drive,
+    **gnss: object,
+) -> Drive:
     """A random drive with a 100 Hz MEMS IMU (exact when `noise` is None) and 1 Hz fixes."""
     rng = np.random.default_rng(seed)
-    motion = random_drive(seconds, rng)
+    motion = moves(seconds, rng)
     stamps = np.arange(0.0, seconds, 0.01)
     biases = np.zeros((len(stamps), 6)) if noise is None else simulate_biases(stamps, noise, rng)
     imu = simulate_imu(motion, stamps, FRAME, noise, rng, biases=biases)

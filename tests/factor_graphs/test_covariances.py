@@ -1,9 +1,9 @@
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, M, V, X
 
 from factor_graphs.covariances import keyframe_covariances
-from factor_graphs.fitting import fit_noise
+from factor_graphs.fitting import constrain, fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.problem import pose_problem
@@ -24,7 +24,8 @@ def test_they_are_those_of_gtsams_marginals(simulate):
     fit, k = fit_noise(problem), len(problem.intervals.keyframes)
     marginals = gtsam.Marginals(fit.graph, fit.values)
     theirs = [marginals.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix() for i in range(k)]
-    assert relative_difference(keyframe_covariances(fit.graph, fit.values, k), np.array(theirs)) < 1e-5
+    ours, _ = keyframe_covariances(fit.graph, fit.values, k)
+    assert relative_difference(ours, np.array(theirs)) < 1e-5
 
 
 def test_they_hold_where_factors_reach_over_several_keyframes(simulate):
@@ -38,4 +39,18 @@ def test_they_hold_where_factors_reach_over_several_keyframes(simulate):
         graph.push_back(gtsam.BetweenFactorPose3(X(i), X(i + 5), between, model))
     marginals = gtsam.Marginals(graph, fit.values)
     theirs = [marginals.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix() for i in range(k)]
-    assert relative_difference(keyframe_covariances(graph, fit.values, k), np.array(theirs)) < 1e-5
+    ours, _ = keyframe_covariances(graph, fit.values, k)
+    assert relative_difference(ours, np.array(theirs)) < 1e-5
+
+
+def test_they_hold_where_all_keyframes_share_an_unknown(simulate):
+    drive = simulate(3, seconds=120.0, noise=ImuNoise())
+    problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
+    fit, _, vehicle = constrain(problem, fit_noise(problem))
+    assert vehicle.held
+    k = len(problem.intervals.keyframes)
+    marginals = gtsam.Marginals(fit.graph, fit.values)
+    theirs = [marginals.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix() for i in range(k)]
+    ours, of_mounting = keyframe_covariances(fit.graph, fit.values, k)
+    assert relative_difference(ours, np.array(theirs)) < 1e-5
+    assert relative_difference(of_mounting[None], marginals.marginalCovariance(M(k))[None]) < 1e-5

@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
+from factor_graphs.rigid_motion import Mounted, RigidMotion, drone, hand_held
 from factor_graphs.simulation import (
     Motion,
     follow,
@@ -23,30 +24,47 @@ def motion() -> Motion:
     return random_drive(120.0, np.random.default_rng(1))
 
 
-def stamps_of(motion: Motion) -> np.ndarray:
+def mounted(seconds: float, rng: np.random.Generator) -> Mounted:
+    T_body_imu = np.eye(4)
+    T_body_imu[:3, :3] = Rotation.from_euler("ZYX", [20.0, 10.0, 5.0], degrees=True).as_matrix()
+    T_body_imu[:3, 3] = 1.2, -0.4, 0.7
+    return Mounted(random_drive(seconds, rng), T_body_imu)
+
+
+def there_and_back(seconds: float, rng: np.random.Generator) -> Motion:
+    waypoints = np.column_stack([np.linspace(0, 200, 21), 10 * np.sin(np.linspace(0, 6, 21)), np.zeros(21)])
+    return follow(waypoints, [0.0, 30.0, 60.0, 120.0], [0.0, 5.0, -2.0, 0.5], suspension_deg=0.3)
+
+
+@pytest.fixture(scope="module", params=[random_drive, there_and_back, mounted, hand_held, drone])
+def any_motion(request: pytest.FixtureRequest) -> RigidMotion:
+    return request.param(120.0, np.random.default_rng(1))
+
+
+def stamps_of(motion: RigidMotion) -> np.ndarray:
     return np.linspace(motion.start + 1, motion.end - 1, 501) + 0.0123
 
 
-def test_velocity_is_the_derivative_of_position(motion):
-    t = stamps_of(motion)
-    difference = (motion.poses(t + STEP) - motion.poses(t - STEP))[:, :3, 3] / (2 * STEP)
-    np.testing.assert_allclose(motion.velocities(t), difference, atol=1e-6)
+def test_velocity_is_the_derivative_of_position(any_motion):
+    t = stamps_of(any_motion)
+    difference = (any_motion.poses(t + STEP) - any_motion.poses(t - STEP))[:, :3, 3] / (2 * STEP)
+    np.testing.assert_allclose(any_motion.velocities(t), difference, atol=1e-6)
 
 
-def test_specific_force_is_acceleration_against_gravity_in_the_turning_frame(motion):
-    t = stamps_of(motion)
-    acceleration = (motion.velocities(t + STEP) - motion.velocities(t - STEP)) / (2 * STEP)
-    coriolis = 2 * np.cross(FRAME.earth_rate, motion.velocities(t))
-    in_map = np.einsum("nij,nj->ni", motion.poses(t)[:, :3, :3], motion.specific_force(t, FRAME))
+def test_specific_force_is_acceleration_against_gravity_in_the_turning_frame(any_motion):
+    t = stamps_of(any_motion)
+    acceleration = (any_motion.velocities(t + STEP) - any_motion.velocities(t - STEP)) / (2 * STEP)
+    coriolis = 2 * np.cross(FRAME.earth_rate, any_motion.velocities(t))
+    in_map = np.einsum("nij,nj->ni", any_motion.poses(t)[:, :3, :3], any_motion.specific_force(t, FRAME))
     np.testing.assert_allclose(in_map, acceleration + coriolis + [0, 0, FRAME.gravity], atol=1e-3)
 
 
-def test_angular_rate_is_the_turn_of_the_body_and_of_the_earth(motion):
-    t = stamps_of(motion)
-    before, after = (motion.poses(t + d)[:, :3, :3] for d in (-STEP, STEP))
+def test_angular_rate_is_the_turn_of_the_body_and_of_the_earth(any_motion):
+    t = stamps_of(any_motion)
+    before, after = (any_motion.poses(t + d)[:, :3, :3] for d in (-STEP, STEP))
     turn = Rotation.from_matrix(np.swapaxes(before, 1, 2) @ after).as_rotvec() / (2 * STEP)
-    earth = np.swapaxes(motion.poses(t)[:, :3, :3], 1, 2) @ FRAME.earth_rate
-    np.testing.assert_allclose(motion.angular_rate(t, FRAME), turn + earth, atol=1e-6)
+    earth = np.swapaxes(any_motion.poses(t)[:, :3, :3], 1, 2) @ FRAME.earth_rate
+    np.testing.assert_allclose(any_motion.angular_rate(t, FRAME), turn + earth, atol=1e-6)
 
 
 def test_the_vehicle_drives_forward_at_the_speed_asked_for_and_stands_when_it_stands():
@@ -92,6 +110,8 @@ def test_speeds_that_leave_the_path_and_impossible_waypoints_are_refused():
     line = np.column_stack([np.arange(0.0, 60.0, 10.0), np.zeros(6), np.zeros(6)])
     with pytest.raises(MeasurementError, match=r"drive 100\.0 m but the path is 50\.0 m"):
         follow(line, [0.0, 10.0], [10.0, 10.0])
+    with pytest.raises(MeasurementError, match=r"back 50\.0 m beyond the first"):
+        follow(line, [0.0, 10.0], [-5.0, -5.0])
     with pytest.raises(MeasurementError, match="n >= 6"):
         follow(line[:4], [0.0, 1.0], [1.0, 1.0])
     with pytest.raises(MeasurementError, match="waypoint 3 repeats"):

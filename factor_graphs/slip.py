@@ -1,0 +1,97 @@
+"""What is left of a velocity when the part that is explained is taken away: its variance, and how long it lasts."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from factor_graphs.chi_square import probability_below
+
+Array = NDArray[np.float64]
+
+# Slip is never believed to be less, m/s, nor to change faster, s.
+LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
+# The heading of a solution drifts, and looks like slip; over this time, s, it does not.
+DRIFT_S = 20.0
+# Huber's loss of the fit, and where squares are cut, in standard deviations; what a cut leaves of a normal variance.
+HUBER, CUT, ROUNDS = 1.345, 2.5, 10
+LEFT = probability_below(CUT**2, 3) + CUT**2 * (1 - probability_below(CUT**2, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Slip:
+    """Velocity that nothing explains: it is random, grows, and lasts for a while.
+
+    `parts` (3,) of its variance: m²/s², by squared speed, by squared lateral acceleration. `lasting_s` is the time in
+    which it tells as much as one independent value does; `typical` m/s its root mean square.
+    """
+
+    parts: Array
+    lasting_s: float
+    typical: float
+
+    def stddevs(self, grows_with: Array, spacing: Array) -> Array:
+        """What to believe of one value among others `spacing` (k,) s apart, (k,) m/s; `grows_with` (k, 3)."""
+        together = np.maximum(1.0, self.lasting_s / spacing)
+        return np.asarray(np.sqrt(grows_with @ self.parts * together), np.float64)
+
+
+def explain(
+    y: Array, by: Array, stddevs: Array, ahead: Array, grows_with: Array, spacing: Array
+) -> tuple[Array, Slip, Array]:
+    """The x (n,) of y = by x + slip, and the slip: each from the other in turn (iteratively reweighted least squares).
+
+    Third, what is neither (k,) m/s: a skid, zero where there is none. The mean slope of every `DRIFT_S` s is the drift
+    of heading.
+
+    `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
+    (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
+    """
+    x: Array = np.zeros(len(stddevs))
+    window = (np.cumsum(spacing) / DRIFT_S).astype(int)
+    left, drift, parts = y, np.zeros(window[-1] + 1), np.zeros(3)
+    variance: Array = np.full(len(y), max(robust_stddev(y), LEAST_SLIP) ** 2)
+    for _ in range(ROUNDS):
+        weights = spacing * _huber(y - by @ x, variance)
+        information = (by.T * weights) @ by + np.diag(stddevs**-2)
+        x = np.linalg.inv(information) @ (by.T * weights) @ y
+        left = y - by @ x - drift[window] * ahead
+        weights = _huber(left, variance)
+        lever = np.bincount(window, weights * ahead**2)
+        drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
+        left, most = y - by @ x - drift[window] * ahead, CUT * np.sqrt(variance)
+        scale = np.sqrt(spacing) / variance
+        parts = nnls(grows_with * scale[:, None], np.clip(left, -most, most) ** 2 / LEFT * scale)[0]
+        parts[0] = max(parts[0], LEAST_SLIP**2)
+        variance = grows_with @ parts
+    typical = float(np.sqrt(np.average(variance, weights=spacing)))
+    off = left / np.sqrt(variance)
+    slip = Slip(parts, _lasting(np.clip(off, -CUT, CUT), spacing), typical)
+    return x, slip, np.where(np.abs(off) > CUT, left, 0.0)
+
+
+def _huber(off: Array, variance: Array) -> Array:
+    """Weights of values under Huber's loss."""
+    weights: Array = np.minimum(1.0, HUBER * np.sqrt(variance) / np.maximum(np.abs(off), 1e-12)) / variance
+    return weights
+
+
+def robust_stddev(values: Array) -> float:
+    """The standard deviation about zero of normal values, whatever a few others are (median absolute deviation)."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def _lasting(values: Array, spacing: Array) -> float:
+    """Integral of the autocovariance of whitened values, both sides, s: up to where they are no longer alike.
+
+    Where slip is smaller than what is believed of it, it counts as lasting less.
+    """
+    step = float(np.median(spacing))
+    total = float(values @ values) / len(values)
+    for lag in range(1, min(int(DRIFT_S / 2 / step) + 1, len(values))):
+        alike = float(values[lag:] @ values[:-lag]) / (len(values) - lag)
+        if alike <= 0:
+            break
+        total += 2 * alike
+    return max(step * total, LEAST_LASTING_S)

@@ -1,0 +1,194 @@
+"""Is it a wheeled vehicle? How the IMU sits on it, and how much its axle slides, as a solution shows them.
+
+A point on the axle moves along the vehicle and nowhere else (non-holonomic constraint). In the imu's axes
+v_y = a v_x + l w_z + c |v_x| v_x w_z and v_z = b v_x, up to slip: a and b are the slopes of the direction of travel,
+l is how far the IMU sits ahead of the axle, and c the angle at which tyres roll under lateral acceleration v_x w_z.
+Going backwards changes the sign of v_x and nothing else.
+"""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import M
+from numpy.typing import NDArray
+
+from factor_graphs.graph import from_values
+from factor_graphs.intervals import ImuIntervals
+from factor_graphs.problem import Fit, Problem
+from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
+
+Array = NDArray[np.float64]
+
+# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s².
+MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01])
+# What of the mounting moves the imu sideways, and what upwards.
+SIDEWAYS, UPWARDS = [0, 2, 3], [1]
+# Slower than this, m/s, the direction of travel is not seen; seen for less long, s, or less far, m, it is not known.
+MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
+# What slides more than this share of its speed, or looks farther off its course, is no vehicle with an IMU on it.
+MOST_SLIP, MOST_SLOPE = 0.04, 0.3
+# Farther than this from a fix, s, a solution is too uncertain to show slip.
+BESIDE_S = 2.0
+# Slip, m/s, of what was not seen to slide.
+UNSEEN_SLIP = 0.1
+# A skid is so many times less certain than it is fast.
+SKID = 3.0
+# Yaw rate is the mean over so long, s: a single sample is noise.
+RATE_WINDOW_S = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMotion:
+    """Motion at keyframes, in the imu's axes: `velocity` (k, 3) m/s, `yaw_rate` (k,) rad/s.
+
+    `R_imu_map` (k, 3, 3) turns to these axes; `spacing` (k,) s is the time that each keyframe stands for.
+    """
+
+    R_imu_map: Array
+    velocity: Array
+    yaw_rate: Array
+    spacing: Array
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> "BodyMotion":
+        return BodyMotion(self.R_imu_map[rows], self.velocity[rows], self.yaw_rate[rows], self.spacing[rows])
+
+    def sliding(self, mounting: Array) -> Array:
+        """Lateral and vertical velocity that the mounting (4,) does not explain, (k, 2) m/s."""
+        left: Array = self.velocity[:, 1:] - self.by_mounting() @ mounting
+        return left
+
+    def by_mounting(self) -> Array:
+        """Lateral and vertical velocity of an imu whose axle does not slide, by its mounting, (k, 2, 4)."""
+        ahead, rows = self.velocity[:, 0], np.zeros((len(self.velocity), 2, 4))
+        rows[:, 0, 0] = rows[:, 1, 1] = ahead
+        rows[:, 0, 2], rows[:, 0, 3] = self.yaw_rate, np.abs(ahead) * ahead * self.yaw_rate
+        return rows
+
+    def by_velocity(self, mounting: Array) -> Array:
+        """How `sliding` changes with the velocity in the imu's axes, (k, 2, 3)."""
+        rows = np.tile([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (len(self.velocity), 1, 1))
+        rows[:, 0, 0] = -mounting[0] - 2 * mounting[3] * np.abs(self.velocity[:, 0]) * self.yaw_rate
+        rows[:, 1, 0] = -mounting[1]
+        return rows
+
+    def grows_with(self) -> Array:
+        """What the variance of slip grows with: nothing, speed squared, lateral acceleration squared, (k, 3)."""
+        speed = self.velocity[:, 0]
+        return np.column_stack([np.ones(len(speed)), speed**2, (speed * self.yaw_rate) ** 2])
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """How the IMU sits on the vehicle, and how much the axle slides.
+
+    `mounting` (4,): slopes of the direction of travel in the imu's axes, to the left and upwards; how far the IMU is
+    ahead of the axle, m; angle of the tyres, rad per m/s². `mounting_stddevs` (4,) once it was part of a graph.
+    `slip`: lateral and vertical; `skids` (k, 2) m/s: what does not fit it, zero where all fits. `doubt`: why it is no
+    such vehicle, or nothing. `held`: the constraint is on.
+    """
+
+    mounting: Array
+    slip: tuple[Slip, Slip]
+    skids: Array
+    doubt: str = ""
+    held: bool = False
+    mounting_stddevs: Array | None = None
+
+    @property
+    def yaw_pitch_deg(self) -> Array:
+        """Yaw (to the left) and pitch (nose down) of the IMU against the direction of travel, (2,) degrees."""
+        return np.asarray(np.degrees(np.arctan([-self.mounting[0], self.mounting[1]])), np.float64)
+
+    @property
+    def typical_slip(self) -> Array:
+        """Lateral and vertical slip, (2,) m/s."""
+        return np.array([one.typical for one in self.slip])
+
+    def slip_stddevs(self, motion: BodyMotion) -> Array:
+        """Standard deviation of lateral and vertical slip at every keyframe, (k, 2) m/s."""
+        usual = np.column_stack([one.stddevs(motion.grows_with(), motion.spacing) for one in self.slip])
+        # where it skids it says nothing of its heading: so uncertain that it hardly counts
+        return np.asarray(np.hypot(usual, SKID * self.skids), np.float64)
+
+    def __str__(self) -> str:
+        (yaw, pitch), (lateral, vertical) = self.yaw_pitch_deg, self.typical_slip
+        return (
+            f"slip {lateral:.2f} m/s sideways, {vertical:.2f} m/s vertically; IMU mounted {yaw:+.2f}° in yaw,"
+            f" {pitch:+.2f}° in pitch, {self.mounting[2]:+.1f} m ahead of the axle"
+        )
+
+
+def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
+    """The motion at the keyframes of a solution."""
+    stamps = problem.intervals.keyframes
+    T, velocities, biases = from_values(fit.values, len(stamps))
+    R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
+    in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
+    return BodyMotion(R_imu_map, in_imu, _yaw_rate(problem.intervals) - biases[:, 5], np.gradient(stamps))
+
+
+def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
+    """The same solution with the mounting (4,) among its values, as M(k)."""
+    values, key = gtsam.Values(fit.values), M(len(problem.intervals.keyframes))
+    if values.exists(key):
+        values.erase(key)
+    values.insert(key, mounting)
+    return replace(fit, values=values)
+
+
+def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
+    """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
+    moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
+    where = moving & _beside_fixes(problem, fit)
+    seen, skids = motion[where], np.zeros((len(where), 2))
+    time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
+    if time < LEAST_TIME_S or way < LEAST_WAY_M:
+        unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
+        doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
+        return Vehicle(np.zeros(4), (unseen, unseen), skids, doubt)
+    mounting, by_mounting, slip = np.zeros(4), seen.by_mounting(), []
+    for row, part in enumerate((SIDEWAYS, UPWARDS)):
+        mounting[part], its_slip, skids[where, row] = explain(
+            seen.velocity[:, 1 + row],
+            by_mounting[:, row, part],
+            MOUNTING_STDDEVS[part],
+            seen.velocity[:, 0],
+            seen.grows_with(),
+            seen.spacing,
+        )
+        slip.append(its_slip)
+    return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))
+
+
+def _doubt(mounting: Array, motion: BodyMotion) -> str:
+    """Why what moves is no vehicle that rolls forward on wheels; empty when it is."""
+    if np.mean(motion.velocity[:, 0] > 0) < 0.5 or np.abs(mounting[:2]).max() > MOST_SLOPE:
+        return "the IMU does not look where it goes"
+    speed = float(np.sqrt(np.mean(np.sum(motion.velocity**2, axis=1))))
+    lateral, vertical = (robust_stddev(off) / speed for off in motion.sliding(mounting).T)
+    if max(lateral, vertical) > MOST_SLIP:
+        return f"it slides {100 * lateral:.0f} % of its speed sideways, {100 * vertical:.0f} % vertically"
+    return ""
+
+
+def _beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+    """The keyframes (k,) beside a fix that fits, not in an outage: no farther than fixes usually are apart."""
+    stamps = problem.intervals.keyframes
+    good = stamps[problem.at[fit.weights > 0.5]]
+    if len(good) < 2:
+        return np.zeros(len(stamps), dtype=bool)
+    after = np.searchsorted(good, stamps).clip(max=len(good) - 1)
+    nearest = np.minimum(np.abs(good[after] - stamps), np.abs(good[np.maximum(after - 1, 0)] - stamps))
+    beside: NDArray[np.bool_] = nearest <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
+    return beside
+
+
+def _yaw_rate(intervals: ImuIntervals) -> Array:
+    """What the gyroscope says about the imu's z axis around every keyframe, (k,) rad/s."""
+    turned = np.concatenate([[0.0], np.cumsum(intervals.angular_rate[:, 2] * intervals.durations)])
+    first = np.maximum(intervals.keyframes - RATE_WINDOW_S / 2, intervals.nodes[0])
+    last = np.minimum(intervals.keyframes + RATE_WINDOW_S / 2, intervals.nodes[-1])
+    by_first, by_last = (np.interp(stamps, intervals.nodes, turned) for stamps in (first, last))
+    rate: Array = (by_last - by_first) / (last - first)
+    return rate

@@ -1,0 +1,180 @@
+"""Mounting, slip, and whether it is a vehicle at all: found in exact motion, and in solutions of noisy drives."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.accuracy import errors
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import ImuNoise
+from factor_graphs.rigid_motion import FreeMotion, Mounted, RigidMotion, drone, hand_held
+from factor_graphs.settings import SmootherSettings
+from factor_graphs.simulation import Motion, follow, random_drive
+from factor_graphs.slip import LEAST_SLIP, Slip, explain
+from factor_graphs.smoothing import smooth
+from factor_graphs.vehicle import BodyMotion
+
+FRAME = LocalFrame(49.0, 8.4, 115.0)
+LEVER = np.array([0.5, 0.3, 1.0])
+YAW_PITCH_DEG, AHEAD_M = np.array([2.0, 1.0]), 1.2
+NO_GROWTH = np.array([1.0, 0.0, 0.0])
+
+
+def mounted(seconds: float, rng: np.random.Generator) -> Mounted:
+    return on_axle(random_drive(seconds, rng))
+
+
+def on_axle(vehicle: RigidMotion) -> Mounted:
+    T_vehicle_imu = np.eye(4)
+    T_vehicle_imu[:3, :3] = Rotation.from_euler("ZYX", [*YAW_PITCH_DEG, 0.0], degrees=True).as_matrix()
+    T_vehicle_imu[0, 3] = AHEAD_M
+    return Mounted(vehicle, T_vehicle_imu)
+
+
+def shunting(seconds: float, rng: np.random.Generator) -> Motion:
+    """Forward along a winding road, back along half of it, and forward again, at up to 8 m/s."""
+    t = np.linspace(0.0, seconds, 13)
+    speeds = np.array([0.0, 8, 8, 8, 0, 0, -5, -5, -5, 0, 0, 8, 8])
+    length = 8.0 * seconds
+    way = np.linspace(0.0, length, int(length / 20))
+    return follow(np.column_stack([way, 15 * np.sin(way / 30), 0 * way]), t, speeds, suspension_deg=0.3)
+
+
+def skidding(seconds: float, rng: np.random.Generator) -> FreeMotion:
+    """A random drive whose tail breaks out by 12° for a second or two, four times."""
+    motion = random_drive(seconds, rng)
+    t = np.arange(0.0, motion.end, 0.05)
+    T, fast = motion.poses(t), np.linalg.norm(motion.velocities(t), axis=1) > 5.0
+    euler = np.unwrap(Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX"), axis=0)
+    for moment in rng.choice(t[fast & (t > 20.0) & (t < seconds - 20.0)], 4):
+        euler[:, 0] += np.radians(12.0) * np.exp(-0.5 * ((t - moment) / 1.2) ** 2)
+    return FreeMotion(make_interp_spline(t, T[:, :3, 3], k=5), make_interp_spline(t, euler, k=5))
+
+
+def seen(motion: RigidMotion, stamps: np.ndarray) -> BodyMotion:
+    R_imu_map = np.swapaxes(motion.poses(stamps)[:, :3, :3], 1, 2)
+    velocity = np.einsum("kij,kj->ki", R_imu_map, motion.velocities(stamps))
+    return BodyMotion(R_imu_map, velocity, motion.turn_rates(stamps)[:, 2], np.gradient(stamps))
+
+
+def gauss_markov(k: int, keep: float, rng: np.random.Generator) -> np.ndarray:
+    values = rng.standard_normal(k)
+    for i in range(1, k):
+        values[i] = keep * values[i - 1] + np.sqrt(1 - keep**2) * values[i]
+    return values
+
+
+def test_an_axle_that_does_not_slide_does_not_forward_or_backward_wherever_the_imu_sits():
+    level = shunting(200.0, np.random.default_rng(0))
+    motion = seen(on_axle(Motion(level.path, level.speed)), np.arange(1.0, 199.0, 0.5))
+    assert motion.velocity[:, 0].min() < -4.0
+    yaw, pitch = np.radians(YAW_PITCH_DEG)
+    mounting = np.array([-np.tan(yaw) / np.cos(pitch), np.tan(pitch), AHEAD_M / np.cos(yaw), 0.0])
+    sliding = motion.sliding(mounting)
+    assert np.abs(motion.velocity[:, 1]).max() > 0.2
+    np.testing.assert_allclose(sliding, 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("skidding", [0.0, 0.05])
+def test_slip_is_found_beside_skids_and_drift_with_its_size_and_its_duration(skidding):
+    rng, k, spacing = np.random.default_rng(1), 3000, 0.5
+    ahead = rng.uniform(5.0, 15.0, k)
+    slip = 0.1 * gauss_markov(k, np.exp(-spacing / 1.0), rng)
+    drift = 0.05 * np.sin(2 * np.pi * np.arange(k) * spacing / 300) * ahead
+    pushed = np.where(rng.random(k) < skidding, 3.0, 0.0)
+    by, grows_with = ahead[:, None], np.column_stack([np.ones(k), ahead**2, np.zeros(k)])
+    y = 0.03 * ahead + slip + drift + pushed
+    (slope,), found, skids = explain(y, by, np.array([0.2]), ahead, grows_with, np.full(k, spacing))
+    assert slope == pytest.approx(0.03, abs=0.005)
+    assert np.all(skids[pushed > 0] > 2.0)
+    assert np.mean(skids[pushed == 0] == 0) > 0.97
+    assert found.typical == pytest.approx(0.1, rel=0.3)
+    assert found.lasting_s == pytest.approx(2.0, rel=0.5 if skidding else 0.25)
+
+
+def test_slip_that_grows_is_small_where_it_is_slow():
+    rng, k = np.random.default_rng(2), 4000
+    ahead = rng.uniform(2.0, 20.0, k)
+    grows_with = np.column_stack([np.ones(k), ahead**2, np.zeros(k)])
+    y = 0.01 * ahead * rng.standard_normal(k)
+    _, slip, _ = explain(y, ahead[:, None], np.array([0.2]), ahead, grows_with, np.ones(k))
+    slow, fast = np.array([[1.0, 0.0, 0.0], [1.0, 400.0, 0.0]]) @ slip.parts
+    assert np.sqrt(fast) == pytest.approx(0.2, rel=0.15)
+    assert np.sqrt(slow) < 2 * LEAST_SLIP
+
+
+def test_a_second_tells_the_same_however_many_keyframes_it_has():
+    slip = Slip(np.array([0.01, 0.0, 0.0]), 1.0, 0.1)
+    information = {}
+    for k in (2, 10, 20):
+        stddevs = slip.stddevs(np.tile(NO_GROWTH, (k, 1)), np.full(k, 1 / k))
+        information[k] = np.sum(stddevs**-2)
+    assert information[2] == pytest.approx(information[10]) == pytest.approx(information[20])
+    assert slip.stddevs(NO_GROWTH[None], np.array([5.0])) == pytest.approx(0.1)
+
+
+@pytest.mark.integration
+def test_the_mounting_is_found_as_well_as_it_says(simulate):
+    for seed in (60, 61):
+        drive = simulate(seed, seconds=300.0, noise=ImuNoise(), moves=mounted)
+        vehicle = smooth(drive.imu, drive.fixes, FRAME, None, LEVER).vehicle
+        assert vehicle.held
+        assert not vehicle.doubt
+        off = vehicle.yaw_pitch_deg - YAW_PITCH_DEG
+        assert np.abs(off).max() < 0.1
+        assert np.all(np.abs(off) < 4 * np.degrees(vehicle.mounting_stddevs[:2]))
+        assert vehicle.mounting[2] == pytest.approx(AHEAD_M, abs=4 * vehicle.mounting_stddevs[2])
+        assert vehicle.mounting_stddevs[2] < 0.2
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("moves", [hand_held, drone])
+def test_what_is_no_vehicle_is_left_alone_and_told_why(simulate, moves):
+    drive = simulate(70, seconds=150.0, noise=ImuNoise(), moves=moves)
+    found, without = (
+        smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(vehicle_constraint=v), LEVER)
+        for v in ("auto", "off")
+    )
+    assert not found.vehicle.held
+    assert [note for note in found.notes if note.startswith("vehicle constraint off: ")]
+    assert without.vehicle is None
+    assert not [note for note in without.notes if "vehicle" in note]
+    np.testing.assert_allclose(found.trajectory.positions, without.trajectory.positions)
+
+
+@pytest.mark.integration
+def test_a_vehicle_that_reverses_keeps_its_heading(simulate):
+    drive = simulate(80, seconds=240.0, noise=ImuNoise(), moves=shunting)
+    solution = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+    assert solution.vehicle.held
+    e = errors(solution.keyframes, drive.motion.trajectory(solution.keyframes.stamps))
+    assert np.degrees(np.abs(e.rotation[:, 2])).max() < 0.5
+
+
+@pytest.mark.integration
+def test_a_skid_does_not_turn_the_heading(simulate):
+    off, found = [], []
+    for seed in (100, 101, 102):
+        drive = simulate(seed, seconds=200.0, noise=ImuNoise(), moves=skidding)
+        truth = drive.motion.trajectory
+        for wanted, heading in (("off", off), ("auto", found)):
+            s = smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(vehicle_constraint=wanted), LEVER)
+            heading.append(errors(s.keyframes, truth(s.keyframes.stamps)).heading_rms_deg)
+        assert s.vehicle.held
+        assert np.abs(s.vehicle.skids[:, 0]).max() > 1.0
+    assert np.mean(found) < np.mean(off)
+
+
+@pytest.mark.integration
+def test_it_can_be_asked_for_where_nothing_shows_it(simulate):
+    drive = simulate(90, seconds=25.0, noise=ImuNoise())
+    auto, asked = (
+        smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(vehicle_constraint=v), LEVER)
+        for v in ("auto", "on")
+    )
+    assert not auto.vehicle.held
+    assert asked.vehicle.held
+    assert "only" in asked.vehicle.doubt
+    heading = [np.mean(s.keyframes.covariances[:, 2, 2]) for s in (auto, asked)]
+    assert heading[1] < heading[0]

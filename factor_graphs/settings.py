@@ -43,7 +43,7 @@ class SmootherSettings(BaseModel):
     )
     vehicle_constraint: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="The axle of a vehicle does not slide. auto: where the drive itself shows that, and how little.",
+        description="The axle of a vehicle does not slide. auto: where the drive shows that, without LiDAR odometry.",
     )
     start_tilt_stddev_rad: float = Field(0.2, gt=0, description="Unknown roll and pitch of the first guess.")
     start_heading_stddev_rad: float = Field(0.7, gt=0, description="Unknown heading of the first guess.")

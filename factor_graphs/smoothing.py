@@ -41,7 +41,9 @@ class Solution:
     outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
     `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
-    `calibration` the time offset and lever arm used; `notes` says in words what was repaired or is in doubt.
+    `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
+    where the vehicle constraint was not asked for or LiDAR odometry took its place; `notes` says in words what was
+    repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -131,7 +133,7 @@ def _solution(
         calibration=calibration,
         iterations=fit.iterations,
         vehicle=vehicle,
-        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration), *_on_wheels(vehicle)),
+        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
     )
 
 
@@ -175,16 +177,6 @@ def _doubts(
     heading = heading_stddevs(keyframes)
     if heading.min() > UNKNOWN_HEADING:
         yield f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): did the vehicle move?"
-
-
-def _on_wheels(vehicle: Vehicle | None) -> Iterator[str]:
-    """Whether the vehicle constraint took part, and what it is, in words."""
-    if vehicle is None:
-        return
-    if vehicle.held:
-        yield f"vehicle constraint on: {vehicle}"
-    if vehicle.doubt:
-        yield f"vehicle constraint {'in doubt' if vehicle.held else 'off'}: {vehicle.doubt}"
 
 
 def heading_stddevs(trajectory: Trajectory) -> Array:

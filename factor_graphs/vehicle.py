@@ -105,6 +105,13 @@ class Vehicle:
         """Lateral and vertical slip, (2,) m/s."""
         return np.array([one.typical for one in self.slip])
 
+    @property
+    def verdict(self) -> str:
+        """Whether the constraint takes part, and why or how, in one line."""
+        if not self.held:
+            return f"vehicle constraint off: {self.doubt}"
+        return f"vehicle constraint on: {self}" + (f"; in doubt, as {self.doubt}" if self.doubt else "")
+
     def slip_stddevs(self, motion: BodyMotion) -> Array:
         """Standard deviation of lateral and vertical slip at every keyframe, (k, 2) m/s."""
         usual = np.column_stack([one.stddevs(motion.grows_with(), motion.spacing) for one in self.slip])

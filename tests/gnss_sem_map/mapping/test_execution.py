@@ -252,6 +252,7 @@ def test_workers_end_when_nobody_wants_more_results(tmp_path: Path) -> None:
 
 
 PARENT = """
+import signal
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
@@ -259,6 +260,7 @@ from gnss_sem_map.mapping.execution import Task, run_tasks
 from gnss_sem_map.mapping.worker_processes import Processes
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts background jobs without it
     tasks = [Task("wait", "small_tasks:begins_and_waits", (sys.argv[2],))] * 2
     list(run_tasks(tasks, Processes(2, allowed="small_tasks.")))
 """
@@ -272,8 +274,11 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
     begun.mkdir()
     words = [sys.executable, str(script), str(TESTS), str(begun)]
     with subprocess.Popen(words, stderr=subprocess.DEVNULL, start_new_session=True) as process:
-        assert wait_until(lambda: len(list(begun.iterdir())) == 2)
-        process.send_signal(number)
-        process.wait(20)
+        try:
+            assert wait_until(lambda: len(list(begun.iterdir())) == 2)
+            process.send_signal(number)
+            process.wait(20)
+        finally:
+            process.kill()
     workers = [int(path.name) for path in begun.iterdir()]
     assert wait_until(lambda: not any(map(is_alive, workers)))

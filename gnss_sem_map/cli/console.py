@@ -141,8 +141,8 @@ def print_metrics(metrics: dict[str, Any]) -> None:
             )
             inside = ", ".join(_percent(t[f"position_inside_{share}"]) for share in (50, 90, 95))
             lines.append(
-                f"  positions inside the ellipsoids that should hold 50, 90, 95 %: {inside} %; variances too small by"
-                f" k = {t['position_scale_gap']:.2f}"
+                f"  positions inside the ellipsoids that should hold 50, 90, 95 %: {inside} %; scale gap k"
+                f" {t['position_scale_gap']:.2f}, above 1 the variances are too small"
             )
     for line in lines:
         console.print(line, highlight=False)

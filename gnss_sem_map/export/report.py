@@ -56,8 +56,8 @@ WORDS = {
         for part in ("position", "horizontal")
         for share in (50, 90, 95)
     },
-    "position_scale_gap": "position: how many times too small the variances are (scale gap k)",
-    "horizontal_scale_gap": "horizontal: how many times too small the variances are (scale gap k)",
+    "position_scale_gap": "position: scale gap k, above 1 the variances are too small",
+    "horizontal_scale_gap": "horizontal: scale gap k, above 1 the variances are too small",
 }
 UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
 BAR_PX = 260

@@ -45,8 +45,8 @@ COARSE_M, FINE_M = 0.01, 0.001
 NEIGHBOURS = 6
 # Sweeps overlap, so every other matched one is added to the local map: on simulated drives the poses drift no more.
 EVERY_NTH_IN_MAP = 2
-# Anchors are so many sweeps apart, and each is bound to so many before it. Sweeps that were each bound to the tenth
-# before it would take twice the time and three times the memory of the graph, for the same accuracy.
+# Anchors are so many sweeps apart, and each is bound to so many before it. If each sweep were bound to the tenth before
+# it, the graph of a drive of 480 s would take half as much memory again (780 MB for 530), for the same accuracy.
 ANCHOR_SCANS, ANCHORS_BOUND = 10, 3
 # So many sweeps are matched before a section, for its local map.
 WARM_UP_SCANS = 50

@@ -6,7 +6,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.simulation import random_drive, simulate_gnss, simulate_imu
 from factor_graphs.smoothing import smooth
-from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
+from factor_graphs.trajectory_plot import write_trajectory_plot
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
 

@@ -40,6 +40,9 @@ class ImuSamples:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "ImuSamples":
+        return ImuSamples(self.stamps[rows], self.specific_force[rows], self.angular_rate[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class GnssFixes:

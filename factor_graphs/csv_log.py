@@ -99,7 +99,7 @@ def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table
         raise MeasurementError(f"{where}: column {wrong[0]} is missing or repeated in {found}; {expected}")
     try:
         table = csv.read_csv(
-            pa.BufferReader(content),
+            pa.BufferReader(_completed(content, len(names))),
             # with several threads an error does not tell its row
             read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
             convert_options=csv.ConvertOptions(
@@ -113,6 +113,13 @@ def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
     return table
+
+
+def _completed(content: bytes, cells: int) -> bytes:
+    """A last line that was cut off, when the logger died, becomes a row without values: dropped and counted as such."""
+    start = content.rfind(b"\n") + 1
+    is_cut = start and content.count(b",", start) < cells - 1 and content[start:].strip()
+    return content[:start] + b"," * (cells - 1) if is_cut else content
 
 
 def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:

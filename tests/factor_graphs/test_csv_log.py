@@ -99,6 +99,16 @@ def test_a_bad_row_costs_that_row_only_and_is_counted(log, name, row, column, va
     assert lost == {"imu.csv": 0, "gnss.csv": 0} | {name: 1}
 
 
+@pytest.mark.parametrize("kept", ["0.39", "0.39,", "0.39,1.2,-"])
+def test_a_last_line_that_was_cut_off_costs_that_row_only(log, kept):
+    before, *_ = read_csv(log)
+    lines = (log / "imu.csv").read_text().splitlines()
+    (log / "imu.csv").write_text("\n".join([*lines[:-1], kept]))
+    with pytest.warns(RepairWarning, match="40 rows; 1 not finite, dropped"):
+        after, *_ = read_csv(log)
+    np.testing.assert_array_equal(after.specific_force, before.specific_force[:-1])
+
+
 def test_rows_out_of_order_are_sorted_and_counted(log):
     before, *_ = read_csv(log)
 

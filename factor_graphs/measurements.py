@@ -14,9 +14,9 @@ from factor_graphs.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # No accelerometer or gyroscope says more, in whatever unit.
 LARGEST_OF_IMU = 1e6
-UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
 BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
 

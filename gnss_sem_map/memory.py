@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 from contextlib import suppress
 
 M_ARENA_MAX = -8
 """Of glibc's `mallopt`: the number of heaps."""
+NEW_OBJECTS = 20_000
+"""So many more objects than before let Python look for reference cycles; its own default is 700."""
 
 
 def share_one_heap() -> None:
@@ -23,6 +26,14 @@ def share_one_heap() -> None:
     os.environ["MALLOC_ARENA_MAX"] = "1"
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).mallopt(M_ARENA_MAX, 1)
+
+
+def collect_seldom() -> None:
+    """Look for reference cycles less often: there are hardly any, and 400,000 objects of imported modules to go through.
+
+    A run of the demo drive spends 0.3 s on it in place of 0.8 s.
+    """
+    gc.set_threshold(NEW_OBJECTS)
 
 
 def release_memory() -> None:

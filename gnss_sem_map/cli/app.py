@@ -11,7 +11,7 @@ import typer
 
 from gnss_sem_map.cli import evaluation, finished, mapping, segmentation, settings, simulation
 from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
-from gnss_sem_map.memory import share_one_heap
+from gnss_sem_map.memory import collect_seldom, share_one_heap
 
 COMMANDS = (
     mapping.run,
@@ -53,6 +53,7 @@ def main() -> None:
     from gnss_sem_map.errors import SemMapError
 
     share_one_heap()
+    collect_seldom()
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # of other packages; ours are printed by the commands
     for stream in (sys.stdout, sys.stderr):

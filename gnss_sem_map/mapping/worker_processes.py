@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
+from gnss_sem_map.memory import collect_seldom
 from gnss_sem_map.scans.prefetch import THREADS_VARIABLE, threads
 
 WATCH_S = 0.1
@@ -211,6 +212,7 @@ def _signals_blocked() -> Iterator[None]:
 
 def _serve(parent: Connection) -> None:
     """Answer tasks until the parent closes its end."""
+    collect_seldom()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         while True:

@@ -117,6 +117,8 @@ def constrain(
     settled = not held and not rolling
     for _ in range(CONSTRAINT_ROUNDS):
         stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
+        if wheels is not None and rolling:
+            stands &= ~wheels.readings.moving
         if settled and stood is not None and np.array_equal(stands, stood):
             break
         stood = stands

@@ -11,17 +11,18 @@ Array = NDArray[np.float64]
 
 # A keyframe takes the samples within this, s, or within so many usual steps of a slow sensor.
 WINDOW_S, STEPS = 0.15, 1.2
-# Below this, m/s, sensors are blind or say zero, and a vehicle may turn back.
-SLOW = 0.5
+# Below this, m/s, sensors are blind or say zero, and a vehicle may turn back; above that one, it does not stand.
+SLOW, CREEP = 0.5, 0.1
 # A way between two stops leads where the solution says, when that agrees with this share of the wheels' own.
 SURE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Wheel speeds at k keyframes: `speeds` (k,) m/s, their `changes` (k,) m/s².
+    """Wheel speeds at k keyframes, without sign: `speeds` (k,) m/s, their `changes` (k,) m/s².
 
-    `rolling` (k,): they say a speed; `stopped` (k,): they say zero; where neither holds, they say nothing.
+    `rolling` (k,): they say a speed; `stopped` (k,): they say zero; where neither holds, they say nothing but that they
+    are `moving` (k,).
     `directions` (k,): 1 or -1, what the speed is to be multiplied with; 0 where they say none.
     """
 
@@ -29,6 +30,7 @@ class Readings:
     changes: Array
     rolling: NDArray[np.bool_]
     stopped: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
     directions: Array
 
     def grows_with(self) -> Array:
@@ -50,19 +52,23 @@ def read(wheels: WheelSpeeds, stamps: Array, ahead: Array) -> Readings:
     row = np.repeat(np.arange(k), count)
     sample = np.arange(len(row)) + np.repeat(first - np.cumsum(count) + count, count)
     t, w = wheels.stamps[sample] - stamps[row], wheels.speeds[sample]
-    n, t1, t2, w1, tw, before, after, slow, zero = (
+    n, t1, t2, w1, tw, before, after, slow, still, zero = (
         np.bincount(row, values, k)
-        for values in (np.ones(len(t)), t, t * t, w, t * w, t <= 0, t >= 0, np.abs(w) < SLOW, w == 0)
-    )
+        for values in (
+            np.ones(len(t)), t, t * t, w, t * w, t <= 0, t >= 0, np.abs(w) < SLOW, np.abs(w) < CREEP, w == 0,
+        )
+    )  # fmt: skip
     spread = n * t2 - t1**2
     known = (before > 0) & (after > 0) & (spread > 1e-9)
     changes = np.where(known, (n * tw - t1 * w1) / np.where(known, spread, 1.0), 0.0)
     speeds = np.where(known, (w1 - changes * t1) / np.maximum(n, 1.0), 0.0)
     rolling = known & (slow == 0)
-    directions = rolling.astype(np.float64)
+    sign = np.where(speeds < 0, -1.0, 1.0)
+    directions = sign * rolling
     if len(wheels) and wheels.speeds.min() > -SLOW:
-        directions *= _directions(wheels, stamps, speeds, rolling, ahead)
-    return Readings(speeds, changes, directions != 0, known & (zero == n), directions)
+        directions = _directions(wheels, stamps, speeds, rolling, ahead)
+    rolling, stopped, moving = directions != 0, known & (zero == n), known & (still == 0)
+    return Readings(sign * speeds, sign * changes, rolling, stopped, moving, directions)
 
 
 def _directions(

@@ -11,20 +11,31 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from factor_graphs.csv_log import read_csv
+    from factor_graphs.csv_log import read_csv, read_wheels
     from factor_graphs.geodesy import LocalFrame
-    from factor_graphs.measurements import GnssFixes, ImuSamples
+    from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
     from factor_graphs.smoothing import smooth
     from factor_graphs.trajectory import Trajectory
 
-__all__ = ["GnssFixes", "ImuSamples", "LocalFrame", "Trajectory", "read_csv", "smooth"]
+__all__ = [
+    "GnssFixes",
+    "ImuSamples",
+    "LocalFrame",
+    "Trajectory",
+    "WheelSpeeds",
+    "read_csv",
+    "read_wheels",
+    "smooth",
+]
 
 _PLACES = {
     "GnssFixes": "measurements",
     "ImuSamples": "measurements",
     "LocalFrame": "geodesy",
     "Trajectory": "trajectory",
+    "WheelSpeeds": "measurements",
     "read_csv": "csv_log",
+    "read_wheels": "csv_log",
     "smooth": "smoothing",
 }
 

@@ -83,7 +83,7 @@ def _split(key: int) -> tuple[int, int]:
 def keyframe_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
 ) -> tuple[Array, Array]:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k), then W(k), those there are.
+    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k) and W(k), where they are.
 
     M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
     eliminated last, as if they were one more keyframe.

@@ -1,4 +1,4 @@
-"""A log of two CSV files: `imu.csv` and `gnss.csv`."""
+"""A log of two CSV files, `imu.csv` and `gnss.csv`, and if there is one a third, `wheels.csv`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds, clean_wheels
 
 IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
+WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 
 
 def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
@@ -26,6 +27,19 @@ def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
     frame = LocalFrame(*(float(value) for value in gnss[0, 1:4]))
     fixes = GnssFixes(gnss[:, 0], frame.to_map(*gnss[:, 1:4].T), gnss[:, 4:7])
     return ImuSamples(imu[:, 0], imu[:, 1:4], imu[:, 4:7]), fixes, frame
+
+
+def read_wheels(folder: Path | str) -> WheelSpeeds | None:
+    """Read `wheels.csv` of a folder, for `smooth(..., wheels=...)`; None where there is none.
+
+    Columns: stamp_s; speed_mps, below zero in reverse if the sensor tells. Rows that `clean_wheels` drops are left out.
+    Raises MeasurementError for a file that holds no such table.
+    """
+    path = Path(folder) / "wheels.csv"
+    if not path.exists():
+        return None
+    rows = _table(path, WHEEL_COLUMNS)
+    return clean_wheels(rows[:, 0], rows[:, 1])[0]
 
 
 def _table(path: Path, columns: tuple[str, ...]) -> NDArray[np.float64]:

@@ -125,8 +125,8 @@ class Repairs:
     repeated: int = 0
     out_of_order: int = 0
     far_off: int = 0
-    absurd: int = 0
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
+    absurd: int = 0
 
     @property
     def dropped(self) -> int:

@@ -80,8 +80,8 @@ def smooth(
 
     `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
     IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
-    its wheels rolled; none of them need be given. Raises MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser
-    stops at its limit.
+    its wheels rolled; none of them need be given. Raises MeasurementError with fewer than three usable fixes, and
+    EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)

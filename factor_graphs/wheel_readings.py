@@ -1,4 +1,4 @@
-"""What wheel speeds say at keyframes: the value there, how it changes, and forwards or backwards where they do not tell."""
+"""What wheel speeds say at keyframes: the value, how it changes, and the direction where they do not tell it."""
 
 from dataclasses import dataclass
 

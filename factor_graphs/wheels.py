@@ -1,7 +1,8 @@
 """Wheel speed as a measurement: its scale, offset and latency are unknowns of the graph, and slip is not believed.
 
-The wheels say w at a stamp that is `latency` late. The axle moves forward at ±(scale w + offset), and the imu, `left` of
-where the wheels are, at that less left times yaw rate. A wheel at rest says zero: it has no offset.
+The wheels say w at a stamp that is `latency` late. The axle moves forward at ±(scale w + offset), and the imu, `left`
+of where the wheels are, at that less left times yaw rate. A wheel at rest says zero: it has no offset. Slip that goes
+with acceleration cannot be told from latency.
 """
 
 from collections.abc import Iterator
@@ -35,7 +36,14 @@ LATENCY_ROUNDS, MOST_LATENCY_S = 3, 1.0
 # What differs from the speed by more than this share is no wheel, nor is one whose scale is beyond these.
 MOST_MISFIT, SCALES = 0.1, (0.8, 1.25)
 # How much m/s one unit is.
-UNITS = {"km/h": 1 / 3.6, "mph": 0.44704, "cm/s": 0.01, "mm/s": 0.001, "0.01 km/h": 0.01 / 3.6, "0.1 km/h": 0.1 / 3.6}
+UNITS = {
+    "km/h": 1 / 3.6,
+    "mph": 0.44704,
+    "cm/s": 0.01,
+    "mm/s": 0.001,
+    "0.01 km/h": 0.01 / 3.6,
+    "0.1 km/h": 0.1 / 3.6,
+}
 # A wheel slips where it is so many standard deviations off; it is so many times less certain than it is fast.
 CUT, SKID = 3.5, 3.0
 # Without fixes a solution drifts: slip is then what differs from the median of so long, s.
@@ -91,10 +99,10 @@ class Wheels:
         return np.asarray(np.hypot(np.where(self.readings.stopped, at_rest, usual), SKID * self.slip))
 
     def __str__(self) -> str:
-        accuracy = [""] * 4 if self.stddevs is None else [f" ± {s:.3f}" for s in self.stddevs]
+        unsure = [""] * 4 if self.stddevs is None else [f" ± {s:.3f}" for s in self.stddevs]
         scale, offset, latency, _ = self.calibration
         return (
-            f"scale {scale:.4f}{accuracy[0]}, offset {offset:+.3f}{accuracy[1]} m/s, {latency:+.3f}{accuracy[2]} s late,"
+            f"scale {scale:.3f}{unsure[0]}, offset {offset:+.3f}{unsure[1]} m/s, {latency:+.3f}{unsure[2]} s late,"
             f" noise {self.noise.typical:.2f} m/s; slip {100 * self.slip_share:.1f} % of the time"
         )
 
@@ -114,7 +122,12 @@ def misfit(ahead: Array, yaw_rate: Array, readings: Readings, calibration: Array
 
 
 def observe_wheels(
-    wheels: WheelSpeeds, problem: Problem, fit: Fit, motion: BodyMotion, mounting: Array, known: Array | None = None
+    wheels: WheelSpeeds,
+    problem: Problem,
+    fit: Fit,
+    motion: BodyMotion,
+    mounting: Array,
+    known: Array | None = None,
 ) -> Wheels:
     """What a solution shows of the wheels where it is well determined: rolling, and beside a fix that fits.
 
@@ -172,7 +185,7 @@ def _doubt(wheels: Wheels, off: Array, ahead: Array) -> str:
         return f"their scale is {scale:.3f}: they count backwards; change their sign"
     if not SCALES[0] <= scale <= SCALES[1]:
         unit = next((name for name, value in UNITS.items() if abs(abs(scale) / value - 1) < 0.1), "")
-        is_in = f": they are in {unit}; convert them to m/s" if unit else "; expected about 1, speeds in m/s"
+        is_in = f": they are in {unit}, give m/s" if unit else ", expected about 1: give m/s"
         return f"their scale is {scale:.4g}{is_in}"
     return ""
 

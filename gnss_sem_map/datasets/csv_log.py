@@ -3,6 +3,8 @@
     imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
                                                        or by `imu_axes`, `force_unit`, `rate_unit` in log.yaml
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
+    wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
+                                                       or by `speed_unit` in log.yaml
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
     images/stamps.csv   number,stamp_s             images/<number>.png    rectified; or .jpg
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu, far_off
+from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels, far_off
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_fixes import usable_fixes
 from gnss_sem_map.datasets.stamps import (
@@ -29,6 +31,7 @@ from gnss_sem_map.datasets.stamps import (
     LONGEST_FRAME_STEP_S,
     LONGEST_IMU_STEP_S,
     LONGEST_SWEEP_S,
+    LONGEST_WHEEL_STEP_S,
     check_unit,
     in_order,
 )
@@ -56,6 +59,7 @@ IDENTITY: Matrix4 = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
 
 IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
+WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 
 
 class LogFile(SensorConventions):
@@ -101,6 +105,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         for name, repairs in (("imu.csv", imu_repairs), ("gnss.csv", gnss_repairs))
         if repairs.dropped
     ]
+    wheels, wheel_skips = _wheels(drive / "wheels.csv")
     scans, scan_skips = _scans(drive / "lidar", about.lidar_is_compensated)
     images, image_skips = _images(drive / "images", about.image_size)
     return SensorLog(
@@ -112,9 +117,10 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         frame=frame,
         imu=imu,
         gnss=gnss,
+        wheels=wheels,
         imu_noise=about.imu_noise,
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*skips, *fix_skips, *scan_skips, *image_skips),
+        skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
 
 
@@ -147,6 +153,15 @@ def _fixes(path: Path) -> tuple[Array, list[Skip]]:
             " deviations above 0" + (f"; found {skips[0].reason}" if skips else "")
         )
     return rows[stamped][usable], skips
+
+
+def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
+    """Wheel speeds and the skipped rows; None where there is no such table."""
+    if not is_file(path):
+        return None, []
+    rows = _table(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 
 
 def _calibration(about: LogFile, path: Path) -> Calibration:

@@ -14,7 +14,7 @@ from gnss_sem_map.sensor_log import Skip
 LONGEST_SWEEP_S = 1.0
 FAR_FROM_SWEEP_S = 0.5
 """A scan's stamp may lie this far outside its sweep."""
-LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_FRAME_STEP_S = 0.5, 100.0, 20.0
+LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_FRAME_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 20.0, 5.0
 """Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer."""
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 

@@ -59,7 +59,10 @@ def inside_outages(solution, drive) -> float:
 def test_the_linearised_factor_agrees_with_differences_of_the_real_one():
     rng, step, stddev = np.random.default_rng(0), 1e-6, 0.2
     attitude, velocity = Rotation.random(random_state=3).as_matrix(), np.array([4.0, -6.0, 0.5])
-    pose, mounting = gtsam.Pose3(gtsam.Rot3(attitude), rng.standard_normal(3)), np.array([0.05, -0.03, 1.2, 0.0])
+    pose, mounting = (
+        gtsam.Pose3(gtsam.Rot3(attitude), rng.standard_normal(3)),
+        np.array([0.05, -0.03, 1.2, 0.0]),
+    )
     stamps = np.arange(0.0, 2.0, 0.05)
     speeds = WheelSpeeds(stamps, 5.0 + 1.5 * stamps)  # a straight line is what the readings hold exactly
 
@@ -84,7 +87,7 @@ def test_the_linearised_factor_agrees_with_differences_of_the_real_one():
     numeric = np.array([(off(step * e)[0] - here) / step for e in np.eye(13)])
     columns = {X(0): numeric[:6], V(0): numeric[6:9], W(1): numeric[9:]}
     np.testing.assert_allclose(b, -here)
-    np.testing.assert_allclose(jacobian[0], np.concatenate([columns[key] for key in row.keys()]), atol=1e-3)
+    np.testing.assert_allclose(jacobian[0], np.concatenate(list(map(columns.get, row.keys()))), atol=1e-3)
 
 
 @pytest.mark.parametrize("signed", [True, False])
@@ -138,7 +141,9 @@ def test_covariances_are_those_of_gtsams_marginals(simulate, settings):
 def test_the_calibration_is_found_as_well_as_it_says(simulate, settings):
     for seed in (60, 61, 62):
         drive = simulate(seed, seconds=300.0, noise=ImuNoise(), moves=mounted)
-        found = smooth(drive.imu, drive.fixes, FRAME, settings, LEVER, wheels=wheels_of(drive, seed, 300.0)).wheels
+        found = smooth(
+            drive.imu, drive.fixes, FRAME, settings, LEVER, wheels=wheels_of(drive, seed, 300.0)
+        ).wheels
         assert found.held
         assert found.scale == pytest.approx(1.03, rel=5e-3)
         np.testing.assert_array_less(np.abs(found.calibration - TRUTH), 3 * found.stddevs)
@@ -153,9 +158,7 @@ def test_outages_are_better_with_wheels_even_where_they_slip(simulate, slips):
     for seed in range(6):
         drive = simulate(seed, seconds=240.0, noise=ImuNoise(), moves=mounted, outages=OUTAGES)
         wheels = wheels_of(drive, seed, 240.0, signed=False, slips=slips)
-        off["without"].append(
-            inside_outages(smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER), drive)
-        )
+        off["without"].append(inside_outages(smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER), drive))
         s = smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER, wheels=wheels)
         off["with"].append(inside_outages(s, drive))
         truth = drive.motion.trajectory(s.keyframes.stamps)
@@ -231,7 +234,9 @@ def test_wheels_that_are_partly_missing_help_where_they_are(simulate):
     whole = wheels_of(drive, 5, 240.0)
     there = (whole.stamps < 50.0) | (whole.stamps > 125.0)
     part = WheelSpeeds(whole.stamps[there], whole.speeds[there])
-    without, with_part = (smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER, wheels=w) for w in (None, part))
+    without, with_part = (
+        smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER, wheels=w) for w in (None, part)
+    )
     assert with_part.wheels.held
     stddevs = [s.keyframes.covariances[:, 3, 3] ** 0.5 for s in (without, with_part)]
     stamps = without.keyframes.stamps

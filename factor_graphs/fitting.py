@@ -28,6 +28,8 @@ NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 LONG_ENOUGH_S = 120.0
 # The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
 CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
+# Wheels are wrong, unasked, when with them the IMU must be so many times noisier.
+CONTRADICTION, CONTRADICTED = 1.5, "the IMU contradicts them"
 # Where relative poses span more than this share of the time, the axle adds nothing that they do not know better: on a
 # drive of 480 s with LiDAR odometry it changes no digit of the error, and takes 70 % more time.
 BOUND_SHARE = 0.5
@@ -101,7 +103,7 @@ def constrain(
     which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
     settings, motion = problem.settings, body_motion(problem, fit)
-    wanted = settings.vehicle_constraint
+    start, wanted = fit, settings.vehicle_constraint
     if wanted == "auto" and _bound_share(problem) > BOUND_SHARE:
         wanted = "off"
     vehicle = None if wanted == "off" else observe(problem, fit, motion)
@@ -133,6 +135,10 @@ def constrain(
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)
+        if wheels is not None and rolling and settings.wheel_speed == "auto":
+            if fit.inflation > CONTRADICTION * start.inflation:
+                fit, factors, vehicle, _ = constrain(problem, start)
+                return fit, factors, vehicle, replace(wheels, held=False, doubt=CONTRADICTED)
         before, motion = motion, body_motion(problem, fit)
         if held or rolling:
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)

@@ -28,9 +28,8 @@ from factor_graphs.wheel_readings import Readings, read
 
 Array = NDArray[np.float64]
 
-# Before anything is seen: scale, offset m/s, latency s, and how far left the imu is m. No prior knows the unit.
+# Before anything is seen: scale, offset m/s, latency s, and how far left the imu is m.
 UNKNOWN, STDDEVS = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, 0.5, 0.2, 1.0])
-ANY_UNIT = np.array([10.0, 0.5, 0.2, 1.0])
 # Latency is found by so many corrections, none beyond this, s.
 LATENCY_ROUNDS, MOST_LATENCY_S = 3, 1.0
 # What differs from the speed by more than this share is no wheel, nor is one whose scale is beyond these.
@@ -46,8 +45,9 @@ UNITS = {
 }
 # A wheel slips where it is so many standard deviations off; it is so many times less certain than it is fast.
 CUT, SKID = 3.5, 3.0
-# Without fixes a solution drifts: slip is then what differs from the median of so long, s.
-DRIFT_S = 20.0
+# Without fixes a solution drifts: slip is then what differs from the median of so long, s. Where more than a share of
+# that time slips, all of it does: wheels that are frozen agree with the speed now and then.
+DRIFT_S, MOST_SLIP = 20.0, 1 / 3
 # A wheel said to be at rest may creep, m/s; it is one value for so long, s.
 CREEP, CREEP_S = 0.2, 10.0
 
@@ -135,7 +135,7 @@ def observe_wheels(
     """
     stamps, ahead = problem.intervals.keyframes, motion.velocity @ direction(mounting)
     calibration, beside = UNKNOWN if known is None else known, beside_fixes(problem, fit)
-    for _ in range(LATENCY_ROUNDS if known is None else 1):
+    for step in range(LATENCY_ROUNDS if known is None else 1):
         readings = read(wheels, stamps + calibration[2], ahead)
         where = readings.rolling & beside & (np.abs(ahead) > MOVING_SPEED)
         spacing = motion.spacing[where]
@@ -144,15 +144,21 @@ def observe_wheels(
             unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
             doubt = f"beside fixes they are seen to roll for {time:.0f} s and {way:.0f} m only"
             return Wheels(readings, calibration, unseen, np.zeros(len(stamps)), doubt=doubt)
-        unit = np.array([1.0, 0.0, 0.0, 0.0])
-        _, by = misfit(ahead, motion.yaw_rate, readings, unit)
-        found, noise, _ = explain(
-            ahead[where], -by[where], ANY_UNIT, np.zeros(len(spacing)), readings.grows_with()[where], spacing
+        if known is None and step == 0:  # in whatever unit
+            ratios = (ahead * readings.directions)[where] / readings.speeds[where]
+            calibration = np.array([np.median(ratios), 0.0, 0.0, 0.0])
+        off, by = misfit(ahead, motion.yaw_rate, readings, calibration)
+        change, noise, _ = explain(
+            off[where],
+            -by[where],
+            STDDEVS,
+            np.zeros(len(spacing)),
+            readings.grows_with()[where],
+            spacing,
         )
         if known is None:
-            step = found[2] / found[0] if found[0] else 0.0
-            latency = float(np.clip(calibration[2] + step, -MOST_LATENCY_S, MOST_LATENCY_S))
-            calibration = np.array([found[0], found[1], latency, found[3]])
+            calibration = calibration + change
+            calibration[2] = np.clip(calibration[2], -MOST_LATENCY_S, MOST_LATENCY_S)
     seen = Wheels(readings, calibration, noise, np.zeros(len(stamps)))
     doubt = _doubt(seen, misfit(ahead, motion.yaw_rate, readings, calibration)[0][where], ahead[where])
     return replace(_with_slip(seen, ahead, motion, beside), doubt=doubt)
@@ -169,7 +175,12 @@ def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray
         off[lost & (window == part)] -= np.median(off[said & (window == part)])
     stddevs = np.sqrt(readings.grows_with() @ wheels.noise.parts)
     stddevs[readings.stopped] = CREEP
-    slip = np.where(said & (np.abs(off) > CUT * stddevs), off, 0.0)
+    slips = said & (np.abs(off) > CUT * stddevs)
+    slip = np.where(slips, off, 0.0)
+    for part in np.unique(window[slips]):
+        its = said & (window == part)
+        if slips[its].mean() > MOST_SLIP:
+            slip[its] = np.sqrt(np.mean(off[its] ** 2))
     share = motion.spacing[slip != 0].sum() / max(motion.spacing[said].sum(), 1e-12)
     return replace(wheels, slip=slip, slip_share=float(share))
 

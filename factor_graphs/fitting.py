@@ -94,64 +94,74 @@ def calibrate(
     return problem, fit, calibration
 
 
-def constrain(
-    problem: Problem, fit: Fit, speeds: WheelSpeeds | None = None
-) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
-    """Add what a road vehicle cannot do and what its wheels say, linearised at the solution, and again at the next.
+Constrained = tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]
+
+
+def constrain(problem: Problem, fit: Fit, speeds: WheelSpeeds | None = None) -> Constrained:
+    """Add what a road vehicle cannot do, and what its wheels say if the IMU does not contradict them.
+
+    Vehicle and wheels are None where they are not wanted.
+    """
+    found = _constrain(problem, fit, speeds)
+    wheels = found[-1]
+    if wheels is None or wheels.doubt or found[0].inflation <= CONTRADICTION * fit.inflation:
+        return found
+    alone, factors, vehicle, _ = _constrain(problem, fit, None)
+    if problem.settings.wheel_speed == "on" or found[0].inflation <= CONTRADICTION * alone.inflation:
+        return found
+    return alone, factors, vehicle, replace(wheels, held=False, doubt=CONTRADICTED)
+
+
+def _constrain(problem: Problem, fit: Fit, speeds: WheelSpeeds | None) -> Constrained:
+    """Constraints are linearised at the solution, and again at the one that follows.
 
     Slip is looked at again as well, for a heading that drifts looks like slip until it is held; and the IMU's noise,
-    which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
+    which a vehicle that is known to stand shows better.
     """
-    settings, motion = problem.settings, body_motion(problem, fit)
-    start, wanted = fit, settings.vehicle_constraint
+    settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
+    wanted = settings.vehicle_constraint
     if wanted == "auto" and _bound_share(problem) > BOUND_SHARE:
         wanted = "off"
     vehicle = None if wanted == "off" else observe(problem, fit, motion)
-    held = vehicle is not None and (wanted == "on" or not vehicle.doubt)
-    mounting, wheels = np.zeros(4), None
+    axle = vehicle if vehicle is not None and (wanted == "on" or not vehicle.doubt) else None
+    wheels, mounting = None, np.zeros(4)
     if speeds is not None and settings.wheel_speed != "off":
         shown = vehicle or observe(problem, fit, motion)
-        mounting = shown.mounting if held or not shown.doubt else mounting
+        mounting = shown.mounting if axle is not None or not shown.doubt else mounting
         wheels = observe_wheels(speeds, problem, fit, motion, mounting)
-    rolling = wheels is not None and (settings.wheel_speed == "on" or not wheels.doubt)
+    rolling = wheels if wheels is not None and (settings.wheel_speed == "on" or not wheels.doubt) else None
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
-    settled = not held and not rolling
+    settled = axle is None and rolling is None
     for _ in range(CONSTRAINT_ROUNDS):
         stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
-        if wheels is not None and rolling:
-            stands &= ~wheels.readings.moving
+        if rolling is not None:
+            stands &= ~rolling.readings.moving
         if settled and stood is not None and np.array_equal(stands, stood):
             break
         stood = stands
         factors = [*zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
-        if vehicle is not None and held:
-            fit = with_mounting(problem, fit, vehicle.mounting)
-        if wheels is not None and rolling:
-            fit = with_calibration(problem, fit, wheels.calibration)
-            factors += wheel_factors(fit.values, motion, mounting, wheels)
-        if vehicle is not None and held:
-            factors += non_holonomic_factors(fit.values, motion, vehicle.slip_stddevs(motion))
+        if axle is not None:
+            fit = with_mounting(problem, fit, axle.mounting)
+            factors += non_holonomic_factors(fit.values, motion, axle.slip_stddevs(motion))
+        if rolling is not None:
+            fit = with_calibration(problem, fit, rolling.calibration)
+            factors += wheel_factors(fit.values, motion, mounting, rolling)
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)
-        if wheels is not None and rolling and settings.wheel_speed == "auto":
-            if fit.inflation > CONTRADICTION * start.inflation:
-                fit, factors, vehicle, _ = constrain(problem, start)
-                return fit, factors, vehicle, replace(wheels, held=False, doubt=CONTRADICTED)
         before, motion = motion, body_motion(problem, fit)
-        if held or rolling:
+        if axle is not None or rolling is not None:
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
-        if vehicle is not None and held:
-            found = fit.values.atVector(M(len(motion.velocity)))
-            guessed, vehicle = vehicle, replace(observe(problem, fit, motion), mounting=found, held=True)
-            settled &= np.allclose(guessed.typical_slip, vehicle.typical_slip, rtol=SETTLED_SLIP)
-            mounting = found
-        if speeds is not None and wheels is not None and rolling:
-            found, guess = fit.values.atVector(W(len(motion.velocity))), wheels
-            wheels = replace(observe_wheels(speeds, problem, fit, motion, mounting, found), held=True)
-            settled &= np.allclose(guess.noise.typical, wheels.noise.typical, rtol=SETTLED_SLIP)
-    return fit, factors, vehicle, wheels
+        if axle is not None:
+            mounting, guessed = fit.values.atVector(M(key)), axle.typical_slip
+            axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            settled &= np.allclose(guessed, axle.typical_slip, rtol=SETTLED_SLIP)
+        if speeds is not None and rolling is not None:
+            calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
+            rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
+            settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
+    return fit, factors, vehicle, rolling or wheels
 
 
 def _bound_share(problem: Problem) -> float:

@@ -146,7 +146,7 @@ def tile_by_tile(run: Path) -> Figures:
         raw.evidence.keyframes_near(voxels.centres, steps.free_space.farthest_m),
     )
     halo = by_tile.halo_m(steps, voxels.voxel_size_m)
-    tiles = {tile: raw.around(tile, halo)[0] for tile in raw.fused.tiles}
+    tiles = {tile: raw.around(tile, halo) for tile in raw.fused.tiles}
     of_sums, sums = cpu(lambda: [by_tile.sums_of(*part, beside, steps) for part in tiles.items()], REPEATS)
     figures = figures_of(sum(sums, Sums()))
     of_tiles, _ = cpu(

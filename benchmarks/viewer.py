@@ -63,7 +63,8 @@ def cost(edge: int) -> dict[str, Any]:
     town(tiles[0])
     before, begun = peak_mb(), time.process_time()
     with TemporaryDirectory() as folder:
-        write_viewer(TiledMap(0.2, LABELS, None, tiles, read_tile), (), Path(folder) / "viewer.html")
+        tiled = TiledMap(0.2, LABELS, None, tiles, read_tile, lambda tile: read_tile(tile).voxels)
+        write_viewer(tiled, (), Path(folder) / "viewer.html")
         seconds = time.process_time() - begun - making
         finer = [file.stat().st_size for file in Path(folder).glob("viewer/*")]
         page = (Path(folder) / "viewer.html").stat().st_size

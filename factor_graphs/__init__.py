@@ -1,8 +1,9 @@
 """A GNSS/IMU trajectory from a factor graph, with consistent covariance.
 
-Knows no map and no scans. Read in this order: `measurements` and `geodesy` (what goes in), `smoothing`
-(the graph), `trajectory` (what comes out), `accuracy` (how good it is), `simulation` (exact truth to test
-against), `streaming` (fix by fix) and `kalman` (the baseline).
+Knows no map and no scans. Read in this order: `csv_log`, `measurements` and `geodesy` (what goes in), `smoothing`
+(the graph), `trajectory`, `tum` and `trajectory_plot` (what comes out), `accuracy` (how good it is), `simulation`
+(exact truth to test against), `streaming` (fix by fix: `examples/streaming.py`) and `kalman` (the baseline:
+`examples/kalman_baseline.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
     from factor_graphs.smoothing import smooth
     from factor_graphs.trajectory import Trajectory
+    from factor_graphs.trajectory_plot import write_trajectory_plot
+    from factor_graphs.tum import write_covariance_tum, write_tum
 
 __all__ = [
     "GnssFixes",
@@ -26,6 +29,9 @@ __all__ = [
     "read_csv",
     "read_wheels",
     "smooth",
+    "write_covariance_tum",
+    "write_trajectory_plot",
+    "write_tum",
 ]
 
 _PLACES = {
@@ -37,6 +43,9 @@ _PLACES = {
     "read_csv": "csv_log",
     "read_wheels": "csv_log",
     "smooth": "smoothing",
+    "write_covariance_tum": "tum",
+    "write_trajectory_plot": "trajectory_plot",
+    "write_tum": "tum",
 }
 
 

@@ -1,6 +1,6 @@
 """The first guess: where the vehicle was, how fast, and which way it looked, before any graph.
 
-Position and velocity come from a constant-velocity Kalman smoother over the fixes, roll and pitch from
+Position and velocity come from a smoothing spline through the fixes, roll and pitch from
 the mean specific force, heading from the gyroscope tied to the course. A good start matters: from straight
 lines between fixes the optimiser stays in a wrong valley after a long outage.
 """
@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +21,9 @@ from factor_graphs.measurements import GnssFixes
 
 Array = NDArray[np.float64]
 
-# Random acceleration of the constant-velocity model, m/s²/√Hz: brisk driving.
+# Prior of the first keyframe's position m and speed m/s: finite, and no information.
+START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
+# Random acceleration between the fixes, m/s²/√Hz: brisk driving.
 CRUISE_NOISE_DENSITY = 1.5
 # Course says nothing about heading below this speed, m/s, nor this far, s, from a fix.
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
@@ -54,41 +58,47 @@ def first_guess(
     intervals: ImuIntervals, fixes: GnssFixes, p_imu_antenna: Array, attitude: AttitudePrior | None = None
 ) -> tuple[Array, Array]:
     """Poses (k, 4, 4) and velocities (k, 3) of the imu at the keyframes."""
-    positions, velocities = constant_velocity(fixes, intervals)
+    positions, velocities = spline_through(fixes, intervals)
     T = np.tile(np.eye(4), (len(positions), 1, 1))
     T[:, :3, :3] = attitudes(intervals, fixes, velocities, attitude)
     T[:, :3, 3] = positions - T[:, :3, :3] @ p_imu_antenna
     return T, velocities
 
 
-def constant_velocity(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array, Array]:
-    """Positions and velocities of the antenna at the keyframes, (k, 3) each: Kalman filter and RTS smoother.
+def spline_through(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array, Array]:
+    """Positions and velocities of the antenna at the keyframes, (k, 3) each, under white random acceleration.
 
-    The axes are independent of each other, but filtered together.
+    The most probable motion is a cubic smoothing spline, with its knots at the fixes and at both ends.
     """
-    from filterpy.kalman import KalmanFilter
+    at = intervals.keyframe_of(fixes.stamps)
+    knots = np.unique([0, *at, len(intervals.keyframes) - 1])
+    stamps, origin = intervals.keyframes[knots], fixes.positions[0]
+    bands, weighted = _motion_bands(np.diff(stamps)), np.zeros((3, len(knots)))
+    states = np.empty((len(knots), 2, 3))
+    for axis in range(3):
+        information, of_axis = 1 / fixes.stddevs[:, axis] ** 2, bands.copy()
+        row = np.searchsorted(knots, at)
+        np.add.at(of_axis[0], 2 * row, information)
+        np.add.at(weighted[axis], row, information * (fixes.positions[:, axis] - origin[axis]))
+        right = np.column_stack([weighted[axis], np.zeros(len(knots))]).ravel()
+        states[:, :, axis] = solveh_banded(of_axis, right, lower=True).reshape(-1, 2)
+    spline = CubicHermiteSpline(stamps, states[:, 0] + origin, states[:, 1])
+    return spline(intervals.keyframes), spline(intervals.keyframes, 1)
 
-    kalman = KalmanFilter(dim_x=6, dim_z=3)
-    kalman.x = np.concatenate([fixes.positions[0], np.zeros(3)])
-    kalman.P = np.diag(np.repeat([1e4, 4e2], 3))
-    kalman.H = np.eye(3, 6)
-    stamps = intervals.keyframes
-    fix_at = dict(zip(intervals.keyframe_of(fixes.stamps).tolist(), range(len(fixes)), strict=True))
-    dt = np.diff(stamps, prepend=stamps[0])
-    Fs, Qs, axes = np.tile(np.eye(6), (len(dt), 1, 1)), np.zeros((len(dt), 6, 6)), np.arange(3)
-    Fs[:, axes, axes + 3] = dt[:, None]
-    Qs[:, axes, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 3 / 3
-    Qs[:, axes, axes + 3] = Qs[:, axes + 3, axes] = CRUISE_NOISE_DENSITY**2 * dt[:, None] ** 2 / 2
-    Qs[:, axes + 3, axes + 3] = CRUISE_NOISE_DENSITY**2 * dt[:, None]
-    means, covariances = [], []
-    for i, (F, Q) in enumerate(zip(Fs, Qs, strict=True)):
-        kalman.predict(F=F, Q=Q)
-        if i in fix_at:
-            kalman.update(fixes.positions[fix_at[i]], R=np.diag(fixes.stddevs[fix_at[i]] ** 2))
-        means.append(kalman.x)
-        covariances.append(kalman.P)
-    smoothed = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0]
-    return smoothed[:, :3], smoothed[:, 3:]
+
+def _motion_bands(dt: Array) -> Array:
+    """Information of position and velocity at n + 1 moments, (n, ) s apart: its four lower bands, (4, 2 n + 2)."""
+    strength = 1 / CRUISE_NOISE_DENSITY**2
+    positions, mixed, velocities = 12 * strength / dt**3, 6 * strength / dt**2, 4 * strength / dt
+    bands = np.zeros((4, 2 * len(dt) + 2))
+    bands[0, :2] = 1 / START_POSITION_STDDEV**2, 1 / START_SPEED_STDDEV**2
+    for end, sign in ((slice(0, -2), 1), (slice(2, None), -1)):  # of every step its begin and its end
+        bands[0, end][::2] += positions
+        bands[0, end][1::2] += velocities
+        bands[1, end][::2] += sign * mixed
+    bands[1, 1:-2:2], bands[3, :-2:2] = -mixed, mixed
+    bands[2, :-2:2], bands[2, 1:-2:2] = -positions, velocities / 2
+    return bands
 
 
 def attitudes(

@@ -1,58 +1,158 @@
-"""A log of two CSV files, `imu.csv` and `gnss.csv`, and if there is one a third, `wheels.csv`."""
+"""A log of two CSV files, `imu.csv` and `gnss.csv`, and if there is one a third, `wheels.csv`.
+
+What has one obvious repair is repaired, with a warning that counts the rows; all else is refused.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.errors import MeasurementError
+from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds, clean_wheels
+from factor_graphs.measurements import (
+    GnssFixes,
+    ImuSamples,
+    WheelSpeeds,
+    clean_gnss,
+    clean_imu,
+    clean_wheels,
+    far_off,
+    unit_fault,
+)
+from factor_graphs.valid_fixes import valid_fixes
+
+if TYPE_CHECKING:
+    from pyarrow import Table
+
+Array = NDArray[np.float64]
 
 IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
 WHEEL_COLUMNS = ("stamp_s", "speed_mps")
+# Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer.
+LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
+LONGEST_HEADER = 10_000
 
 
 def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
-    """Read `imu.csv` and `gnss.csv` of a folder; the local frame has its origin at the first fix.
+    """Read `imu.csv` and `gnss.csv` of a folder; the local frame has its origin at the first valid fix.
 
     IMU columns: stamp_s; ax, ay, az, specific force, m/s²; wx, wy, wz, rad/s; x forward, y left, z up. GNSS columns:
-    stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m. Other columns are ignored. Raises
-    MeasurementError for a file that is missing, or holds no such table.
+    stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m. Other columns are ignored. Rows without a
+    value, with a repeated stamp, or without a valid fix are dropped, and rows out of order are sorted: a RepairWarning
+    says how many. Raises MeasurementError for a file that is missing, holds no such table, or has stamps in another
+    unit than seconds.
     """
-    imu, gnss = _table(Path(folder) / "imu.csv", IMU_COLUMNS), _table(Path(folder) / "gnss.csv", GNSS_COLUMNS)
-    frame = LocalFrame(*(float(value) for value in gnss[0, 1:4]))
-    fixes = GnssFixes(gnss[:, 0], frame.to_map(*gnss[:, 1:4].T), gnss[:, 4:7])
-    return ImuSamples(imu[:, 0], imu[:, 1:4], imu[:, 4:7]), fixes, frame
+    imu_csv, gnss_csv = Path(folder) / "imu.csv", Path(folder) / "gnss.csv"
+    imu_rows = _numbers(imu_csv, IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
+    gnss_rows, invalid = fix_rows(_numbers(gnss_csv, GNSS_COLUMNS, LONGEST_FIX_STEP_S), str(gnss_csv))
+    frame = LocalFrame(*(float(value) for value in gnss_rows[0, 1:4]))
+    fixes, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
+    told = [f"{gnss_csv}: {n} rows dropped: {why}" for why, n in invalid.items()]
+    for path, repairs in ((imu_csv, imu_repairs), (gnss_csv, gnss_repairs)):
+        told += [f"{path}: {repairs}"] if repairs.dropped or repairs.out_of_order else []
+    for message in told:
+        warnings.warn(message, RepairWarning, stacklevel=2)
+    return imu, fixes, frame
 
 
 def read_wheels(folder: Path | str) -> WheelSpeeds | None:
     """Read `wheels.csv` of a folder, for `smooth(..., wheels=...)`; None where there is none.
 
-    Columns: stamp_s; speed_mps, below zero in reverse if the sensor tells. Rows that `clean_wheels` drops are left out.
-    Raises MeasurementError for a file that holds no such table.
+    Columns: stamp_s; speed_mps, below zero in reverse if the sensor tells. Rows are repaired, and errors raised, as by
+    `read_csv`.
     """
     path = Path(folder) / "wheels.csv"
     if not path.exists():
         return None
-    rows = _table(path, WHEEL_COLUMNS)
-    return clean_wheels(rows[:, 0], rows[:, 1])[0]
+    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    if repairs.dropped or repairs.out_of_order:
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    return wheels
 
 
-def _table(path: Path, columns: tuple[str, ...]) -> NDArray[np.float64]:
-    """The named columns (n, len(columns)) of a CSV file, whatever their order."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            names = [name.strip() for name in file.readline().split(",")]
-            places = [names.index(name) for name in columns]
-            rows = np.loadtxt(file, delimiter=",", usecols=places, ndmin=2)
-    except (OSError, ValueError) as error:
+def fix_rows(rows: Array, where: str) -> tuple[Array, dict[str, int]]:
+    """Of rows of GNSS_COLUMNS (n, 7) the valid fixes, in file order, and the number of invalid rows of each kind.
+
+    Raises MeasurementError when no row is a valid fix.
+    """
+    stamped = np.isfinite(rows[:, 0])
+    stamped[stamped] = ~far_off(rows[stamped, 0])
+    near = rows[stamped]
+    valid, invalid = valid_fixes(near[:, 0], near[:, 1:4], near[:, 4:7])
+    if not stamped.all():
+        invalid["no stamp, or one far off all others"] = int((~stamped).sum())
+    if not valid.any():
         raise MeasurementError(
-            f"{path}: {error}; expected a table with columns {','.join(columns)}"
-        ) from None
-    if len(rows) == 0:
-        raise MeasurementError(f"{path}: empty; expected rows of {','.join(columns)}")
+            f"{where}: no usable fix among {len(rows)} rows; expected degrees and metres of WGS 84, and standard"
+            f" deviations above 0; found {'; '.join(f'{count} rows: {why}' for why, count in invalid.items())}"
+        )
+    return near[valid], invalid
+
+
+def parse_numbers(content: bytes, columns: tuple[str, ...], where: str, longest_step_s: float) -> Array:
+    """The named columns of a CSV file, whatever their order, (n, len(columns)); the first is a stamp, s.
+
+    A cell without a value is NaN. Raises MeasurementError as `parse_columns` does, and for stamps in another unit.
+    """
+    table = parse_columns(content, dict.fromkeys(columns, "float64"), where)
+    rows = np.column_stack([table[name].to_numpy() for name in columns]).astype(np.float64)
+    if fault := unit_fault(rows[:, 0], longest_step_s):
+        raise MeasurementError(f"{where}: {fault}")
     return rows
+
+
+def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table:
+    """The named columns of a CSV file, each with its Arrow type; raises MeasurementError for anything else."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds"
+    header = content[:LONGEST_HEADER].partition(b"\n")[0].decode("utf-8-sig", "replace")
+    names = [name.strip().strip('"') for name in header.split(",")]
+    if not header.strip():
+        raise MeasurementError(f"{where}: empty; {expected}")
+    if wrong := [name for name in types if names.count(name) != 1]:
+        found = " ".join(header.split())[:200]
+        raise MeasurementError(f"{where}: column {wrong[0]} is missing or repeated in {found}; {expected}")
+    try:
+        table = csv.read_csv(
+            pa.BufferReader(_completed(content, len(names))),
+            # with several threads an error does not tell its row
+            read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
+            convert_options=csv.ConvertOptions(
+                include_columns=list(types),
+                column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
+                strings_can_be_null=True,
+            ),
+        )
+    except (pa.ArrowException, ValueError, KeyError) as error:
+        raise MeasurementError(f"{where}: {' '.join(str(error).split())[:200]}; {expected}") from None
+    if table.num_rows == 0:
+        raise MeasurementError(f"{where}: no rows; {expected}")
+    return table
+
+
+def _completed(content: bytes, cells: int) -> bytes:
+    """A last line that was cut off, when the logger died, becomes a row without values: dropped and counted as such."""
+    start = content.rfind(b"\n") + 1
+    is_cut = start and content.count(b",", start) < cells - 1 and content[start:].strip()
+    return content[:start] + b"," * (cells - 1) if is_cut else content
+
+
+def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise MeasurementError(
+            f"{path}: cannot be read ({error.strerror}); expected a table with columns {','.join(columns)}"
+        ) from None
+    return parse_numbers(content, columns, str(path), longest_step_s)

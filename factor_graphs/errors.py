@@ -11,3 +11,7 @@ class MeasurementError(FactorGraphError, ValueError):
 
 class EstimationError(FactorGraphError, RuntimeError):
     """The data are usable, but no trustworthy trajectory came out of them."""
+
+
+class RepairWarning(UserWarning):
+    """Rows of a log were dropped or sorted; the message says how many, and why."""

@@ -2,6 +2,7 @@
 
 The classical way to fuse IMU and GNSS (Groves 2013, chapter 14), on filterpy. The graph must beat it. The
 error is (rotation in imu axes, position, velocity, accelerometer bias, gyroscope bias), truth minus estimate.
+`examples/kalman_baseline.py` compares the two.
 """
 
 from dataclasses import dataclass

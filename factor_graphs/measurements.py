@@ -14,6 +14,7 @@ from factor_graphs.errors import MeasurementError
 
 Array = NDArray[np.float64]
 
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # No accelerometer or gyroscope says more, in whatever unit.
 LARGEST_OF_IMU = 1e6
 # Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available".
@@ -40,6 +41,9 @@ class ImuSamples:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "ImuSamples":
+        return ImuSamples(self.stamps[rows], self.specific_force[rows], self.angular_rate[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +210,19 @@ def far_off(stamps: Array) -> NDArray[np.bool_]:
         centre = stamps[order][group == largest].mean()
         off[order] = few[group] | ((np.abs(stamps[order] - centre) > DAY_S) & (group != largest))
     return off
+
+
+def unit_fault(stamps: Array, longest_step_s: float) -> str | None:
+    """Why stamps (n,) are not seconds, by their usual step, and what they probably are; None if they may be."""
+    finite = np.sort(stamps[np.isfinite(stamps)])
+    with np.errstate(over="ignore"):
+        steps = np.diff(finite)
+    steps = steps[steps > 0]
+    if len(steps) < 2 or (step := float(np.median(steps))) <= longest_step_s:
+        return None
+    fitting = [unit for unit, scale in UNITS.items() if step * scale <= longest_step_s]
+    fault = f"the usual step between stamps is {step:.6g}, expected seconds, at most {longest_step_s:g}"
+    return fault + (f"; are these {fitting[0]}?" if fitting else "")
 
 
 def gaps(stamps: Array, longer_than: float = 2.0) -> Array:

@@ -7,7 +7,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.alignment import AttitudePrior, first_guess
+from factor_graphs.alignment import (
+    START_POSITION_STDDEV,
+    START_SPEED_STDDEV,
+    AttitudePrior,
+    first_guess,
+)
 from factor_graphs.chi_square import probability_below, quantile
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
@@ -33,9 +38,6 @@ GOOD_MEAN = 3 * probability_below(GATE, 5) / probability_below(GATE, 3)
 # ... and relative poses.
 RELATIVE_GATE, RELATIVE_REJECTION = quantile(0.99, 6), quantile(0.999, 6)
 RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below(RELATIVE_GATE, 6)
-# Prior of the first keyframe's position m and speed m/s: finite, and no information.
-START_POSITION_STDDEV, START_SPEED_STDDEV = 100.0, 20.0
-
 # The cost stands still when it changes by less than this share.
 RELATIVE_TOLERANCE = 1e-5
 

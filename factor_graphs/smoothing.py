@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 # Beyond 99.9 % of good relative poses one is rejected: so many in a hundred are ten times what chance takes.
 NOTABLE_REJECTION = 0.01
+# The usual specific force of any vehicle is gravity to some per cent; so many times more or less is another unit.
+ANOTHER_UNIT = 2.0
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
 UNKNOWN_HEADING = 0.35
 
@@ -145,7 +147,7 @@ def _solution(
         iterations=fit.iterations,
         vehicle=vehicle,
         wheels=wheels,
-        notes=(*problem.notes, *_doubts(fit, keyframes, rejected, calibration)),
+        notes=(*problem.notes, *_doubts(problem, fit, keyframes, rejected, calibration)),
     )
 
 
@@ -172,9 +174,13 @@ def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration
 
 
 def _doubts(
-    fit: Fit, keyframes: Trajectory, rejected: NDArray[np.bool_], calibration: Calibration
+    problem: Problem, fit: Fit, keyframes: Trajectory, rejected: NDArray[np.bool_], calibration: Calibration
 ) -> Iterator[str]:
     """What the user should know before believing the trajectory, in words."""
+    force = float(np.median(np.linalg.norm(problem.intervals.specific_force, axis=1)))
+    gravity = problem.frame.gravity
+    if not gravity / ANOTHER_UNIT < force < gravity * ANOTHER_UNIT:
+        yield f"the usual specific force is {force:.2f} m/s², gravity {gravity:.2f}: is it in g, or without gravity?"
     if fit.inflation > 1:
         yield f"the IMU fits with {fit.inflation:.1f} times the noise that was expected"
     if fit.chi2_per_dof > FITTING_CHI2[1]:

@@ -1,7 +1,7 @@
 """Fix by fix: the smoother's factors in an incremental fixed-lag smoother (iSAM2).
 
 QR instead of Cholesky, which fails in GNSS outages of more than about 40 s; and when the solver throws all
-the same, it starts again from its last state.
+the same, it starts again from its last state. `examples/streaming.py` shows how it is used.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class StreamedState:
 
 
 class StreamingSmoother:
-    """Follows a vehicle online, from where a batch solution of its first seconds ends.
+    """Fixed-lag smoother that follows a vehicle online, from where a batch solution of its first seconds ends.
 
     `start` gives the first state, its covariance and the IMU noise; `p_imu_antenna` (3,) m is the lever arm.
     `state` is the newest one, `restarts` counts how often the solver had to start again, and `unbound` the

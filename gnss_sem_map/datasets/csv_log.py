@@ -14,27 +14,31 @@ Stamps are seconds on one clock.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError
 
-from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels, far_off
-from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.gnss_fixes import usable_fixes
-from gnss_sem_map.datasets.stamps import (
+from factor_graphs.csv_log import (
+    GNSS_COLUMNS,
+    IMU_COLUMNS,
     LONGEST_FIX_STEP_S,
-    LONGEST_FRAME_STEP_S,
     LONGEST_IMU_STEP_S,
-    LONGEST_SWEEP_S,
     LONGEST_WHEEL_STEP_S,
-    check_unit,
-    in_order,
+    WHEEL_COLUMNS,
+    fix_rows,
+    parse_columns,
+    parse_numbers,
 )
+from factor_graphs.errors import MeasurementError
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels
+from gnss_sem_map.datasets import frames
+from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, LONGEST_SWEEP_S, check_unit, in_order
 from gnss_sem_map.errors import DataError, PointTimesError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
@@ -56,10 +60,6 @@ Matrix4 = tuple[
     tuple[float, float, float, float],
 ]
 IDENTITY: Matrix4 = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
-
-IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
-GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
-WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 
 
 class LogFile(SensorConventions):
@@ -95,9 +95,9 @@ def is_drive(drive: Path) -> bool:
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
     about = _about(drive / "log.yaml")
-    imu_rows = _table(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
-    gnss_rows, fix_skips = _fixes(drive / "gnss.csv")
+    gnss_rows, fix_skips = _fix_rows(drive / "gnss.csv")
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
     gnss, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
     skips = [
@@ -137,33 +137,6 @@ def _about(path: Path) -> LogFile:
         ) from None
 
 
-def _fixes(path: Path) -> tuple[Array, list[Skip]]:
-    """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
-    rows = _table(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S)
-    stamped = np.isfinite(rows[:, 0])
-    stamped[stamped] = ~far_off(rows[stamped, 0])
-    usable, skips = usable_fixes(rows[stamped, 0], rows[stamped, 1:4], rows[stamped, 4:7], shown(path))
-    if not stamped.all():
-        skips.append(
-            Skip("fix", shown(path), f"{(~stamped).sum()} rows: no stamp, or one far off all others")
-        )
-    if not usable.any():
-        raise DataError(
-            f"{shown(path)}: no usable fix among {len(rows)} rows; expected degrees and metres of WGS 84, and standard"
-            " deviations above 0" + (f"; found {skips[0].reason}" if skips else "")
-        )
-    return rows[stamped][usable], skips
-
-
-def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
-    """Wheel speeds and the skipped rows; None where there is no such table."""
-    if not is_file(path):
-        return None, []
-    rows = _table(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
-    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
-    return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
-
-
 def _calibration(about: LogFile, path: Path) -> Calibration:
     camera = (about.T_camera_lidar, about.K, about.image_size)
     if any(part is None for part in camera) and any(part is not None for part in camera):
@@ -180,38 +153,40 @@ def _calibration(about: LogFile, path: Path) -> Calibration:
     )
 
 
-def _table(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
+def _fix_rows(path: Path) -> tuple[Array, list[Skip]]:
+    """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
+    with _as_data_error():
+        rows, invalid = fix_rows(_numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S), shown(path))
+    return rows, [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+
+
+def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
+    """Wheel speeds and the skipped rows; None where there is no such table."""
+    if not is_file(path):
+        return None, []
+    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
+
+
+def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
     """The named columns of a CSV file, whatever their order: (n, len(columns)); the first is a stamp, s."""
-    table = _columns(path, columns, dict.fromkeys(columns, "float64"))
-    rows = np.column_stack([table[name].to_numpy() for name in columns]).astype(np.float64)
-    check_unit(rows[:, 0], longest_step_s, shown(path))
-    return rows
+    with _as_data_error():
+        return parse_numbers(_content(path, columns), columns, shown(path), longest_step_s)
 
 
-def _columns(path: Path, columns: tuple[str, ...], types: dict[str, str]) -> Any:
-    """The named columns of a CSV file as an Arrow table; raises DataError for anything else."""
-    import pyarrow as pa
-    from pyarrow import csv
-
+def _content(path: Path, columns: tuple[str, ...]) -> bytes:
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing; expected a table with columns {','.join(columns)}")
-    content = read_bytes(path, MOST_TABLE_BYTES)
+    return read_bytes(path, MOST_TABLE_BYTES)
+
+
+@contextmanager
+def _as_data_error() -> Iterator[None]:
     try:
-        options = csv.ConvertOptions(
-            include_columns=list(columns),
-            column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
-            strings_can_be_null=True,
-        )
-        table = csv.read_csv(pa.BufferReader(content), convert_options=options)
-        if len(set(table.column_names)) < len(columns):
-            raise ValueError("a column is repeated")
-    except (pa.ArrowException, ValueError, KeyError) as error:
-        raise DataError(
-            f"{shown(path)}: {' '.join(str(error).split())[:200]}; expected numbers in columns {','.join(columns)}"
-        ) from None
-    if table.num_rows == 0:
-        raise DataError(f"{shown(path)}: empty; expected rows of {','.join(columns)}")
-    return table
+        yield
+    except MeasurementError as error:
+        raise DataError(str(error)) from None
 
 
 def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
@@ -219,7 +194,9 @@ def _stamps(path: Path, what: str) -> tuple[dict[int, float], list[Skip]]:
 
     A number may have 19 digits: it is never a floating number.
     """
-    table = _columns(path, ("number", "stamp_s"), {"number": "string", "stamp_s": "float64"})
+    columns = {"number": "string", "stamp_s": "float64"}
+    with _as_data_error():
+        table = parse_columns(_content(path, tuple(columns)), columns, shown(path))
     texts, seconds = table["number"].to_pylist(), table["stamp_s"].to_numpy().astype(np.float64)
     check_unit(seconds, LONGEST_FRAME_STEP_S, shown(path))
     stamps: dict[int, float] = {}

@@ -19,8 +19,8 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuSamples, far_off
 from factor_graphs.trajectory import Trajectory
+from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames, kitti_calibration
-from gnss_sem_map.datasets.gnss_fixes import usable_fixes
 from gnss_sem_map.datasets.stamps import in_order, sweep_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
@@ -72,14 +72,13 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     calibration = _calibration(_date_folder(drive), has_images=is_folder(drive / "image_02"))
     oxts_ns, oxts, skips = _oxts(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
-    is_fix, fix_skips = usable_fixes(
-        stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]], shown(drive / "oxts")
-    )
+    is_fix, invalid = valid_fixes(stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]])
     if not is_fix.any():
         raise DataError(
-            f"{shown(drive / 'oxts')}: not one of {len(oxts)} rows is a fix; found {fix_skips[0].reason}; expected"
+            f"{shown(drive / 'oxts')}: not one of {len(oxts)} rows is a fix; found {next(iter(invalid))}; expected"
             " degrees, metres of WGS 84 and an accuracy above 0 (columns 1 to 3, and 24)"
         )
+    fix_skips = [Skip("fix", shown(drive / "oxts"), f"{n} rows: {why}", n) for why, n in invalid.items()]
     epoch_ns = int(oxts_ns[0])
     fixes = oxts[is_fix]
     frame = LocalFrame(*(float(v) for v in fixes[0, [LAT, LON, ALT]]))

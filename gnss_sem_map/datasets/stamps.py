@@ -7,16 +7,15 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.measurements import far_off
+from factor_graphs.measurements import far_off, unit_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Skip
 
 LONGEST_SWEEP_S = 1.0
 FAR_FROM_SWEEP_S = 0.5
 """A scan's stamp may lie this far outside its sweep."""
-LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_FRAME_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 20.0, 5.0
+LONGEST_FRAME_STEP_S = 20.0
 """Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer."""
-UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 
 
 class Stamped(Protocol):
@@ -38,17 +37,8 @@ T = TypeVar("T", bound=Stamped)
 
 def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -> None:
     """Raise DataError, with the likely unit, when the usual step between the stamps is longer than any sensor's."""
-    finite = np.sort(stamps[np.isfinite(stamps)])
-    with np.errstate(over="ignore"):
-        steps = np.diff(finite)
-    steps = steps[steps > 0]
-    if len(steps) < 2 or (step := float(np.median(steps))) <= longest_step_s:
-        return
-    fitting = [unit for unit, scale in UNITS.items() if step * scale <= longest_step_s]
-    raise DataError(
-        f"{where}: the usual step between stamps is {step:.6g}, expected seconds, at most {longest_step_s:g}"
-        + (f"; are these {fitting[0]}?" if fitting else "")
-    )
+    if fault := unit_fault(stamps, longest_step_s):
+        raise DataError(f"{where}: {fault}")
 
 
 def sweep_fault(stamp: float, start: float, end: float) -> str | None:

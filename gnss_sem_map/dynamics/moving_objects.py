@@ -18,7 +18,7 @@ from gnss_sem_map.dynamics.clusters import Segments, find_segments, split_segmen
 from gnss_sem_map.dynamics.ground_grid import closer_than, height_over_ground, in_cells_near, within_radius
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
-from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses
+from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses, spatial_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.voxels.hash_unique import distinct
 
@@ -119,10 +119,12 @@ def _observations_by_others(
     sums = np.concatenate([part.sums for part in parts])
     centroids = np.stack([np.bincount(row, sums[:, axis]) / points for axis in range(3)], axis=1)
     images = [*before, *(seen.seen for seen in observations)]
-    counts = np.zeros((2, len(centroids)), np.int32)
+    order = spatial_order(centroids)
+    centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
     for start in range(0, len(images), SCANS_AT_A_TIME):
         some = KeyframeScans.of(images[start : start + SCANS_AT_A_TIME])
         counts += hits_and_misses(centroids, some, farthest_m)
+    counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
     return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
 

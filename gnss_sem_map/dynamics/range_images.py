@@ -25,9 +25,13 @@ NEAREST_M, FARTHEST_M = 2.5, 650.0
 IMAGE_SHAPE = (ROWS + 2, WIDTH)
 UNITS_PER_M = 100
 EMPTY = np.uint16(65535)
+SLENDER = 0.7
+"""A sphere of more than this share of its distance as its radius is not asked whether it is hidden."""
 LEAST_FILLED = 3
 """A 3 x 3 window with fewer returns is no evidence: sky, glass, or the edge of the view."""
 BLOCK = 1024
+CLUSTER = 256
+"""Positions in a row that are hidden together: they should be neighbours, see `visibility.spatial_order`."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -141,13 +145,18 @@ def count_hits_and_misses(
     `images` (k, 70, 902) cm, `T_lidar_map` (k, 4, 4), of which those at the places `chosen` are asked. Only scans with
     the position in range count. A return is a hit within a margin that grows with range.
     """
-    p_lidar, index = np.empty((3, BLOCK)), np.empty(BLOCK, np.int32)
-    corners, lows, highs = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.uint16), np.empty(BLOCK, np.uint16)
-    for start in range(0, len(positions), BLOCK):
-        here = positions[start : start + BLOCK]
+    p_lidar, index = np.empty((3, CLUSTER)), np.empty(CLUSTER, np.int32)
+    corners = np.empty(CLUSTER, np.int32)
+    lows, highs = np.empty(CLUSTER, np.uint16), np.empty(CLUSTER, np.uint16)
+    for start in range(0, len(positions), CLUSTER):
+        here = positions[start : start + CLUSTER]
+        centre, radius = _sphere_around(here)
         for k in chosen:
-            count = _in_range(here, T_lidar_map[k], nearest_m, farthest_m, p_lidar, index)
-            xs, ys, zs, drawn = p_lidar[0], p_lidar[1], p_lidar[2], images[k].reshape(-1)
+            T, drawn = T_lidar_map[k], images[k].reshape(-1)
+            if _is_hidden(centre, radius, T, drawn, farthest_m, margin_m, margin_ratio):
+                continue
+            count = _in_range(here, T, nearest_m, farthest_m, p_lidar, index)
+            xs, ys, zs = p_lidar[0], p_lidar[1], p_lidar[2]
             for i in range(count):
                 x, y, z = xs[i], ys[i], zs[i]
                 r = np.sqrt(x * x + y * y + z * z)
@@ -161,6 +170,59 @@ def count_hits_and_misses(
                     visibility = _test_visibility(drawn, corners[i], lows[i], highs[i])
                     hits[start + index[i]] += visibility == 1
                     misses[start + index[i]] += visibility == -1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sphere_around(positions):
+    """Centre and radius of a sphere that holds the positions (m, 3)."""
+    low, high = positions[0].copy(), positions[0].copy()
+    for position in positions:
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], position[axis]), max(high[axis], position[axis])
+    return (low + high) / 2, np.sqrt(((high - low) ** 2).sum()) / 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_hidden(centre, radius, T_lidar_map, drawn, farthest_m, margin_m, margin_ratio):
+    """Whether a scan says nothing of any place in a sphere: out of its range or view, or behind all that it saw there.
+
+    The window of pixels around the sphere is a little too large, and the range to it a little too small.
+    """
+    x, y, z = _in_lidar(T_lidar_map, centre, 0)
+    level, distance = np.sqrt(x * x + y * y), np.sqrt(x * x + y * y + z * z)
+    if distance - radius > farthest_m:
+        return True
+    if radius > SLENDER * level:
+        return False  # it is around the scan, or nearly so
+    half = np.degrees(np.arcsin(radius / level))
+    row = (atan2_deg(z, level) - LOWEST_DEG) / ROW_DEG
+    first_row, last_row = int(row - half / ROW_DEG) - 2, int(row + half / ROW_DEG) + 3
+    if last_row < 0 or first_row > ROWS:
+        return True
+    nearest = UNITS_PER_M * ((1 - margin_ratio) * (distance - radius) - margin_m) - 1
+    column = (atan2_deg(y, x) + 180.0) / COLUMN_DEG
+    first, last = int(column - half / COLUMN_DEG) - 2, int(column + half / COLUMN_DEG) + 3
+    for r in range(max(first_row, 0) + 1, min(last_row, ROWS - 1) + 2):
+        at = r * WIDTH + 1
+        if first < 0 or last > COLUMNS:  # across the seam
+            seen = max(
+                _farthest(drawn, at, at + last % COLUMNS),
+                _farthest(drawn, at + first % COLUMNS, at + COLUMNS),
+            )
+        else:
+            seen = _farthest(drawn, at + first, at + last)
+        if seen >= nearest:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _farthest(drawn, start, end):
+    """The largest of some pixels; those without a return count as 0."""
+    largest = uint16(0)
+    for i in range(start, end):
+        largest = max(largest, uint16(drawn[i] + uint16(1)))  # EMPTY becomes 0
+    return int32(largest) - 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -16,6 +16,8 @@ THREADS = min(threads(), 4)
 """More threads would wait for the one that reads, each with two scans in memory."""
 POINTS_PER_BLOCK = 1 << 14
 """Positions that one thread works on at a time."""
+CUBE_M = 3.2
+"""Edge of the cubes of neighbours: they hide together behind what is nearer."""
 APART_M, APART_S = 2.0, 2.0
 """Distance and time between keyframe scans, whichever comes first: the scans take no more memory than the map."""
 NEAREST_M = 3.0
@@ -103,6 +105,13 @@ class KeyframeSelector:
     def keyframes(self) -> KeyframeScans | None:
         """The selected scans; None if there are none."""
         return KeyframeScans.of(self._kept) if self._kept else None
+
+
+def spatial_order(positions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """An order of positions (v, 3) m in which those that follow each other are neighbours, cube by cube."""
+    cubes = (positions / CUBE_M).astype(np.int64)
+    x, y, z = (cubes - cubes.min(axis=0, initial=0)).T
+    return np.argsort((x << 42) + (y << 21) + z, kind="stable")
 
 
 def hits_and_misses(

@@ -38,12 +38,11 @@ class RawMap:
     """All points."""
     evidence: RunEvidence
 
-    def around(self, tile: Tile, margin_m: float) -> tuple[VoxelMap, VoxelMap]:
-        """The voxels of a tile and of a margin around it: static points, and those that moved; raises DataError."""
+    def around(self, tile: Tile, margin_m: float) -> VoxelMap:
+        """The voxels of a tile and of a margin around it, without the points that moved; raises DataError."""
         everything = self.fused.around(tile, margin_m)
-        moved = self.evidence.moved.around(tile, margin_m)
         try:
-            return everything - moved, moved
+            return everything - self.evidence.moved.around(tile, margin_m)
         except DataError:
             raise DataError("map/ and evidence/ are not of one run; make the run again") from None
 
@@ -95,7 +94,7 @@ def write_sum(
     label_set = open_label_set(classes)
     for place in (Path(MAP), Path(evidence.FOLDER, evidence.MOVED)):
         folders = [drive / place for drive in drives]
-        maps = [tiles.open_map(folder, label_set, held=0) for folder in folders]
+        maps = [tiles.open_map(folder, label_set) for folder in folders]
         sizes = {one.voxel_size_m for one in maps}
         if len(sizes) > 1 or {one.frame for one in maps} != {frame}:
             raise DataError(
@@ -121,9 +120,9 @@ def write_sum(
 
 def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[str, Any]]]) -> list[None]:
     """Save the sums of tiles, each with the digest of what it is made from: a task."""
-    opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), held=0))
+    opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), voxels_held=0))
     for x, y, of_tile in of_tiles:
-        parts = [opened(folder).read_tile((x, y)).voxels for folder in of_tile["folders"]]
+        parts = [opened(folder).read_voxels((x, y)) for folder in of_tile["folders"]]
         about = {"made_from": of_tile["made_from"]}
         save((x, y), SemanticMap.of(reduce(add, parts)), about, None, Path(made_in))
     return [None] * len(of_tiles)

@@ -41,8 +41,7 @@ from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import files_of, name_of
 from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
-from gnss_sem_map.voxels.tiles import places_around
-from gnss_sem_map.voxels.voxel_map import VoxelMap, limits_of
+from gnss_sem_map.voxels.voxel_map import limits_of
 
 REFINED = "refined"
 
@@ -205,13 +204,12 @@ class _Inputs:
         self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
-    def beside(self, tile: Tile, around: VoxelMap, moved: VoxelMap) -> Evidence:
-        own = around.indices[places_around(around, tile, 0)]
-        keyframes = None
-        if len(own) and self.steps.free_space.enabled:
-            box = (np.stack(limits_of(own)) + 0.5) * around.voxel_size_m
+    def beside(self, tile: Tile) -> Evidence:
+        fused, keyframes = self.raw.fused.around(tile, 0), None
+        if len(fused) and self.steps.free_space.enabled:
+            box = (np.stack(limits_of(fused.indices)) + 0.5) * fused.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
-        return Evidence(moved, self.model, keyframes)
+        return Evidence(self.raw.evidence.moved.around(tile, 0), self.model, keyframes)
 
 
 @lru_cache(1)
@@ -228,8 +226,8 @@ def measure_tiles(
 
 
 def _measure(tile: Tile, inputs: _Inputs, around: str, made_in: Path) -> dict[str, int]:
-    voxels, _ = inputs.raw.around(tile, inputs.sums_halo)
-    sums = sums_of(tile, voxels, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
+    around_tile = inputs.raw.around(tile, inputs.sums_halo)
+    sums = sums_of(tile, around_tile, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
     write_record({"around": around, "sums": sums}, _sums_file(tile, made_in))
     return sums
 
@@ -251,9 +249,8 @@ def refine_tiles(
 
 
 def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
-    voxels, moved = inputs.raw.around(tile, inputs.halo)
-    beside = inputs.beside(tile, voxels, moved)
-    state, report = refine_tile(tile, voxels, beside, inputs.steps, figures)
+    beside = inputs.beside(tile)
+    state, report = refine_tile(tile, inputs.raw.around(tile, inputs.halo), beside, inputs.steps, figures)
     about["said"]["report"] = report.to_json()
     assert state.decided is not None
     # heights are in the raw map: here they would take a sixth of the bytes

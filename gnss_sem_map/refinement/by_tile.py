@@ -90,6 +90,7 @@ def refine_tile(
     if beside.moved is not None:
         beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, 0)])
     state = MapState.of(around[places_around(around, tile, halo)], beside, figures)
+    del around  # 50 MB: the steps see less and less of it
     own = _inside(state.voxels, tile)
     for i, step in enumerate(STEPS):
         needed = _reach_from(i, settings, size)

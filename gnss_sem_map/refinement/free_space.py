@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses
+from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import State
@@ -66,15 +66,18 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     stands = _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M])
     left = len(keyframes)
     undecided = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * left))
+    places = voxels.centres[undecided]
+    order = spatial_order(places)
+    undecided, places = undecided[order], places[order]
     counts = np.zeros((2, len(undecided)), np.int32)
     for part in keyframes.parts():
-        counts += hits_and_misses(voxels.centres[undecided], part, settings.farthest_m)
+        counts += hits_and_misses(places, part, settings.farthest_m)
         left -= len(part)
         hits, most_misses = counts[0], counts[1] + left
         may_be_free = most_misses >= settings.least_misses
         may_be_free &= most_misses > settings.misses_per_hit * hits
         may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * most_misses
-        undecided, counts = undecided[may_be_free], counts[:, may_be_free]
+        undecided, places, counts = undecided[may_be_free], places[may_be_free], counts[:, may_be_free]
         if not len(undecided):
             break
     free = np.zeros(len(voxels), np.bool_)

@@ -17,13 +17,13 @@ import numpy as np
 
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
+from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import Settings
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import write_covariance_tum, write_geojson, write_kitti, write_tum
-from gnss_sem_map.export.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json

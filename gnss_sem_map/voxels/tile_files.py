@@ -58,27 +58,7 @@ def read(
     path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
 ) -> SemanticMap:
     """The tile that `encode` wrote, of so many `voxels` and with this `sha256`; raises DataError, with its name."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    names = ["key", *(f"log_{name}" for name in label_set.names), "hits", "label", "confidence", "state"]
-    content = read_bytes(path)
-    try:
-        if hashlib.sha256(content).hexdigest() != about["sha256"]:
-            raise ValueError("its checksum is not that of map.json")
-        file = pq.ParquetFile(pa.BufferReader(content))
-        if file.metadata.num_rows != about["voxels"]:
-            raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
-        names += [name for name in (HITS_REMOVED, HEIGHTS) if name in file.schema_arrow.names]
-        table = file.read(columns=names)
-        columns = {name: _column(table, name) for name in names}
-        if not ((columns["label"] >= -1) & (columns["label"] < len(label_set.names))).all():
-            raise ValueError("it has labels of no class")
-        if not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
-            raise ValueError("it has confidences beyond 0..1")
-    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None
+    columns = _read(path, about, label_set, ("label", "confidence", "state"), (HITS_REMOVED, HEIGHTS))
     removed = columns.get(HITS_REMOVED)
     return SemanticMap(
         voxels=_voxels_of(columns, tile, voxel_size_m, label_set),
@@ -87,6 +67,46 @@ def read(
         states=columns["state"].astype(np.uint8),
         hits_removed=None if removed is None else removed.astype(np.uint32),
     )
+
+
+def read_voxels(
+    path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
+) -> VoxelMap:
+    """As `read`, without what is decided about the voxels: two thirds of the time."""
+    return _voxels_of(_read(path, about, label_set, (), (HEIGHTS,)), tile, voxel_size_m, label_set)
+
+
+def _read(
+    path: Path, about: dict[str, Any], label_set: LabelSet, needed: tuple[str, ...], known: tuple[str, ...]
+) -> dict[str, NDArray[Any]]:
+    """The sums of a tile, the `needed` columns, and those of the `known` ones that it has; raises DataError."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    content = read_bytes(path)
+    try:
+        if hashlib.sha256(content).hexdigest() != about["sha256"]:
+            raise ValueError("its checksum is not that of map.json")
+        file = pq.ParquetFile(pa.BufferReader(content))
+        if file.metadata.num_rows != about["voxels"]:
+            raise ValueError(f"found {file.metadata.num_rows} voxels, expected {about['voxels']}")
+        names = ["key", *(f"log_{name}" for name in label_set.names), "hits", *needed]
+        names += [name for name in known if name in file.schema_arrow.names]
+        table = file.read(columns=names)
+        columns = {name: _column(table, name) for name in names}
+        _check(columns, len(label_set.names))
+        return columns
+    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None
+
+
+def _check(columns: dict[str, NDArray[Any]], classes: int) -> None:
+    """Raise ValueError for labels and confidences that cannot be."""
+    if "label" in columns and not ((columns["label"] >= -1) & (columns["label"] < classes)).all():
+        raise ValueError("it has labels of no class")
+    if "confidence" in columns and not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
+        raise ValueError("it has confidences beyond 0..1")
 
 
 def encode_voxels(voxels: VoxelMap) -> bytes:

@@ -30,7 +30,9 @@ from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 Z_ORDER_BITS = AXIS_BITS - TILE_BITS
 TILES_HELD = 6
-"""Tiles of a map in memory at a time: each is read again with its neighbours."""
+"""Tiles of a map with all that is decided about them in memory at a time: several exports read each."""
+VOXELS_HELD = 1_000_000
+"""Voxels in memory at a time, 40 MB: a tile is read again with its neighbours, and a small map is read once."""
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
@@ -91,7 +93,9 @@ class TiledMap:
     tiles: tuple[Tile, ...]
     """Sorted."""
     read_tile: Callable[[Tile], SemanticMap]
-    """The voxels of one of the tiles."""
+    """The voxels of one of the tiles, and what is decided about them."""
+    read_voxels: Callable[[Tile], VoxelMap]
+    """The voxels alone."""
 
     def __iter__(self) -> Iterator[SemanticMap]:
         return map(self.read_tile, self.tiles)
@@ -102,7 +106,7 @@ class TiledMap:
         reach, parts = range(-tiles, tiles + 1), []
         for near in ((tile[0] + i, tile[1] + j) for i in reach for j in reach):
             if near in self._known:
-                part = self.read_tile(near).voxels
+                part = self.read_voxels(near)
                 parts.append(part if near == tile else part[places_around(part, tile, margin_m)])
         return parts[0] if len(parts) == 1 else joined_voxels(parts, self.voxel_size_m, self.label_set)
 
@@ -126,12 +130,18 @@ def in_memory(semantic_map: SemanticMap, frame: LocalFrame | None = None) -> Til
     voxels = semantic_map.voxels
     indices = dict(_indices_by_tile(voxels.keys))
     return TiledMap(
-        voxels.voxel_size_m, voxels.label_set, frame, tuple(indices), lambda tile: semantic_map[indices[tile]]
-    )
+        voxels.voxel_size_m, voxels.label_set, frame, tuple(indices),
+        lambda tile: semantic_map[indices[tile]], lambda tile: voxels[indices[tile]],
+    )  # fmt: skip
 
 
-def open_map(folder: Path, label_set: LabelSet | None = None, held: int = TILES_HELD) -> TiledMap:
-    """A map on disk, with so many tiles `held` in memory; without `label_set` the class set is the one that it names.
+def open_map(
+    folder: Path,
+    label_set: LabelSet | None = None,
+    held: int = TILES_HELD,
+    voxels_held: int = VOXELS_HELD,
+) -> TiledMap:
+    """A map on disk, of which the tiles read last are held; without `label_set` the class set is the one that it names.
 
     Raises DataError when `map.json` is damaged, a tile is missing, or the classes differ; reading raises it for a
     damaged tile.
@@ -152,11 +162,31 @@ def open_map(folder: Path, label_set: LabelSet | None = None, held: int = TILES_
     names = {tile_of(name): name for name in files}
     voxel_size_m = float(about["voxel_size_m"])
 
-    @lru_cache(held)
-    def read_tile(tile: Tile) -> SemanticMap:
-        return tile_files.read(folder / names[tile], tile, files[names[tile]], voxel_size_m, label_set)
+    def of(tile: Tile) -> tuple[Path, Tile, dict[str, Any], float, LabelSet]:
+        return folder / names[tile], tile, files[names[tile]], voxel_size_m, label_set
 
-    return TiledMap(voxel_size_m, label_set, read_frame(folder), tuple(sorted(names)), read_tile)
+    return TiledMap(
+        voxel_size_m,
+        label_set,
+        read_frame(folder),
+        tuple(sorted(names)),
+        lru_cache(held)(lambda tile: tile_files.read(*of(tile))),
+        _Recent(lambda tile: tile_files.read_voxels(*of(tile)), voxels_held),
+    )
+
+
+class _Recent:
+    """Reads tiles, and holds those read last, up to so many voxels."""
+
+    def __init__(self, read: Callable[[Tile], VoxelMap], most: int) -> None:
+        self._read, self._most, self._held = read, most, dict[Tile, VoxelMap]()
+
+    def __call__(self, tile: Tile) -> VoxelMap:
+        voxels = self._held.pop(tile) if tile in self._held else self._read(tile)
+        self._held[tile] = voxels  # the last one
+        while sum(map(len, self._held.values())) > self._most:
+            del self._held[next(iter(self._held))]
+        return voxels
 
 
 def read(

@@ -176,7 +176,7 @@ class VoxelMap:
         """(v, 3) integer voxel coordinates."""
         return unpack(self.keys)
 
-    @cached_property
+    @property
     def centres(self) -> NDArray[np.float64]:
         """(v, 3) m, in the map frame."""
         return (self.indices + np.float64(0.5)) * self.voxel_size_m

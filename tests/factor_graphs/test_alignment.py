@@ -1,8 +1,16 @@
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.alignment import AttitudePrior, first_guess
+from factor_graphs.alignment import (
+    CRUISE_NOISE_DENSITY,
+    START_POSITION_STDDEV,
+    START_SPEED_STDDEV,
+    AttitudePrior,
+    first_guess,
+    spline_through,
+)
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import split
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
@@ -32,6 +40,30 @@ def test_the_first_guess_is_near_the_truth_though_the_gyroscope_drifts(simulate,
     np.testing.assert_allclose(
         T[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2), np.tile(np.eye(3), (len(T), 1, 1)), atol=1e-9
     )
+
+
+def test_the_first_guess_is_what_a_kalman_smoother_finds(simulate):
+    """White random acceleration, filtered forward and smoothed backward: filterpy's answer for every keyframe."""
+    drive = simulate(24, noise=ImuNoise(), outages=[(20.0, 30.0)])
+    fixes = drive.fixes[drive.fixes.stamps > 5.0]
+    cut = split(drive.imu, fixes.stamps)
+    kalman = KalmanFilter(dim_x=6, dim_z=3)
+    kalman.x = np.concatenate([fixes.positions[0], np.zeros(3)])
+    kalman.P = np.diag(np.repeat([START_POSITION_STDDEV**2, START_SPEED_STDDEV**2], 3))
+    kalman.H = np.eye(3, 6)
+    fix_at = dict(zip(cut.keyframe_of(fixes.stamps).tolist(), range(len(fixes)), strict=True))
+    means, covariances, Fs, Qs = [], [], [], []
+    for i, dt in enumerate(np.diff(cut.keyframes, prepend=cut.keyframes[0])):
+        Fs.append(np.kron([[1, dt], [0, 1]], np.eye(3)))
+        Qs.append(CRUISE_NOISE_DENSITY**2 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(3)))
+        kalman.predict(F=Fs[-1], Q=Qs[-1])
+        if i in fix_at:
+            kalman.update(fixes.positions[fix_at[i]], R=np.diag(fixes.stddevs[fix_at[i]] ** 2))
+        means.append(kalman.x)
+        covariances.append(kalman.P)
+    expected = kalman.rts_smoother(np.array(means), np.array(covariances), Fs, Qs)[0]
+    positions, velocities = spline_through(fixes, cut)
+    np.testing.assert_allclose(np.hstack([positions, velocities]), expected, atol=1e-4)
 
 
 def test_an_imu_mounted_at_a_tilt_is_levelled(simulate):

@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factor_graphs.csv_log import read_wheels
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import (
     GnssFixes,
@@ -55,7 +54,7 @@ def test_codes_for_no_speed_are_dropped_whatever_the_unit(unit):
     assert repairs.dropped + len(wheels) == repairs.rows == 14
 
 
-def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none(tmp_path):
+def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none():
     assert len(clean_wheels([], [])[0]) == 0
     for stamps, speeds in (
         ([0.0, 1.0], [[1.0], [2.0]]),
@@ -64,14 +63,6 @@ def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none(tmp_path):
     ):
         with pytest.raises(MeasurementError, match=r"WheelSpeeds\.(speeds|stamps)"):
             WheelSpeeds(np.array(stamps), np.array(speeds))
-    assert read_wheels(tmp_path) is None
-    (tmp_path / "wheels.csv").write_text("gear,speed_mps,stamp_s\n1,2.5,0.1\n1,nan,0.2\n1,-3,0.3\n")
-    np.testing.assert_array_equal(read_wheels(tmp_path).speeds, [2.5, -3.0])
-    (tmp_path / "wheels.csv").write_text("time,speed_mps\n0,1\n")
-    with pytest.raises(
-        MeasurementError, match=r"wheels.csv: .*expected a table with columns stamp_s,speed_mps"
-    ):
-        read_wheels(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -230,6 +230,18 @@ def test_short_drives_of_any_rate_are_solved(simulate, seconds, step, stddev, im
     )
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("wrong", [lambda force: force / 9.81, lambda force: force - [0.0, 0.0, 9.81]])
+def test_a_specific_force_in_g_or_without_gravity_is_told(simulate, wrong, seed):
+    drive = simulate(seed, noise=ImuNoise(), seconds=60.0)
+    imu = ImuSamples(drive.imu.stamps, wrong(drive.imu.specific_force), drive.imu.angular_rate)
+    try:
+        told = smooth(imu, drive.fixes, FRAME, None, LEVER).notes[0]
+    except EstimationError as error:
+        told = str(error)
+    assert "is it in g, or without gravity?" in told or "check units" in told
+
+
 def test_wrong_lever_arms_and_unknown_settings_are_refused(mems):
     with pytest.raises(MeasurementError, match="p_imu_antenna is"):
         smooth(mems.imu, mems.fixes, FRAME, None, (0.0, 1.0))

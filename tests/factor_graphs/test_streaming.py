@@ -15,8 +15,7 @@ BEGIN_S = 30.0
 
 def cut(imu: ImuSamples, first: float, last: float) -> ImuSamples:
     a, b = np.searchsorted(imu.stamps, [first, last])
-    rows = slice(max(a - 1, 0), b + 1)
-    return ImuSamples(imu.stamps[rows], imu.specific_force[rows], imu.angular_rate[rows])
+    return imu[max(a - 1, 0) : b + 1]
 
 
 def started(drive) -> StreamingSmoother:

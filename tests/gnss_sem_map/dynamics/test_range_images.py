@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.dynamics import range_images
+from gnss_sem_map.dynamics.visibility import CUBE_M, spatial_order
 
 WALL_M = 20.0
 
@@ -23,6 +25,12 @@ def wall_image(hole=None):
     return image
 
 
+def pose_of(rotation, position):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.as_matrix(), position
+    return T
+
+
 def seen_at(image, places, T_lidar_map=None):
     places = np.asarray(places, float).reshape(-1, 3)
     hits, misses = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
@@ -39,6 +47,35 @@ def test_before_the_wall_is_empty_in_the_wall_is_hit_and_behind_it_nothing_is_kn
     direction = np.array([np.cos(a), np.sin(a), -0.05])
     places = np.outer([10.0, 20.0, 30.0, 2.0], direction / np.linalg.norm(direction))
     np.testing.assert_array_equal(seen_at(wall_image(), places), [-1, 1, 0, 0])
+
+
+@pytest.mark.parametrize("hole", [None, 0.0, 90.0, 180.0])
+def test_neighbours_that_are_hidden_together_are_left_out_and_nothing_else_is(hole):
+    """In any order of the places the same is counted; only among neighbours is anything left out."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform((-60, -60, -6), (60, 60, 4), (60_000, 3))
+    T_lidar_map = np.linalg.inv(
+        pose_of(Rotation.from_euler("ZYX", [40, 2, -3], degrees=True), [7.0, -3.0, 0.5])
+    )
+    expected, image = seen_at(wall_image(hole), places, T_lidar_map), wall_image(hole)
+    order = spatial_order(places)
+    clusters = np.array_split(places[order], len(places) // range_images.CLUSTER)
+    hidden = [
+        range_images._is_hidden(
+            *range_images._sphere_around(cluster), T_lidar_map, image.reshape(-1), 40.0, 0.3, 0.01
+        )
+        for cluster in clusters
+    ]
+    assert 0.3 < np.mean(hidden) < 0.9
+    np.testing.assert_array_equal(seen_at(image, places[order], T_lidar_map), expected[order])
+    assert set(expected) == {-1, 0, 1}
+
+
+def test_places_of_one_cube_follow_each_other():
+    places = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+    cubes = (places[spatial_order(places)] / CUBE_M).astype(int)
+    changes = np.any(np.diff(cubes, axis=0) != 0, axis=1).sum()
+    assert changes == len(np.unique(cubes, axis=0)) - 1
 
 
 def test_where_nothing_came_back_nothing_is_known():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,7 +15,7 @@ import pytest
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels import tile_files, tiles
 from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
@@ -134,6 +136,26 @@ def test_around_a_tile_are_its_voxels_and_those_of_a_margin_on_disk_and_in_memor
             for name in ("keys", "evidence", "hits"):
                 expected = getattr(written.voxels, name)[inside]
                 np.testing.assert_array_equal(getattr(around, name), expected)
+
+
+@pytest.mark.parametrize(("held", "reads"), [(10**6, 1), (0, 9)])
+def test_a_small_map_is_read_once_however_many_tiles_ask_for_their_surroundings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, held: int, reads: int
+) -> None:
+    written, names = random_map(count=20_000), Counter[str]()
+    tiles.write(written, tmp_path / "map", FRAME)
+    original = tile_files.read_voxels
+
+    def counted(path: Path, *others: Any) -> VoxelMap:
+        names[path.name] += 1
+        return original(path, *others)
+
+    monkeypatch.setattr(tile_files, "read_voxels", counted)
+    opened = tiles.open_map(tmp_path / "map", URBAN, voxels_held=held)
+    for tile in opened.tiles:
+        opened.around(tile, 1.0)
+    assert len(names) == len(opened.tiles)
+    assert max(names.values()) == reads
 
 
 def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:

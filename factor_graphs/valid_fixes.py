@@ -1,13 +1,10 @@
 """Valid fixes of a receiver: a position on Earth, an accuracy, and no jump that a vehicle cannot make."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from factor_graphs.geodesy import FLATTENING, SEMI_MAJOR_AXIS
-from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
 
@@ -18,10 +15,8 @@ JUMP_M, FASTEST_M_S = 20_000.0, 150.0
 NEIGHBOURS = 21
 
 
-def usable_fixes(
-    stamps: Array, geodetic: Array, stddevs: Array, where: str
-) -> tuple[NDArray[np.bool_], list[Skip]]:
-    """Mask (n,) of the rows that are valid fixes, and one skip for each kind of invalid rows.
+def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Mask (n,) of the rows that are valid fixes, and the number of invalid rows of each kind.
 
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
     """
@@ -43,8 +38,7 @@ def usable_fixes(
         (is_place & ~has_accuracy, "a standard deviation that is not above 0, or far too large"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]
-    counted = [(int(rows.sum()), why) for rows, why in kinds if rows.any()]
-    return near, [Skip("fix", where, f"{count} rows: {why}", count) for count, why in counted]
+    return near, {why: int(rows.sum()) for rows, why in kinds if rows.any()}
 
 
 def _near(stamps: Array, geodetic: Array) -> NDArray[np.bool_]:

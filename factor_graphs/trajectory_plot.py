@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import GnssFixes
 from factor_graphs.smoothing import Solution, heading_stddevs
 
@@ -22,8 +23,13 @@ HEADROOM = 1.15
 def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
     """Write track, residuals, standard deviations and biases as one PNG, with rejected fixes and all notes.
 
-    `fixes` are those given to the smoother. The file is written where `path` says, whatever its name ends with.
+    `fixes` are those given to the smoother. The file is written where `path` says, whatever its name ends with. Raises
+    MeasurementError for other fixes, and OSError when the file cannot be written.
     """
+    if len(fixes) != len(solution.rejected):
+        raise MeasurementError(
+            f"{len(fixes)} fixes, but the solution is of {len(solution.rejected)}: give those that were given to smooth"
+        )
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

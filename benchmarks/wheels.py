@@ -2,8 +2,8 @@
 
     python benchmarks/wheels.py [--seeds 10]
 
-prints a table and writes benchmarks/results/wheels.json. The wheels are those of a vehicle's bus: 20 Hz, without sign, 3 %
-and 0.1 m/s off, 0.04 s late, rounded to 0.05 m/s; they slip for 5 % of the time.
+prints a table and writes benchmarks/results/wheels.json. The wheels are those of a vehicle's bus: 20 Hz, without sign,
+3 % and 0.1 m/s off, 0.04 s late, rounded to 0.05 m/s; they slip for 5 % of the time.
 """
 
 import argparse

@@ -48,6 +48,8 @@ CUT, SKID = 3.5, 3.0
 # Without fixes a solution drifts: slip is then what differs from the median of so long, s. Where more than a share of
 # that time slips, all of it does: wheels that are frozen agree with the speed now and then.
 DRIFT_S, MOST_SLIP = 20.0, 1 / 3
+# Once wheels hold it, it drifts no longer than this, s.
+HELD_S = 1.0
 # A wheel said to be at rest may creep, m/s; it is one value for so long, s.
 CREEP, CREEP_S = 0.2, 10.0
 
@@ -161,11 +163,18 @@ def observe_wheels(
             calibration[2] = np.clip(calibration[2], -MOST_LATENCY_S, MOST_LATENCY_S)
     seen = Wheels(readings, calibration, noise, np.zeros(len(stamps)))
     doubt = _doubt(seen, misfit(ahead, motion.yaw_rate, readings, calibration)[0][where], ahead[where])
-    return replace(_with_slip(seen, ahead, motion, beside), doubt=doubt)
+    density = problem.noise.accelerometer_noise_density * fit.inflation
+    drift = float(density * np.sqrt(DRIFT_S if known is None else HELD_S))
+    return replace(_with_slip(seen, ahead, motion, beside, drift), doubt=doubt)
 
 
-def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray[np.bool_]) -> Wheels:
-    """The same wheels with what does not fit, also where no fix is: there a solution drifts, but slowly."""
+def _with_slip(
+    wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray[np.bool_], drift: float
+) -> Wheels:
+    """The same wheels with what does not fit, also where no fix is: there a solution drifts, but slowly.
+
+    `drift` m/s is how far it may be off its median.
+    """
     readings = wheels.readings
     off, _ = misfit(ahead, motion.yaw_rate, readings, wheels.calibration)
     said = readings.rolling | readings.stopped
@@ -175,6 +184,7 @@ def _with_slip(wheels: Wheels, ahead: Array, motion: BodyMotion, beside: NDArray
         off[lost & (window == part)] -= np.median(off[said & (window == part)])
     stddevs = np.sqrt(readings.grows_with() @ wheels.noise.parts)
     stddevs[readings.stopped] = CREEP
+    stddevs[lost] = np.hypot(stddevs[lost], drift)
     slips = said & (np.abs(off) > CUT * stddevs)
     slip = np.where(slips, off, 0.0)
     for part in np.unique(window[slips]):

@@ -172,6 +172,35 @@ def test_outages_are_better_with_wheels_even_where_they_slip(simulate, slips):
 
 
 @pytest.mark.integration
+def test_the_drift_of_a_bad_imu_is_not_taken_for_slip(simulate):
+    off = {"without": [], "with": []}
+    for seed in range(3):
+        noise = ImuNoise().scaled(20.0)
+        drive = simulate(seed, seconds=240.0, noise=noise, moves=mounted, outages=OUTAGES)
+        wheels = wheels_of(drive, seed, 240.0)
+        for which, speeds in (("without", None), ("with", wheels)):
+            s = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, wheels=speeds)
+            off[which].append(inside_outages(s, drive))
+        assert s.wheels.held
+        assert s.wheels.slip_share < 0.02
+    assert np.mean(off["with"]) < 0.7 * np.mean(off["without"])
+
+
+@pytest.mark.integration
+def test_wheels_that_freeze_in_an_outage_are_not_believed(simulate):
+    for seed in range(2):
+        drive = simulate(seed, seconds=240.0, noise=ImuNoise(), moves=mounted, outages=OUTAGES)
+        right = wheels_of(drive, seed, 240.0)
+        frozen = (right.stamps > 128.0) & (right.stamps < 192.0)
+        stuck = np.where(frozen, right.speeds[np.argmax(frozen)], right.speeds)
+        without, with_stuck = (
+            inside_outages(smooth(drive.imu, drive.fixes, FRAME, None, LEVER, wheels=wheels), drive)
+            for wheels in (None, WheelSpeeds(right.stamps, stuck))
+        )
+        assert with_stuck < 1.2 * without
+
+
+@pytest.mark.integration
 def test_a_vehicle_that_reverses_is_no_trap_for_speeds_without_sign(simulate):
     off = {}
     for signed in (True, False):

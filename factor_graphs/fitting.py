@@ -28,9 +28,6 @@ NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 LONG_ENOUGH_S = 120.0
 # The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
 CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
-# Wheels are left out, unasked, when with them the IMU must be so many times noisier: they show noise that fixes do not,
-# but not that much.
-CONTRADICTION, CONTRADICTED = 5.0, "the IMU contradicts them"
 # Where relative poses span more than this share of the time, the axle adds nothing that they do not know better: on a
 # drive of 480 s with LiDAR odometry it changes no digit of the error, and takes 70 % more time.
 BOUND_SHARE = 0.5
@@ -95,29 +92,13 @@ def calibrate(
     return problem, fit, calibration
 
 
-Constrained = tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]
-
-
-def constrain(problem: Problem, fit: Fit, speeds: WheelSpeeds | None = None) -> Constrained:
-    """Add what a road vehicle cannot do, and what its wheels say if the IMU does not contradict them.
-
-    Vehicle and wheels are None where they are not wanted.
-    """
-    found = _constrain(problem, fit, speeds)
-    wheels = found[-1]
-    if wheels is None or wheels.doubt or found[0].inflation <= CONTRADICTION * fit.inflation:
-        return found
-    alone, factors, vehicle, _ = _constrain(problem, fit, None)
-    if problem.settings.wheel_speed == "on" or found[0].inflation <= CONTRADICTION * alone.inflation:
-        return found
-    return alone, factors, vehicle, replace(wheels, held=False, doubt=CONTRADICTED)
-
-
-def _constrain(problem: Problem, fit: Fit, speeds: WheelSpeeds | None) -> Constrained:
-    """Constraints are linearised at the solution, and again at the one that follows.
+def constrain(
+    problem: Problem, fit: Fit, speeds: WheelSpeeds | None = None
+) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
+    """Add what a road vehicle cannot do, and what its wheels say, linearised at the solution, and again at the next.
 
     Slip is looked at again as well, for a heading that drifts looks like slip until it is held; and the IMU's noise,
-    which a vehicle that is known to stand shows better.
+    which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
     settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
     wanted = settings.vehicle_constraint

@@ -17,8 +17,9 @@ Array = NDArray[np.float64]
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # No accelerometer or gyroscope says more, in whatever unit.
 LARGEST_OF_IMU = 1e6
-# Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available".
-LARGEST_OF_WHEELS, LARGEST_OF_USUAL = 150.0, 10.0
+# Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available";
+# so is what is larger than the last, in any unit.
+LARGEST_OF_WHEELS, LARGEST_OF_USUAL, LARGEST_OF_ANY = 150.0, 10.0, 1e6
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
 BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
 
@@ -185,8 +186,9 @@ def clean_wheels(stamps: ArrayLike, speeds: ArrayLike) -> tuple[WheelSpeeds, Rep
     """
     (cleaned, values), repairs = _clean("wheels", stamps, speeds, width=())
     size = np.abs(values)
-    usual = float(np.median(size[size > 0])) if np.any(size > 0) else 0.0
-    sensible = size <= max(LARGEST_OF_WHEELS, LARGEST_OF_USUAL * usual)
+    said = size[(size > 0) & (size <= LARGEST_OF_ANY)]
+    usual = float(np.median(said)) if len(said) else 0.0
+    sensible = size <= min(max(LARGEST_OF_WHEELS, LARGEST_OF_USUAL * usual), LARGEST_OF_ANY)
     kept = cleaned[sensible]
     repairs = replace(repairs, absurd=int(np.count_nonzero(~sensible)), gaps=gaps(kept))
     return WheelSpeeds(kept, values[sensible]), repairs

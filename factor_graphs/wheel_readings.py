@@ -9,8 +9,8 @@ from factor_graphs.measurements import WheelSpeeds
 
 Array = NDArray[np.float64]
 
-# A keyframe takes the samples within this, s, or within so many usual steps of a slow sensor.
-WINDOW_S, STEPS = 0.15, 1.2
+# A keyframe takes the samples within this, s, or within so many usual steps of a slow sensor, but no farther than that.
+WINDOW_S, STEPS, FARTHEST_S = 0.15, 1.2, 1.5
 # Below this, m/s, sensors are blind or say zero, and a vehicle may turn back; above that one, it does not stand.
 SLOW, CREEP = 0.5, 0.1
 # A way between two stops leads where the solution says, when that agrees with this share of the wheels' own.
@@ -46,7 +46,7 @@ def read(wheels: WheelSpeeds, stamps: Array, ahead: Array) -> Readings:
     """
     k, reach = len(stamps), WINDOW_S
     if len(wheels) > 1:
-        reach = max(WINDOW_S, STEPS * float(np.median(np.diff(wheels.stamps))))
+        reach = float(np.clip(STEPS * np.median(np.diff(wheels.stamps)), WINDOW_S, FARTHEST_S))
     first = np.searchsorted(wheels.stamps, stamps - reach)
     count = np.searchsorted(wheels.stamps, stamps + reach, side="right") - first
     row = np.repeat(np.arange(k), count)

@@ -54,6 +54,12 @@ def test_codes_for_no_speed_are_dropped_whatever_the_unit(unit):
     assert repairs.dropped + len(wheels) == repairs.rows == 14
 
 
+def test_wheels_that_say_only_codes_say_nothing():
+    wheels, repairs = clean_wheels(np.arange(5.0), [1e300, -1e300, np.inf, 0.0, 1e7])
+    np.testing.assert_array_equal(wheels.speeds, [0.0])
+    assert (repairs.not_finite, repairs.absurd) == (1, 3)
+
+
 def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none():
     assert len(clean_wheels([], [])[0]) == 0
     for stamps, speeds in (

@@ -113,6 +113,8 @@ def test_a_keyframe_without_samples_on_both_sides_or_beyond_the_log_has_no_readi
     wheels = WheelSpeeds(stamps, np.full(len(stamps), 8.0))
     readings = read(wheels, np.array([-1.0, 5.0, 10.05, 15.0, 25.0, 31.0]), np.full(6, 8.0))
     np.testing.assert_array_equal(readings.rolling, [False, True, False, False, True, False])
+    sparse = WheelSpeeds(np.arange(0.0, 100.0, 4.0), np.full(25, 8.0))
+    assert not read(sparse, np.arange(1.0, 90.0), np.full(89, 8.0)).rolling.any()
     assert not read(WheelSpeeds(np.empty(0), np.empty(0)), np.arange(3.0), np.ones(3)).rolling.any()
 
 

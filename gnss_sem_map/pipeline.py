@@ -119,7 +119,7 @@ def _checked_and_located(
     sweeps = KeptSweeps()
     page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
     found, sharpness = _located(sweeps.taking(log), settings, stats, progress, page.solution, match)
-    return page, found, sharpness
+    return replace(page, solution=None), found, sharpness
 
 
 def _located(

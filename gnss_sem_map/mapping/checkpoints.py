@@ -107,7 +107,7 @@ class ChunkStore:
 
     def objects(self) -> tuple[TrackedObject, ...]:
         """The tracked objects of all chunks."""
-        return tuple(_object(one) for record in self._records for one in record["objects"])
+        return tuple(_object(one) for number in range(self.count) for one in self._record(number)["objects"])
 
     def untracked(self) -> int:
         """How many objects had too few points to be tracked: most of them, so they are only counted."""
@@ -136,7 +136,8 @@ class ChunkStore:
 
     @cached_property
     def _records(self) -> list[dict[str, Any]]:
-        return [self._record(number) for number in range(self.count)]
+        """Without the objects, whose paths would take more memory than all else."""
+        return [self._record(number) | {"objects": ()} for number in range(self.count)]
 
     @cached_property
     def _parts(self) -> dict[str, dict[Tile, list[tuple[Path, str]]]]:

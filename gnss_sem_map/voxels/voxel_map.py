@@ -7,7 +7,7 @@ immutable result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property, reduce
 from typing import Any
 
@@ -80,28 +80,6 @@ class VoxelMap:
 
     def __len__(self) -> int:
         return len(self.keys)
-
-    @classmethod
-    def of_rows(cls, rows: NDArray[np.int64], voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
-        """The map of table rows (v, words) in any order, in the layout of `voxels.kernels`."""
-        rows = rows[np.argsort(rows[:, 0])]
-        ints, end = rows.view(np.int32), FIRST_SUM + len(label_set.names)
-        return cls(
-            voxel_size_m,
-            label_set,
-            keys=rows[:, 0].copy(),
-            evidence=ints[:, FIRST_SUM:end].copy(),
-            hits=ints[:, end].astype(np.uint32),
-            heights=rows[:, -1].copy(),
-        )
-
-    def to_rows(self) -> NDArray[np.int64]:
-        """The voxels as table rows (v, words): 40 bytes each for five classes."""
-        rows = np.zeros((len(self), self.words(self.label_set)), np.int64)
-        ints, end = rows.view(np.int32), FIRST_SUM + len(self.label_set.names)
-        rows[:, 0], ints[:, FIRST_SUM:end], ints[:, end] = self.keys, self.evidence, self.hits
-        rows[:, -1] = self._known_heights
-        return rows
 
     @staticmethod
     def words(label_set: LabelSet) -> int:
@@ -299,8 +277,17 @@ class VoxelTable:
 
     def to_map(self) -> VoxelMap:
         """The voxels so far, sorted by key."""
-        voxels = VoxelMap.of_rows(self._rows[self._rows[:, 0] != 0], self.voxel_size_m, self.label_set)
-        return voxels if self._knows_heights else replace(voxels, heights=None)
+        filled = np.flatnonzero(self._rows[:, 0])
+        order = filled[np.argsort(self._rows[filled, 0])]
+        ints, end = self._rows.view(np.int32), FIRST_SUM + len(self._columns)
+        return VoxelMap(
+            self.voxel_size_m,
+            self.label_set,
+            keys=self._rows[order, 0],
+            evidence=ints[order, FIRST_SUM:end],
+            hits=ints[order, end].astype(np.uint32),
+            heights=self._rows[order, -1] if self._knows_heights else None,
+        )
 
 
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:

@@ -233,13 +233,19 @@ def test_a_large_table_takes_at_most_63_bytes_per_voxel_and_keeps_all() -> None:
 def test_rows_hold_any_number_of_classes(names: int) -> None:
     some = replace(URBAN, names=tuple(f"c{i}" for i in range(names)), sources={})
     rng = np.random.default_rng(7)
-    table = VoxelTable(0.2, some)
     classes = rng.integers(0, 256, (50, names + 1)).astype(np.uint8)
-    p_map = rng.normal(0, 3, (2000, 3))
-    heights = heights_in_voxels(p_map[:, 2], 0.2)
-    table.add(keys_of(p_map, 0.2), rng.integers(-1, 50, 2000).astype(np.int32), classes, heights)
-    fused = table.to_map()
-    assert_same(VoxelMap.of_rows(rng.permutation(fused.to_rows()), 0.2, some), fused)
+    p_map, pixels = rng.normal(0, 3, (2000, 3)), rng.integers(-1, 50, 2000).astype(np.int32)
+    keys, heights = keys_of(p_map, 0.2), heights_in_voxels(p_map[:, 2], 0.2)
+    whole, parts = VoxelTable(0.2, some), VoxelTable(0.2, some)
+    whole.add(keys, pixels, classes, heights)
+    for part in np.array_split(rng.permutation(len(keys)), 7):
+        parts.add(keys[part], pixels[part], classes, heights[part])
+    fused = whole.to_map()
+    assert_same(parts.to_map(), fused)
+    assert fused.evidence.shape == (len(np.unique(keys)), names)
+    assert fused.hits.sum() == len(keys)
+    assert fused.heights is not None
+    assert fused.heights.sum() == heights.sum(dtype=np.int64)
 
 
 def test_surfaces_lie_at_the_mean_height_of_the_points_of_a_voxel() -> None:

@@ -12,9 +12,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from factor_graphs.csv_log import read_csv
+    from factor_graphs.csv_log import read_csv, read_wheels
     from factor_graphs.geodesy import LocalFrame
-    from factor_graphs.measurements import GnssFixes, ImuSamples
+    from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
     from factor_graphs.smoothing import smooth
     from factor_graphs.trajectory import Trajectory
     from factor_graphs.trajectory_plot import write_trajectory_plot
@@ -25,7 +25,9 @@ __all__ = [
     "ImuSamples",
     "LocalFrame",
     "Trajectory",
+    "WheelSpeeds",
     "read_csv",
+    "read_wheels",
     "smooth",
     "write_covariance_tum",
     "write_trajectory_plot",
@@ -37,7 +39,9 @@ _PLACES = {
     "ImuSamples": "measurements",
     "LocalFrame": "geodesy",
     "Trajectory": "trajectory",
+    "WheelSpeeds": "measurements",
     "read_csv": "csv_log",
+    "read_wheels": "csv_log",
     "smooth": "smoothing",
     "write_covariance_tum": "tum",
     "write_trajectory_plot": "trajectory_plot",

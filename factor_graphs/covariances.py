@@ -24,8 +24,11 @@ SIZE = 15
 INDEX_BITS = 56
 # Keyframes that are eliminated in one call; more take memory, fewer take time.
 TOGETHER = 20
-# Where pose, velocity and bias stand in the 15 numbers of a keyframe.
-PLACES = {ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15), ord("m"): slice(0, 4)}
+# Where pose, velocity and bias stand in the 15 numbers of a keyframe, mounting and wheels in those that all share.
+PLACES = {
+    ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15),
+    ord("m"): slice(0, 4), ord("w"): slice(4, 8),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +83,12 @@ def _split(key: int) -> tuple[int, int]:
 def keyframe_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
 ) -> tuple[Array, Array]:
-    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k), (4, 4), or (0, 0).
+    """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k) and W(k), where they are.
 
-    M(k) is what all keyframes share, the mounting of the IMU: it is eliminated last, as if it were one more keyframe.
+    M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
+    eliminated last, as if they were one more keyframe.
     """
-    shared = (M(k),) if values.exists(M(k)) else ()
+    shared = tuple(key for key in (M(k), gtsam.symbol("w", k)) if values.exists(key))
     net = list(eliminate(graph.linearize(values), k, shared))
     covariances = np.empty((k, SIZE, SIZE))
     # The joint covariance of a keyframe and of those it depends on. The IMU binds each keyframe to the next, so those
@@ -93,9 +97,12 @@ def keyframe_covariances(
     joint = np.empty((0, 0))
     of_shared = np.empty((0, 0))
     if shared:
-        root = np.linalg.inv(net[3 * k].R)
+        R, _, _ = _of_keyframe(k, net[3 * k :])
+        there = np.flatnonzero(R.diagonal())
+        root = np.linalg.inv(R[np.ix_(there, there)])
         of_shared = root @ root.T
-        known, joint = [k], np.pad(of_shared, (0, SIZE - len(of_shared)))
+        known, joint = [k], np.zeros((SIZE, SIZE))
+        joint[np.ix_(there, there)] = of_shared
     for i in reversed(range(k)):
         R, later, S = _of_keyframe(i, net[3 * i : 3 * i + 3])
         own, _ = dtrtri(R)
@@ -122,8 +129,8 @@ def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Ar
     later = sorted({index for row in keys for _, index in row} - {i})
     start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
     columns = np.zeros((SIZE, SIZE * (1 + len(later))))
-    for rows, part, row in zip(PLACES.values(), parts, keys, strict=False):
-        matrix, column = np.hstack([part.R, part.S]), 0
+    for part, row in zip(parts, keys, strict=True):
+        matrix, column, rows = np.hstack([part.R, part.S]), 0, PLACES[row[0][0]]
         for letter, index in row:
             place, first = PLACES[letter], start[index]
             width = place.stop - place.start

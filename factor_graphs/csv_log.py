@@ -1,4 +1,4 @@
-"""A log of two CSV files: `imu.csv` and `gnss.csv`.
+"""A log of two CSV files, `imu.csv` and `gnss.csv`, and if there is one a third, `wheels.csv`.
 
 What has one obvious repair is repaired, with a warning that counts the rows; all else is refused.
 """
@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples, clean_gnss, clean_imu, far_off, unit_fault
+from factor_graphs.measurements import (
+    GnssFixes,
+    ImuSamples,
+    WheelSpeeds,
+    clean_gnss,
+    clean_imu,
+    clean_wheels,
+    far_off,
+    unit_fault,
+)
 from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
@@ -25,8 +34,9 @@ Array = NDArray[np.float64]
 
 IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
+WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 # Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer.
-LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S = 0.5, 100.0
+LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
 LONGEST_HEADER = 10_000
 
 
@@ -51,6 +61,22 @@ def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
     for message in told:
         warnings.warn(message, RepairWarning, stacklevel=2)
     return imu, fixes, frame
+
+
+def read_wheels(folder: Path | str) -> WheelSpeeds | None:
+    """Read `wheels.csv` of a folder, for `smooth(..., wheels=...)`; None where there is none.
+
+    Columns: stamp_s; speed_mps, below zero in reverse if the sensor tells. Rows are repaired, and errors raised, as by
+    `read_csv`.
+    """
+    path = Path(folder) / "wheels.csv"
+    if not path.exists():
+        return None
+    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    if repairs.dropped or repairs.out_of_order:
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    return wheels
 
 
 def fix_rows(rows: Array, where: str) -> tuple[Array, dict[str, int]]:

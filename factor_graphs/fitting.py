@@ -5,14 +5,16 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import M
+from gtsam.symbol_shorthand import M, W
 from numpy.typing import NDArray
 
 from factor_graphs.calibration import Calibration, correct
 from factor_graphs.constraints import non_holonomic_factors, standing, zero_velocity_factors
+from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.problem import Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.vehicle import Vehicle, body_motion, observe, with_mounting
+from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
 
 Array = NDArray[np.float64]
 
@@ -90,41 +92,58 @@ def calibrate(
     return problem, fit, calibration
 
 
-def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None]:
-    """Add what a road vehicle cannot do, linearised at the solution, and again at the one that follows.
+def constrain(
+    problem: Problem, fit: Fit, speeds: WheelSpeeds | None = None
+) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
+    """Add what a road vehicle cannot do, and what its wheels say, linearised at the solution, and again at the next.
 
     Slip is looked at again as well, for a heading that drifts looks like slip until it is held; and the IMU's noise,
-    which a vehicle that is known to stand shows better. The vehicle is None where the constraint is not wanted.
+    which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
-    settings, motion = problem.settings, body_motion(problem, fit)
+    settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
     wanted = settings.vehicle_constraint
     if wanted == "auto" and _bound_share(problem) > BOUND_SHARE:
         wanted = "off"
     vehicle = None if wanted == "off" else observe(problem, fit, motion)
-    held = vehicle is not None and (wanted == "on" or not vehicle.doubt)
+    axle = vehicle if vehicle is not None and (wanted == "on" or not vehicle.doubt) else None
+    wheels, mounting = None, np.zeros(4)
+    if speeds is not None and settings.wheel_speed != "off":
+        shown = vehicle or observe(problem, fit, motion)
+        mounting = shown.mounting if axle is not None or not shown.doubt else mounting
+        wheels = observe_wheels(speeds, problem, fit, motion, mounting)
+    rolling = wheels if wheels is not None and (settings.wheel_speed == "on" or not wheels.doubt) else None
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
-    settled = not held
+    settled = axle is None and rolling is None
     for _ in range(CONSTRAINT_ROUNDS):
         stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
+        if rolling is not None:
+            stands &= ~rolling.readings.moving
         if settled and stood is not None and np.array_equal(stands, stood):
             break
         stood = stands
         factors = [*zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
-        if vehicle is not None and held:
-            fit = with_mounting(problem, fit, vehicle.mounting)
-            factors += non_holonomic_factors(fit.values, motion, vehicle.slip_stddevs(motion))
+        if axle is not None:
+            fit = with_mounting(problem, fit, axle.mounting)
+            factors += non_holonomic_factors(fit.values, motion, axle.slip_stddevs(motion))
+        if rolling is not None:
+            fit = with_calibration(problem, fit, rolling.calibration)
+            factors += wheel_factors(fit.values, motion, mounting, rolling)
         if not factors:
             break
         fit = fit_noise(problem, fit, factors)
         before, motion = motion, body_motion(problem, fit)
-        if vehicle is not None and held:
-            mounting = fit.values.atVector(M(len(motion.velocity)))
-            guessed, vehicle = vehicle, replace(observe(problem, fit, motion), mounting=mounting, held=True)
-            settled = np.allclose(guessed.typical_slip, vehicle.typical_slip, rtol=SETTLED_SLIP) and bool(
-                np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS
-            )
-    return fit, factors, vehicle
+        if axle is not None or rolling is not None:
+            settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
+        if axle is not None:
+            mounting, guessed = fit.values.atVector(M(key)), axle.typical_slip
+            axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            settled &= np.allclose(guessed, axle.typical_slip, rtol=SETTLED_SLIP)
+        if speeds is not None and rolling is not None:
+            calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
+            rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
+            settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
+    return fit, factors, vehicle, rolling or wheels
 
 
 def _bound_share(problem: Problem) -> float:

@@ -1,10 +1,10 @@
-"""What the sensors said: IMU samples and GNSS fixes, checked and frozen, and how raw rows become them.
+"""What the sensors said: IMU samples, GNSS fixes, wheel speeds, checked and frozen, and how raw rows become them.
 
-A constructor refuses whatever is wrong. `clean_imu` and `clean_gnss` take rows as a logger wrote them,
-repair what has one obvious repair, and report every row that they dropped.
+A constructor refuses whatever is wrong. `clean_imu`, `clean_gnss` and `clean_wheels` take rows as a logger wrote
+them, repair what has one obvious repair, and report every row that they dropped.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 # No accelerometer or gyroscope says more, in whatever unit.
 LARGEST_OF_IMU = 1e6
+# Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available";
+# so is what is larger than the last, in any unit.
+LARGEST_OF_WHEELS, LARGEST_OF_USUAL, LARGEST_OF_ANY = 150.0, 10.0, 1e6
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
 BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
 
@@ -72,6 +75,25 @@ class GnssFixes:
         return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows])
 
 
+@dataclass(frozen=True, eq=False)
+class WheelSpeeds:
+    """How fast the wheels roll, each value at its stamp: an odometer, or the speed on the vehicle's bus.
+
+    `stamps` (n,) s, strictly increasing; `speeds` (n,) m/s, below zero in reverse if the sensor tells. No value at all
+    is legal. Raises MeasurementError as `ImuSamples` does.
+    """
+
+    stamps: Array
+    speeds: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "WheelSpeeds")
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+
 class ImuNoise(BaseModel):
     """How good an IMU is, in continuous time; the defaults are a good consumer MEMS unit."""
 
@@ -109,17 +131,19 @@ class Repairs:
     out_of_order: int = 0
     far_off: int = 0
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
+    absurd: int = 0
 
     @property
     def dropped(self) -> int:
         """Number of rows that are not in the cleaned data."""
-        return self.not_finite + self.repeated + self.far_off
+        return self.not_finite + self.repeated + self.far_off + self.absurd
 
     def __str__(self) -> str:
         parts = [
             (self.not_finite, "not finite, dropped"),
             (self.repeated, "repeated, dropped"),
             (self.far_off, "with a stamp far off all others, dropped"),
+            (self.absurd, "faster than any vehicle, dropped"),
             (self.out_of_order, "out of order, sorted"),
             (len(self.gaps), f"gaps, longest {np.ptp(self.gaps, axis=1).max(initial=0.0):.2f} s"),
         ]
@@ -152,6 +176,22 @@ def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> t
     """
     columns, repairs = _clean("GNSS", stamps, positions, stddevs)
     return GnssFixes(*columns), repairs
+
+
+def clean_wheels(stamps: ArrayLike, speeds: ArrayLike) -> tuple[WheelSpeeds, Repairs]:
+    """Raw wheel speeds -> speeds in order of time, once each, and the report of what was repaired.
+
+    `stamps` (n,) s; `speeds` (n,) m/s. Values beyond any vehicle are dropped: a bus has codes for "not available".
+    Raises MeasurementError for another shape.
+    """
+    (cleaned, values), repairs = _clean("wheels", stamps, speeds, width=())
+    size = np.abs(values)
+    said = size[(size > 0) & (size <= LARGEST_OF_ANY)]
+    usual = float(np.median(said)) if len(said) else 0.0
+    sensible = size <= min(max(LARGEST_OF_WHEELS, LARGEST_OF_USUAL * usual), LARGEST_OF_ANY)
+    kept = cleaned[sensible]
+    repairs = replace(repairs, absurd=int(np.count_nonzero(~sensible)), gaps=gaps(kept))
+    return WheelSpeeds(kept, values[sensible]), repairs
 
 
 def far_off(stamps: Array) -> NDArray[np.bool_]:
@@ -194,13 +234,15 @@ def gaps(stamps: Array, longer_than: float = 2.0) -> Array:
     return np.column_stack([stamps[wide], stamps[wide + 1]])
 
 
-def _clean(sensor: str, stamps: ArrayLike, *vectors: ArrayLike) -> tuple[list[Array], Repairs]:
+def _clean(
+    sensor: str, stamps: ArrayLike, *vectors: ArrayLike, width: tuple[int, ...] = (3,)
+) -> tuple[list[Array], Repairs]:
     columns = [np.asarray(c, dtype=np.float64) for c in (stamps, *vectors)]
     n = len(columns[0]) if columns[0].ndim == 1 else -1
-    if n < 0 or any(c.shape != (n, 3) for c in columns[1:]):
-        raise MeasurementError(
-            f"{sensor} rows have shapes {[c.shape for c in columns]}; expected (n,), (n, 3), (n, 3)"
-        )
+    expected = [(n,), *[(n, *width)] * len(vectors)]
+    if n < 0 or [c.shape for c in columns] != expected:
+        shapes = ", ".join(str(("n", *shape[1:])).replace("'", "") for shape in expected)
+        raise MeasurementError(f"{sensor} rows have shapes {[c.shape for c in columns]}; expected {shapes}")
     finite = np.logical_and.reduce(
         [np.isfinite(c.reshape(n, c.size // max(n, 1))).all(axis=1) for c in columns]
     )
@@ -215,29 +257,29 @@ def _clean(sensor: str, stamps: ArrayLike, *vectors: ArrayLike) -> tuple[list[Ar
     return columns, Repairs(sensor, n, missing, repeated, out_of_order, int(off.sum()), gaps(columns[0]))
 
 
-def _freeze(value: ImuSamples | GnssFixes) -> None:
+def _freeze(value: ImuSamples | GnssFixes | WheelSpeeds) -> None:
     for f in fields(value):
         array = np.array(getattr(value, f.name), dtype=np.float64)
         array.setflags(write=False)
         object.__setattr__(value, f.name, array)
 
 
-def _check(value: ImuSamples | GnssFixes, what: str) -> None:
+def _check(value: ImuSamples | GnssFixes | WheelSpeeds, what: str) -> None:
     n = len(value.stamps) if value.stamps.ndim == 1 else -1
     for f in fields(value):
         array = getattr(value, f.name)
-        expected = (n,) if f.name == "stamps" else (n, 3)
+        expected = (n,) if f.name in ("stamps", "speeds") else (n, 3)
         if array.shape != expected:
             raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
         if not np.isfinite(array).all():
             row = int(np.argwhere(~np.isfinite(array))[0, 0])
             raise MeasurementError(
-                f"{what}.{f.name}[{row}] is not finite; drop such rows with clean_imu/clean_gnss"
+                f"{what}.{f.name}[{row}] is not finite; drop such rows with clean_imu/clean_gnss/clean_wheels"
             )
     backwards = np.flatnonzero(np.diff(value.stamps) <= 0)
     if len(backwards):
         row = int(backwards[0])
         raise MeasurementError(
             f"{what}.stamps go from {value.stamps[row]} to {value.stamps[row + 1]} s at row {row + 1}; "
-            "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss"
+            "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss/clean_wheels"
         )

@@ -1,4 +1,4 @@
-"""Exact motion of a ground vehicle, and what an IMU and a GNSS receiver on it would report.
+"""Exact motion of a ground vehicle, and what an IMU, a GNSS receiver and wheels on it would report.
 
 Position is a quintic spline of the way driven, so velocity, acceleration and angular rate are its analytic
 derivatives: nothing is integrated here, and nothing is shared with the estimator that this puts to the test.
@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
-from factor_graphs.rigid_motion import RigidMotion, turn_rates
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
+from factor_graphs.rigid_motion import Mounted, RigidMotion, turn_rates
 
 Array = NDArray[np.float64]
 
@@ -249,6 +249,43 @@ def simulate_gnss(
     seen = np.logical_and.reduce([(t < a) | (t > b) for a, b in outages], initial=True)
     seen = np.broadcast_to(seen, t.shape)
     return GnssFixes(t[seen], positions[seen], np.tile(claimed, (int(seen.sum()), 1)))
+
+
+def simulate_wheels(
+    motion: RigidMotion,
+    stamps: ArrayLike,
+    rng: np.random.Generator | None = None,
+    *,
+    scale: float = 1.0,
+    offset_mps: float = 0.0,
+    latency_s: float = 0.0,
+    stddev_mps: float = 0.0,
+    quantum_mps: float = 0.0,
+    signed: bool = True,
+    slips: Sequence[tuple[float, float, float]] = (),
+) -> WheelSpeeds:
+    """What wheel speeds on this motion say; exact when nothing else is asked for.
+
+    `motion` is the axle's; of a `Mounted` imu it is that of the body. A wheel that rolls says ±(|v| - `offset_mps`) /
+    `scale` of the speed v at its stamp less `latency_s`, with white noise of `stddev_mps` (needs `rng`), rounded to
+    `quantum_mps`, its sign lost unless `signed`; one at rest says zero. `slips`: (first, last, share) stamps s between
+    which it spins so much faster, or is locked (-1).
+    """
+    t = np.asarray(stamps, dtype=np.float64)
+    axle = motion.body if isinstance(motion, Mounted) else motion
+    true_stamps = np.clip(t - latency_s, motion.start, motion.end)
+    R_map_axle = axle.poses(true_stamps)[:, :3, :3]
+    ahead = np.einsum("kij,ki->kj", R_map_axle, axle.velocities(true_stamps))[:, 0]
+    speeds = np.maximum(np.abs(ahead) - offset_mps, 0.0) / scale
+    for first, last, share in slips:
+        speeds = np.where((t >= first) & (t <= last), speeds * (1 + share), speeds)
+    if stddev_mps:
+        if rng is None:
+            raise MeasurementError("simulate_wheels with noise needs a random generator; give rng")
+        speeds = np.where(speeds > 0, np.abs(speeds + stddev_mps * rng.standard_normal(len(t))), 0.0)
+    if quantum_mps:
+        speeds = np.round(speeds / quantum_mps) * quantum_mps
+    return WheelSpeeds(t, speeds * np.sign(ahead) if signed else speeds)
 
 
 def _gauss_markov(stamps: Array, correlation_time_s: float, rng: np.random.Generator) -> Array:

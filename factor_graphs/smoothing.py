@@ -1,4 +1,4 @@
-"""The batch smoother: IMU and GNSS in, the most probable trajectory out, with covariance."""
+"""The batch smoother: IMU, GNSS and what else there is in, the most probable trajectory out, with covariance."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,13 +14,14 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.vehicle import Vehicle
+from factor_graphs.wheels import Wheels
 
 Array = NDArray[np.float64]
 
@@ -44,8 +45,8 @@ class Solution:
     `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
     `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
-    where the vehicle constraint was not asked for or LiDAR odometry took its place; `notes` says in words what was
-    repaired or is in doubt.
+    where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
+    slip of the wheels, None where none were given or asked for; `notes` says in words what was repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -63,6 +64,7 @@ class Solution:
     calibration: Calibration
     iterations: int
     vehicle: Vehicle | None = None
+    wheels: Wheels | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -74,13 +76,14 @@ def smooth(
     p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
     initial_attitude: AttitudePrior | None = None,
     relative_poses: RelativePoses | None = None,
+    wheels: WheelSpeeds | None = None,
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
     `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
-    IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like); neither need
-    be given. Raises MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser
-    stops at its limit.
+    IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
+    its wheels rolled; none of them need be given. Raises MeasurementError with fewer than three usable fixes, and
+    EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)
@@ -96,18 +99,26 @@ def smooth(
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
-    fit, constraints, vehicle = constrain(problem, fit)
+    fit, constraints, vehicle, odometer = constrain(problem, fit, wheels)
     fit = reject(problem, fit, constraints)
-    return _solution(problem, fit, fixes, calibration, vehicle)
+    return _solution(problem, fit, fixes, calibration, vehicle, odometer)
 
 
 def _solution(
-    problem: Problem, fit: Fit, fixes: GnssFixes, calibration: Calibration, vehicle: Vehicle | None
+    problem: Problem,
+    fit: Fit,
+    fixes: GnssFixes,
+    calibration: Calibration,
+    vehicle: Vehicle | None,
+    wheels: Wheels | None,
 ) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
-    covariances, of_mounting = keyframe_covariances(fit.graph, fit.values, len(T))
+    covariances, of_shared = keyframe_covariances(fit.graph, fit.values, len(T))
+    shared_stddevs = np.sqrt(of_shared.diagonal())
     if vehicle is not None and vehicle.held:
-        vehicle = replace(vehicle, mounting_stddevs=np.sqrt(of_mounting.diagonal()))
+        vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:4])
+    if wheels is not None and wheels.held:
+        wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     of_poses = covariances[:, :6, :6]
     if are_drifting(fixes[problem.used]):
         of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])
@@ -135,6 +146,7 @@ def _solution(
         calibration=calibration,
         iterations=fit.iterations,
         vehicle=vehicle,
+        wheels=wheels,
         notes=(*problem.notes, *_doubts(problem, fit, keyframes, rejected, calibration)),
     )
 

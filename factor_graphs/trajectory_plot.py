@@ -51,8 +51,8 @@ def _title(solution: Solution, fixes: GnssFixes) -> str:
     span = solution.trajectory.end - solution.trajectory.start
     used = int(np.count_nonzero(solution.fix_weights > 0))
     first = f"{span:.0f} s, {used} of {len(fixes)} fixes used, chi2 per degree of freedom {solution.chi2_per_dof:.2f}"
-    vehicle = [] if solution.vehicle is None else [solution.vehicle.verdict]
-    return "\n".join([first, *vehicle, *solution.notes])
+    verdicts = [part.verdict for part in (solution.vehicle, solution.wheels) if part is not None]
+    return "\n".join([first, *verdicts, *solution.notes])
 
 
 def _track(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:

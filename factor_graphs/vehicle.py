@@ -147,7 +147,7 @@ def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
 def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
-    where = moving & _beside_fixes(problem, fit)
+    where = moving & beside_fixes(problem, fit)
     seen, skids = motion[where], np.zeros((len(where), 2))
     time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
     if time < LEAST_TIME_S or way < LEAST_WAY_M:
@@ -179,7 +179,7 @@ def _doubt(mounting: Array, motion: BodyMotion) -> str:
     return ""
 
 
-def _beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """The keyframes (k,) beside a fix that fits, not in an outage: no farther than fixes usually are apart."""
     stamps = problem.intervals.keyframes
     good = stamps[problem.at[fit.weights > 0.5]]

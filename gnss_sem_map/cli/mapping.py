@@ -223,5 +223,7 @@ def trajectory(
     else:
         poses = found.trajectory
         typer.echo(f"{log.name}: {len(poses)} poses over {poses.end - poses.start:.1f} s; results in {out}")
-        if found.solution is not None and found.solution.vehicle is not None:
-            typer.echo(found.solution.vehicle.verdict)
+        parts = () if found.solution is None else (found.solution.vehicle, found.solution.wheels)
+        for part in parts:
+            if part is not None:
+                typer.echo(part.verdict)

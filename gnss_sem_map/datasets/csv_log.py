@@ -3,6 +3,8 @@
     imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
                                                        or by `imu_axes`, `force_unit`, `rate_unit` in log.yaml
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
+    wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
+                                                       or by `speed_unit` in log.yaml
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
     images/stamps.csv   number,stamp_s             images/<number>.png    rectified; or .jpg
@@ -26,13 +28,15 @@ from factor_graphs.csv_log import (
     IMU_COLUMNS,
     LONGEST_FIX_STEP_S,
     LONGEST_IMU_STEP_S,
+    LONGEST_WHEEL_STEP_S,
+    WHEEL_COLUMNS,
     fix_rows,
     parse_columns,
     parse_numbers,
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuNoise, clean_gnss, clean_imu
+from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, LONGEST_SWEEP_S, check_unit, in_order
 from gnss_sem_map.errors import DataError, PointTimesError
@@ -101,6 +105,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         for name, repairs in (("imu.csv", imu_repairs), ("gnss.csv", gnss_repairs))
         if repairs.dropped
     ]
+    wheels, wheel_skips = _wheels(drive / "wheels.csv")
     scans, scan_skips = _scans(drive / "lidar", about.lidar_is_compensated)
     images, image_skips = _images(drive / "images", about.image_size)
     return SensorLog(
@@ -112,9 +117,10 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         frame=frame,
         imu=imu,
         gnss=gnss,
+        wheels=wheels,
         imu_noise=about.imu_noise,
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*skips, *fix_skips, *scan_skips, *image_skips),
+        skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
 
 
@@ -152,6 +158,15 @@ def _fix_rows(path: Path) -> tuple[Array, list[Skip]]:
     with _as_data_error():
         rows, invalid = fix_rows(_numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S), shown(path))
     return rows, [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+
+
+def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
+    """Wheel speeds and the skipped rows; None where there is no such table."""
+    if not is_file(path):
+        return None, []
+    rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
+    wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
+    return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 
 
 def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:

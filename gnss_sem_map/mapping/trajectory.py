@@ -103,7 +103,7 @@ def check_georeference(log: SensorLog, origin: LocalFrame | None) -> None:
 def smooth_log(
     log: SensorLog, settings: TrajectorySettings, relative_poses: RelativePoses | None = None
 ) -> Solution:
-    """Smooth IMU and GNSS of a drive; the setting for the noise of the IMU takes precedence over the drive's own.
+    """Smooth IMU, GNSS and wheel speed of a drive; the setting for the IMU's noise is before the drive's own.
 
     Raises DataError without IMU and GNSS, MeasurementError and EstimationError.
     """
@@ -112,5 +112,13 @@ def smooth_log(
     smoother = settings
     if settings.imu_noise is None:
         smoother = settings.model_copy(update={"imu_noise": log.imu_noise})
-    lever = log.calibration.p_imu_antenna
-    return smooth(log.imu, log.gnss, log.frame, smoother, lever, log.initial_attitude, relative_poses)
+    return smooth(
+        log.imu,
+        log.gnss,
+        log.frame,
+        smoother,
+        log.calibration.p_imu_antenna,
+        log.initial_attitude,
+        relative_poses,
+        log.wheels,
+    )

@@ -224,6 +224,7 @@ def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
         "relative_poses_rejected": int(solution.relative_rejected.sum()),
         "time_offset_s": solution.calibration.time_offset_s,
         "vehicle_constraint": None if solution.vehicle is None else solution.vehicle.verdict,
+        "wheel_speed": None if solution.wheels is None else solution.wheels.verdict,
         "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
     }
 

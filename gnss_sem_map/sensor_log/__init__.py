@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -173,6 +173,8 @@ class SensorLog:
     """Origin of the map; None when the drive has no georeference."""
     imu: ImuSamples | None = None
     gnss: GnssFixes | None = None
+    wheels: WheelSpeeds | None = None
+    """None: the log has no wheel speed."""
     imu_noise: ImuNoise | None = None
     """None: the estimator's default."""
     initial_attitude: AttitudePrior | None = None
@@ -221,6 +223,7 @@ class SensorLog:
             self,
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
             gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
+            wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
             scans=self.scans if offset == 0.0 else tuple(_later(scan, offset) for scan in self.scans),
             conventions=None,
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,7 @@ NAMED_AXES = {"flu": "x y z", "frd": "x -y -z", "rfu": "y -x z"}
 STANDARD_GRAVITY = 9.80665
 FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}
 RATE_UNITS = {"rad/s": 1.0, "deg/s": float(np.pi / 180)}
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 
 
 def matrix_of(axes: str) -> Array:
@@ -65,6 +66,7 @@ class SensorConventions(BaseModel):
     )
     force_unit: Literal["m/s2", "g", "mg"] | None = Field(None, description="Unit of the specific force.")
     rate_unit: Literal["rad/s", "deg/s"] | None = Field(None, description="Unit of the angular rate.")
+    speed_unit: Literal["m/s", "km/h", "mph"] | None = Field(None, description="Unit of the wheel speed.")
     gnss_time_offset_s: float | None = Field(
         None, ge=-3600, le=3600, description="Moment of a fix minus its stamp: -1 when stamps are 1 s late."
     )
@@ -92,6 +94,12 @@ class SensorConventions(BaseModel):
         if not self.gnss_time_offset_s:
             return fixes
         return GnssFixes(fixes.stamps + self.gnss_time_offset_s, fixes.positions, fixes.stddevs)
+
+    def wheels_in_ours(self, wheels: WheelSpeeds) -> WheelSpeeds:
+        """The same wheel speeds in our unit."""
+        if self.speed_unit in (None, "m/s"):
+            return wheels
+        return WheelSpeeds(wheels.stamps, wheels.speeds * SPEED_UNITS[self.speed_unit])
 
     def _to_ours(self, axes: str | None) -> Array:
         matrix = matrix_of(axes or self.imu_axes or "flu")

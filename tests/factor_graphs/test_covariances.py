@@ -46,7 +46,7 @@ def test_they_hold_where_factors_reach_over_several_keyframes(simulate):
 def test_they_hold_where_all_keyframes_share_an_unknown(simulate):
     drive = simulate(3, seconds=120.0, noise=ImuNoise())
     problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
-    fit, _, vehicle = constrain(problem, fit_noise(problem))
+    fit, _, vehicle, _ = constrain(problem, fit_noise(problem))
     assert vehicle.held
     k = len(problem.intervals.keyframes)
     marginals = gtsam.Marginals(fit.graph, fit.values)

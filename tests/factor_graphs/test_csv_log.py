@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS, read_csv
+from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS, read_csv, read_wheels
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
 
@@ -160,3 +160,19 @@ def test_a_missing_file_is_named(log):
     (log / "gnss.csv").unlink()
     with pytest.raises(MeasurementError, match=r"gnss\.csv: cannot be read \(No such file or directory\)"):
         read_csv(log)
+
+
+def test_wheel_speeds_are_read_exactly_or_repaired_with_a_count_or_refused(log):
+    assert read_wheels(log) is None
+    (log / "wheels.csv").write_text("gear,speed_mps,stamp_s\n1,2.5,0.1\n1,-3,0.3\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        wheels = read_wheels(log)
+    np.testing.assert_array_equal(wheels.stamps, [0.1, 0.3])
+    np.testing.assert_array_equal(wheels.speeds, [2.5, -3.0])
+    (log / "wheels.csv").write_text("gear,speed_mps,stamp_s\n1,2.5,0.1\n1,nan,0.2\n1,-3,0.3\n")
+    with pytest.warns(RepairWarning, match=r"wheels.csv: wheels: 3 rows; 1 not finite, dropped"):
+        np.testing.assert_array_equal(read_wheels(log).speeds, [2.5, -3.0])
+    (log / "wheels.csv").write_text("time,speed_mps\n0,1\n")
+    with pytest.raises(MeasurementError, match=r"wheels.csv: column stamp_s is missing"):
+        read_wheels(log)

@@ -4,7 +4,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factor_graphs.errors import MeasurementError
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, clean_gnss, clean_imu
+from factor_graphs.measurements import (
+    GnssFixes,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+    clean_gnss,
+    clean_imu,
+    clean_wheels,
+)
 
 ZEROS = np.zeros((4, 3))
 
@@ -31,6 +39,36 @@ def test_cleaning_gives_the_same_samples_whatever_was_shuffled_repeated_or_spoil
 def test_repairs_are_told_in_words():
     _, repairs = clean_imu([0.0, 0.01, 0.01, 0.03, 0.02, 0.04, 1.0, 1.01], *2 * [np.zeros((8, 3))])
     assert str(repairs) == "IMU: 8 rows; 1 repeated, dropped; 1 out of order, sorted; 1 gaps, longest 0.96 s"
+
+
+@pytest.mark.parametrize("unit", [1.0, 3.6, 100.0, 1000.0])
+def test_codes_for_no_speed_are_dropped_whatever_the_unit(unit):
+    stamps, speeds = np.arange(12) * 0.1, unit * np.array([0, 3, 5, 8, 9, 9, -9, 8, 7, 5, 3, 0.0])
+    spoilt = speeds.copy()
+    spoilt[[2, 9]] = np.nan, 655.35 * unit
+    wheels, repairs = clean_wheels([*stamps, 0.4, 1e9], [*spoilt, 1.0, 1.0])
+    left = np.delete(np.arange(12), [2, 9])
+    np.testing.assert_array_equal(wheels.stamps, stamps[left])
+    np.testing.assert_array_equal(wheels.speeds, speeds[left])
+    assert (repairs.not_finite, repairs.absurd, repairs.repeated, repairs.far_off) == (1, 1, 1, 1)
+    assert repairs.dropped + len(wheels) == repairs.rows == 14
+
+
+def test_wheels_that_say_only_codes_say_nothing():
+    wheels, repairs = clean_wheels(np.arange(5.0), [1e300, -1e300, np.inf, 0.0, 1e7])
+    np.testing.assert_array_equal(wheels.speeds, [0.0])
+    assert (repairs.not_finite, repairs.absurd) == (1, 3)
+
+
+def test_wheel_speeds_are_of_one_column_in_order_and_may_be_none():
+    assert len(clean_wheels([], [])[0]) == 0
+    for stamps, speeds in (
+        ([0.0, 1.0], [[1.0], [2.0]]),
+        ([1.0, 1.0], [0.0, 0.0]),
+        ([0.0, 1.0], [0.0, np.nan]),
+    ):
+        with pytest.raises(MeasurementError, match=r"WheelSpeeds\.(speeds|stamps)"):
+            WheelSpeeds(np.array(stamps), np.array(speeds))
 
 
 @pytest.mark.parametrize(

@@ -320,6 +320,44 @@ def test_a_broken_table_log_is_refused(
         open_drive(drive)
 
 
+def test_wheel_speeds_are_read_and_their_bad_rows_reported(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    assert open_drive(drive).wheels is None
+    rows = [f"{0.05 * k:.2f},{0.1 * k:.1f},7" for k in range(20)]
+    spoilt = [*rows[:10], "0.31,nan,7", "0.32,655.35,7", rows[3], ",1.0,7", "9e9,1.0,7", *rows[10:]]
+    for lines, dropped in ((rows, 0), (spoilt, 5)):
+        (drive / "wheels.csv").write_text("\n".join(["stamp_s,speed_mps,gear", *lines]) + "\n")
+        log = open_drive(drive)
+        assert log.wheels is not None
+        np.testing.assert_allclose(log.wheels.stamps, 0.05 * np.arange(20))
+        np.testing.assert_allclose(log.wheels.speeds, 0.1 * np.arange(20))
+        told = [skip.reason for skip in log.skips if "wheels.csv" in skip.where]
+        assert len(told) == bool(dropped)
+        assert all(
+            words in told[0]
+            for words in ("2 not finite", "1 repeated", "1 faster", "1 with a stamp")
+            if dropped
+        )
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("stamp_s,speed\n0,1\n", "wheels.csv:.*columns stamp_s,speed_mps"),
+        ("stamp_s,speed_mps\n", "wheels.csv: no rows"),
+        ("stamp_s,speed_mps\n0,fast\n", "wheels.csv:.*expected numbers"),
+        ("stamp_s,speed_mps\n" + "".join(f"{50 * k},1\n" for k in range(9)), "wheels.csv:.*milliseconds"),
+    ],
+)
+def test_a_broken_table_of_wheel_speeds_is_refused(
+    small_drive: Street, tmp_path: Path, content: str, says: str
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    (drive / "wheels.csv").write_text(content)
+    with pytest.raises(DataError, match=says):
+        open_drive(drive)
+
+
 def test_the_real_excerpt_keeps_its_frame_numbers(real_data: Path) -> None:
     log = open_drive(real_data / "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync")
     assert [scan.number for scan in log.scans] == list(range(114, 154))

@@ -28,9 +28,6 @@ NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 LONG_ENOUGH_S = 120.0
 # The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
 CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
-# Where relative poses span more than this share of the time, the axle adds nothing that they do not know better: on a
-# drive of 480 s with LiDAR odometry it changes no digit of the error, and takes 70 % more time.
-BOUND_SHARE = 0.5
 
 
 def fit_noise(
@@ -102,7 +99,9 @@ def constrain(
     """
     settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
     wanted = settings.vehicle_constraint
-    if wanted == "auto" and _bound_share(problem) > BOUND_SHARE:
+    if wanted == "auto" and problem.is_bound:
+        # the axle adds nothing that LiDAR odometry does not know better: on a drive of 480 s it changes no digit of
+        # the error, and takes 70 % more time
         wanted = "off"
     vehicle = None if wanted == "off" else observe(problem, fit, motion)
     axle = vehicle if vehicle is not None and (wanted == "on" or not vehicle.doubt) else None
@@ -144,15 +143,6 @@ def constrain(
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
     return fit, factors, vehicle, rolling or wheels
-
-
-def _bound_share(problem: Problem) -> float:
-    """Share of the drive's time that relative poses span."""
-    stamps = problem.intervals.keyframes
-    first, last = problem.relative_at.T
-    edges = np.bincount(first, minlength=len(stamps)) - np.bincount(last, minlength=len(stamps))
-    spanned = np.cumsum(edges)[:-1] > 0
-    return float(np.diff(stamps)[spanned].sum() / (stamps[-1] - stamps[0]))
 
 
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:

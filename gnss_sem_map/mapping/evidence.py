@@ -31,8 +31,9 @@ FOLDER = "evidence"
 MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
 MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand."""
-FILES_HELD = 4
-"""Files of keyframes in memory at a time, some 19 MB each."""
+FILES_HELD = 2
+"""Files of keyframes in memory at a time, some 19 MB each: short drives are read once, and of long ones every tile
+reads so many that four of them help no more."""
 
 PACKING = 2
 """Level of compression: 5 % larger than with zlib's usual 6, in a quarter of its time (0.5 s of a drive of 30 s)."""

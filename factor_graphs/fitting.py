@@ -120,8 +120,11 @@ def constrain(problem: Problem, fit: Fit) -> tuple[Fit, list[gtsam.NonlinearFact
         before, motion = motion, body_motion(problem, fit)
         if vehicle is not None and held:
             mounting = fit.values.atVector(M(len(motion.velocity)))
-            guessed, vehicle = vehicle, replace(observe(problem, fit, motion), mounting=mounting, held=True)
-            settled = np.allclose(guessed.typical_slip, vehicle.typical_slip, rtol=SETTLED_SLIP) and bool(
+            guessed, vehicle = (
+                vehicle,
+                replace(observe(problem, fit, motion, held=True), mounting=mounting, held=True),
+            )
+            settled = np.allclose(guessed.density, vehicle.density, rtol=SETTLED_SLIP) and bool(
                 np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS
             )
     return fit, factors, vehicle

@@ -135,9 +135,10 @@ def constrain(
         if axle is not None or rolling is not None:
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
         if axle is not None:
-            mounting, guessed = fit.values.atVector(M(key)), axle.typical_slip
-            axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
-            settled &= np.allclose(guessed, axle.typical_slip, rtol=SETTLED_SLIP)
+            mounting, guessed = fit.values.atVector(M(key)), axle.density
+            shown = observe(problem, fit, motion, held=True)
+            axle = vehicle = replace(shown, mounting=mounting, held=True)
+            settled &= np.allclose(guessed, axle.density, rtol=SETTLED_SLIP)
         if speeds is not None and rolling is not None:
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)

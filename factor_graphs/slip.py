@@ -10,9 +10,13 @@ from factor_graphs.chi_square import probability_below
 
 Array = NDArray[np.float64]
 
-# Slip is never believed to be less, m/s, nor to change faster, s.
+# Slip is never believed to be less, m/s, for as long, s: a fifth of what a car on a road shows (0.1 m/s sideways).
 LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
-# The heading of a solution drifts, and looks like slip; over this time, s, it does not.
+# Means over this time, s, show how long slip lasts: several times as long as it lasts, and dozens in a drive.
+BLOCK_S = 10.0
+# Keyframes are as far apart as this, s, in an outage: slip that changes faster is seen there as it is sampled.
+SPARSE_S = 1.0
+# The heading of a solution that nothing holds drifts, and looks like slip; over this time, s, it does not.
 DRIFT_S = 20.0
 # Huber's loss of the fit, and where squares are cut, in standard deviations; what a cut leaves of a normal variance.
 HUBER, CUT, ROUNDS = 1.345, 2.5, 10
@@ -23,8 +27,9 @@ LEFT = probability_below(CUT**2, 3) + CUT**2 * (1 - probability_below(CUT**2, 1)
 class Slip:
     """Velocity that nothing explains: it is random, grows, and lasts for a while.
 
-    `parts` (3,) of its variance: m²/s², by squared speed, by squared lateral acceleration. `lasting_s` is the time in
-    which it tells as much as one independent value does; `typical` m/s its root mean square.
+    `parts` (3,) of its variance: m²/s², by squared speed, by squared lateral acceleration; `typical` m/s is its root
+    mean square. `lasting_s` is the time in which it tells as much as one independent value does: the integral of its
+    autocorrelation. That is less than the time between values where slip swings to and fro, as a suspension does.
     """
 
     parts: Array
@@ -33,17 +38,24 @@ class Slip:
 
     def stddevs(self, grows_with: Array, spacing: Array) -> Array:
         """What to believe of one value among others `spacing` (k,) s apart, (k,) m/s; `grows_with` (k, 3)."""
-        together = np.maximum(1.0, self.lasting_s / spacing)
+        # what it is over a long time counts: from moment to moment the imu knows the motion far better
+        together = self.lasting_s / np.minimum(spacing, max(self.lasting_s, SPARSE_S))
         return np.asarray(np.sqrt(grows_with @ self.parts * together), np.float64)
 
 
 def explain(
-    y: Array, by: Array, stddevs: Array, ahead: Array, grows_with: Array, spacing: Array
+    y: Array,
+    by: Array,
+    stddevs: Array,
+    ahead: Array,
+    grows_with: Array,
+    spacing: Array,
+    drifts: bool = True,
 ) -> tuple[Array, Slip, Array]:
     """The x (n,) of y = by x + slip, and the slip: each from the other in turn (iteratively reweighted least squares).
 
     Third, what is neither (k,) m/s: a skid, zero where there is none. The mean slope of every `DRIFT_S` s is the drift
-    of heading.
+    of heading, where the heading `drifts`; where it is held, it is slip that lasts.
 
     `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
     (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
@@ -59,7 +71,8 @@ def explain(
         left = y - by @ x - drift[window] * ahead
         weights = _huber(left, variance)
         lever = np.bincount(window, weights * ahead**2)
-        drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
+        if drifts:
+            drift = drift + np.bincount(window, weights * left * ahead) / np.maximum(lever, 1e-12)
         left, most = y - by @ x - drift[window] * ahead, CUT * np.sqrt(variance)
         scale = np.sqrt(spacing) / variance
         parts = nnls(grows_with * scale[:, None], np.clip(left, -most, most) ** 2 / LEFT * scale)[0]
@@ -67,7 +80,8 @@ def explain(
         variance = grows_with @ parts
     typical = float(np.sqrt(np.average(variance, weights=spacing)))
     off = left / np.sqrt(variance)
-    slip = Slip(parts, _lasting(np.clip(off, -CUT, CUT), spacing), typical)
+    lasting = max(_lasting(np.clip(off, -CUT, CUT), spacing), LEAST_LASTING_S * (LEAST_SLIP / typical) ** 2)
+    slip = Slip(parts, lasting, typical)
     return x, slip, np.where(np.abs(off) > CUT, left, 0.0)
 
 
@@ -83,15 +97,9 @@ def robust_stddev(values: Array) -> float:
 
 
 def _lasting(values: Array, spacing: Array) -> float:
-    """Integral of the autocovariance of whitened values, both sides, s: up to where they are no longer alike.
-
-    Where slip is smaller than what is believed of it, it counts as lasting less.
-    """
-    step = float(np.median(spacing))
-    total = float(values @ values) / len(values)
-    for lag in range(1, min(int(DRIFT_S / 2 / step) + 1, len(values))):
-        alike = float(values[lag:] @ values[:-lag]) / (len(values) - lag)
-        if alike <= 0:
-            break
-        total += 2 * alike
-    return max(step * total, LEAST_LASTING_S)
+    """Integral of the autocovariance of whitened values, both sides, s, from the means of blocks (batch means)."""
+    middle = np.cumsum(spacing) - spacing / 2
+    sparse = np.diff(middle // SPARSE_S, prepend=-1.0) > 0
+    values, each = values[sparse], np.maximum(spacing[sparse], SPARSE_S)
+    sums = np.bincount((np.cumsum(each) // BLOCK_S).astype(int), values * each)
+    return float(sums @ sums / each.sum())

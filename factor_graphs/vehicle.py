@@ -106,6 +106,11 @@ class Vehicle:
         return np.array([one.typical for one in self.slip])
 
     @property
+    def density(self) -> Array:
+        """Density of lateral and vertical slip, (2,) m/s/√Hz: what counts over a time much longer than it lasts."""
+        return self.typical_slip * np.sqrt([one.lasting_s for one in self.slip])
+
+    @property
     def verdict(self) -> str:
         """Whether the constraint takes part, and why or how, in one line."""
         if not self.held:
@@ -144,7 +149,7 @@ def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
     return replace(fit, values=values)
 
 
-def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
+def observe(problem: Problem, fit: Fit, motion: BodyMotion, held: bool = False) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
     where = moving & beside_fixes(problem, fit)
@@ -163,6 +168,7 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
             seen.velocity[:, 0],
             seen.grows_with(),
             seen.spacing,
+            not held,
         )
         slip.append(its_slip)
     return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))

@@ -78,20 +78,43 @@ def test_an_axle_that_does_not_slide_does_not_forward_or_backward_wherever_the_i
 
 
 @pytest.mark.parametrize("skidding", [0.0, 0.05])
-def test_slip_is_found_beside_skids_and_drift_with_its_size_and_its_duration(skidding):
+def test_slip_is_found_beside_skids_with_its_size_and_once_the_heading_is_held_its_duration(skidding):
     rng, k, spacing = np.random.default_rng(1), 3000, 0.5
     ahead = rng.uniform(5.0, 15.0, k)
     slip = 0.1 * gauss_markov(k, np.exp(-spacing / 1.0), rng)
     drift = 0.05 * np.sin(2 * np.pi * np.arange(k) * spacing / 300) * ahead
     pushed = np.where(rng.random(k) < skidding, 3.0, 0.0)
     by, grows_with = ahead[:, None], np.column_stack([np.ones(k), ahead**2, np.zeros(k)])
-    y = 0.03 * ahead + slip + drift + pushed
-    (slope,), found, skids = explain(y, by, np.array([0.2]), ahead, grows_with, np.full(k, spacing))
+    held = 0.03 * ahead + slip + pushed
+    y, prior, times = held + drift, np.array([0.2]), np.full(k, spacing)
+    (slope,), found, skids = explain(y, by, prior, ahead, grows_with, times)
     assert slope == pytest.approx(0.03, abs=0.005)
     assert np.all(skids[pushed > 0] > 2.0)
     assert np.mean(skids[pushed == 0] == 0) > 0.97
     assert found.typical == pytest.approx(0.1, rel=0.3)
+    _, found, _ = explain(held, by, prior, ahead, grows_with, times, drifts=False)
+    assert found.typical == pytest.approx(0.1, rel=0.3)
     assert found.lasting_s == pytest.approx(2.0, rel=0.5 if skidding else 0.25)
+
+
+def test_slip_that_swings_to_and_fro_tells_more_than_slip_that_stays():
+    """Oracle: sampled once a second, the sum of all autocovariances of e(t) - 0.8 e(t-1) is 0.2² of e's variance."""
+    rng, k = np.random.default_rng(3), 6000
+    e, ahead = rng.standard_normal(k + 1), rng.uniform(5.0, 15.0, k)
+    grows_with = np.tile(NO_GROWTH, (k, 1))
+    found = {}
+    for name, y in (("swings", e[1:] - 0.8 * e[:-1]), ("stays", gauss_markov(k, np.exp(-0.25), rng))):
+        y = 0.1 * y / np.std(y)
+        found[name] = explain(
+            y, ahead[:, None], np.array([0.2]), ahead, grows_with, np.ones(k), drifts=False
+        )[1]
+    assert found["swings"].lasting_s < 0.3  # 0.2² / (1 + 0.8²), and what blocks of ten seconds add
+    seen = 1 - 0.4 * (
+        1 - np.exp(-2.5)
+    )  # what blocks of ten seconds show of an autocorrelation of exp(-t / 4 s)
+    assert found["stays"].lasting_s == pytest.approx(8.0 * seen, rel=0.2)
+    rows = {name: slip.stddevs(grows_with[:1], np.ones(1)) for name, slip in found.items()}
+    assert rows["swings"] < 0.1 < rows["stays"]
 
 
 def test_slip_that_grows_is_small_where_it_is_slow():

@@ -3,7 +3,7 @@
 from scipy.special import chdtr, gammaincinv
 
 
-def quantile(probability: float, dof: int) -> float:
+def quantile(probability: float, dof: float) -> float:
     """The value that a sum of `dof` squared standard normal variables stays below with this probability."""
     return float(2 * gammaincinv(dof / 2, probability))
 

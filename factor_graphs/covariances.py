@@ -63,7 +63,7 @@ def _by_first_keyframe(graph: gtsam.GaussianFactorGraph, k: int) -> dict[int, li
     """The factors of a graph by the first keyframe that they bind; k where they bind none."""
     found = defaultdict(list)
     for factor in (graph.at(n) for n in range(graph.size())):
-        keyframes = [index for letter, index in map(_split, factor.keys()) if letter in PLACES]
+        keyframes = [index for letter, index in map(split_key, factor.keys()) if letter in PLACES]
         found[min(keyframes, default=k)].append(factor)
     return found
 
@@ -75,7 +75,7 @@ def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
     return ordering
 
 
-def _split(key: int) -> tuple[int, int]:
+def split_key(key: int) -> tuple[int, int]:
     """Letter and index of a key."""
     return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
@@ -125,7 +125,7 @@ def _of(keyframes: list[int], known: list[int], joint: Array) -> Array:
 
 def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Array]:
     """Keyframe i given later ones: R (15, 15) upper triangular, those keyframes, and S (15, 15 each)."""
-    keys = [[_split(key) for key in part.keys] for part in parts]
+    keys = [[split_key(key) for key in part.keys] for part in parts]
     later = sorted({index for row in keys for _, index in row} - {i})
     start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
     columns = np.zeros((SIZE, SIZE * (1 + len(later))))

@@ -146,6 +146,13 @@ def constrain(
     return fit, factors, vehicle, rolling or wheels
 
 
+def with_inflation(problem: Problem, fit: Fit, inflation: float) -> Fit:
+    """The same solution, of which the next one starts, with so many times the noise of the IMU."""
+    motion = motion_graph(problem, inflation)
+    loss = "huber" if problem.settings.robust else "quadratic"
+    return optimise(problem, motion, fit.values, inflation, loss)
+
+
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:
     """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
     if not problem.settings.robust or fit.chi2_per_dof > FITTING_CHI2[1]:

@@ -11,7 +11,7 @@ from factor_graphs.calibration import Calibration
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.errors import MeasurementError
-from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject
+from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject, with_inflation
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
@@ -20,6 +20,7 @@ from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
+from factor_graphs.variance import missing_imu_noise
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 NOTABLE_REJECTION = 0.01
 # The usual specific force of any vehicle is gravity to some per cent; so many times more or less is another unit.
 ANOTHER_UNIT = 2.0
+# The noise of the IMU is looked at again so often.
+NOISE_ROUNDS = 10
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
 UNKNOWN_HEADING = 0.35
 
@@ -99,9 +102,17 @@ def smooth(
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
-    fit, constraints, vehicle, odometer = constrain(problem, fit, wheels)
-    fit = reject(problem, fit, constraints)
-    return _solution(problem, fit, fixes, calibration, vehicle, odometer)
+    may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
+    for n in range(NOISE_ROUNDS):
+        fit, constraints, vehicle, odometer = constrain(problem, fit, wheels)
+        fit = reject(problem, fit, constraints)
+        covariances, of_shared = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
+        more = missing_imu_noise(fit, covariances, n > 0) if may_inflate else 1.0
+        if more == 1.0:
+            break
+        fit = with_inflation(problem, fit, more * fit.inflation)
+    shared_stddevs = np.sqrt(of_shared.diagonal())
+    return _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
 
 
 def _solution(
@@ -111,10 +122,10 @@ def _solution(
     calibration: Calibration,
     vehicle: Vehicle | None,
     wheels: Wheels | None,
+    covariances: Array,
+    shared_stddevs: Array,
 ) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
-    covariances, of_shared = keyframe_covariances(fit.graph, fit.values, len(T))
-    shared_stddevs = np.sqrt(of_shared.diagonal())
     if vehicle is not None and vehicle.held:
         vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:4])
     if wheels is not None and wheels.held:

@@ -136,8 +136,7 @@ def constrain(
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
         if axle is not None:
             mounting, guessed = fit.values.atVector(M(key)), axle.density
-            shown = observe(problem, fit, motion, held=True)
-            axle = vehicle = replace(shown, mounting=mounting, held=True)
+            axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
             settled &= np.allclose(guessed, axle.density, rtol=SETTLED_SLIP)
         if speeds is not None and rolling is not None:
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical

@@ -1,9 +1,9 @@
 """Is the IMU as good as was said? Its share of the squared residuals, against the share of the measurements.
 
 With all standard deviations honest, the squared whitened residuals of a group of factors sum up to its redundancy: its
-rows, less what the unknowns take from them, tr(P Aᵀ A) (variance component estimation; Förstner 1979). The rows of the
-IMU and the priors are as many as the unknowns, so their redundancy is what the unknowns take from all other rows. A
-total over all residuals hardly shows the IMU: most of them are fixes.
+rows, less what the unknowns take from them, tr(P Aᵀ A) (variance component estimation; Förstner 1979). From all rows
+together they take as many as they are. So the redundancy of the IMU follows from the other factors, each of which binds
+one keyframe only. A total over all residuals hardly shows the IMU: most of them are fixes.
 """
 
 import gtsam
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.chi_square import quantile
-from factor_graphs.covariances import PLACES, split_key
+from factor_graphs.covariances import PLACES, SIZE, split_key
 from factor_graphs.problem import Fit
 
 Array = NDArray[np.float64]
@@ -27,18 +27,25 @@ def missing_imu_noise(fit: Fit, covariances: Array, is_noisier: bool) -> float:
     Chance is no reason to change it; once the IMU `is_noisier` for sure, the best estimate is wanted. For a graph
     without relative poses: each of its other factors binds one keyframe, beside what all share.
     """
-    squares, redundancy = 2 * fit.motion.error(fit.values), _leverage(fit, covariances)
+    squares, redundancy = _squares(fit, len(covariances)), _redundancy(fit, covariances)
     if redundancy < 1 or (not is_noisier and squares <= quantile(CHANCE, redundancy)):
         return 1.0
     missing = float(np.sqrt(squares / redundancy))
     return missing if missing > ENOUGH else 1.0
 
 
-def _leverage(fit: Fit, covariances: Array) -> float:
-    """What the unknowns take from the rows of fixes and constraints: tr(P Aᵀ A), summed over them."""
+def _squares(fit: Fit, k: int) -> float:
+    """The squared whitened residuals of the IMU between k keyframes; priors follow it in the graph."""
+    of_priors = sum(fit.motion.at(n).error(fit.values) for n in range(k - 1, fit.motion.size()))
+    return float(2 * (fit.motion.error(fit.values) - of_priors))
+
+
+def _redundancy(fit: Fit, covariances: Array) -> float:
+    """Rows of the IMU, less what the unknowns take from them: all unknowns, less what they take from other factors."""
     linear = fit.graph.linearize(fit.values)
+    k = len(covariances)
     total = 0.0
-    for n in range(fit.motion.size(), linear.size()):
+    for n in range(k - 1, linear.size()):
         factor = linear.at(n)
         assert isinstance(factor, gtsam.JacobianFactor)
         A, begin = factor.jacobian()[0], 0
@@ -46,9 +53,9 @@ def _leverage(fit: Fit, covariances: Array) -> float:
         for letter, index in map(split_key, factor.keys()):
             place = PLACES[letter]
             end = begin + place.stop - place.start
-            if index < len(covariances):
+            if index < k:
                 rows[:, place], i = A[:, begin:end], index
             begin = end
         if i >= 0:
             total += float(np.sum(rows @ covariances[i] * rows))
-    return total
+    return total - SIZE

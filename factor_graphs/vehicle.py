@@ -149,7 +149,7 @@ def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
     return replace(fit, values=values)
 
 
-def observe(problem: Problem, fit: Fit, motion: BodyMotion, held: bool = False) -> Vehicle:
+def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
     moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
     where = moving & beside_fixes(problem, fit)
@@ -168,7 +168,6 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion, held: bool = False) 
             seen.velocity[:, 0],
             seen.grows_with(),
             seen.spacing,
-            not held,
         )
         slip.append(its_slip)
     return Vehicle(mounting, (slip[0], slip[1]), skids, _doubt(mounting, seen))

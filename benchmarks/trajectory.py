@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.accuracy import anees_band, errors, nees, state_error
+from factor_graphs.accuracy import anees_band, coverage, errors, nees, pose_nees, state_error
 from factor_graphs.chi_square import quantile
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.kalman import kalman_smooth
@@ -55,6 +55,19 @@ CASES: dict[str, dict[str, Any]] = {
     "hand-held": {"moves": hand_held},
     "drone": {"moves": drone},
 }
+WALKING = ImuNoise(
+    **{name: 5 * getattr(ImuNoise(), name) for name in ("accelerometer_bias_walk", "gyroscope_bias_walk")}
+)
+HONESTY: dict[str, dict[str, Any]] = {
+    "clean": {},
+    "outages of 30, 60, 30 s": {"outages": OUTAGES},
+    "10 % outliers": {"outlier_share": 0.1},
+    "30 % outliers": {"outlier_share": 0.3},
+    "IMU 3 times noisier than said": {"noise": ImuNoise().scaled(3.0)},
+    "the same with outages": {"noise": ImuNoise().scaled(3.0), "outages": OUTAGES},
+    "biases walk 5 times faster, outages": {"noise": WALKING, "outages": OUTAGES},
+    "IMU 2°, 1°, 1.2 m off, outages": {"moves": mounted, "outages": OUTAGES},
+}
 PLAIN = SmootherSettings(standing_stddev_mps=None, vehicle_constraint="off")
 GRAPHS = {
     "graph, no constraint": PLAIN,
@@ -68,12 +81,16 @@ def simulate(
     seed: int,
     seconds: float = 600.0,
     moves: Callable[[float, np.random.Generator], RigidMotion] = random_drive,
+    noise: ImuNoise | None = None,
     **gnss: Any,
 ) -> tuple[RigidMotion, ImuSamples, GnssFixes, NDArray[np.float64]]:
-    """A drive of `seconds` s, its MEMS-grade IMU at 100 Hz, its fixes at 1 Hz, and the true biases."""
+    """A drive of `seconds` s, its MEMS-grade IMU at 100 Hz, its fixes at 1 Hz, and the true biases.
+
+    `noise` is the IMU's own, where it is not what the smoother believes.
+    """
     rng = np.random.default_rng(seed)
     motion = moves(seconds, rng)
-    stamps, noise = np.arange(0.0, seconds, 0.01), ImuNoise()
+    stamps, noise = np.arange(0.0, seconds, 0.01), noise or ImuNoise()
     biases = simulate_biases(stamps, noise, rng)
     imu = simulate_imu(motion, stamps, FRAME, noise, rng, biases=biases)
     return (
@@ -133,6 +150,41 @@ def simulated(seeds: int) -> dict[str, dict[str, Figures]]:
             line += "    {covered_horizontal:.2f} {covered_3d:.2f}"
             print(f"  {name:32}" + line.format(**mean) + outage)
             table[case][name] = mean
+    return table
+
+
+def honesty(seeds: int) -> dict[str, Any]:
+    """Share of positions in their 90 % ellipsoid, and scale gap k: everywhere, in outages, and within 30 s of them."""
+    table: dict[str, Any] = {}
+    print(
+        f"\n{'90 % coverage h, 3D; k h, 3D':36} all                     in outages              within 30 s of them"
+    )
+    for case, told in HONESTY.items():
+        outages, squares = told.get("outages", ()), dict[str, list[tuple[NDArray[np.float64], ...]]]()
+        for seed in range(seeds):
+            motion, imu, fixes, _ = simulate(seed, **told)
+            found = smooth(imu, fixes, FRAME, None, LEVER).keyframes
+            values = pose_nees(found, motion.trajectory(found.stamps))
+            both = np.stack([values.horizontal, values.position])
+            inside, near = (
+                np.any([(found.stamps >= a - m) & (found.stamps <= b + m) for a, b in outages], axis=0)
+                for m in (0.0, 30.0)
+            )
+            whole = np.ones(len(found), dtype=bool)
+            for place, chosen in (("all", whole), ("in outages", inside), ("near outages", near & ~inside)):
+                if outages or place == "all":
+                    squares.setdefault(place, []).append(both[:, chosen])
+        table[case] = {}
+        for place, parts in squares.items():
+            of_place = [
+                coverage(row, dof) for row, dof in zip(np.concatenate(parts, axis=1), (2, 3), strict=True)
+            ]
+            table[case][place] = {
+                "covered_horizontal": of_place[0].inside[1], "covered_3d": of_place[1].inside[1],
+                "k_horizontal": of_place[0].scale_gap, "k_3d": of_place[1].scale_gap,
+            }  # fmt: skip
+        line = "{covered_horizontal:.3f} {covered_3d:.3f} {k_horizontal:.2f} {k_3d:.2f}   "
+        print(f"{case:36}", *(line.format(**figures) for figures in table[case].values()), flush=True)
     return table
 
 
@@ -253,6 +305,7 @@ def _timed(work: Callable[[], Solution], rounds: int) -> tuple[float, Solution]:
 
 PARTS: dict[str, Callable[[int], Any]] = {
     "simulated": simulated,
+    "honesty": honesty,
     "consistency": consistency,
     "real_log": lambda seeds: real_log(),
     "cost": lambda seeds: cost(),

@@ -53,7 +53,7 @@ def fit_noise(
         fit = optimise(
             problem, motion_graph(problem, inflation), fit.values, inflation, loss, constraints or []
         )
-        if FITTING_CHI2[0] <= fit.chi2_per_dof <= INFLATED_CHI2:
+        if FITTING_CHI2[0] <= fit.chi2_per_dof <= (INFLATED_CHI2 if start is None else FITTING_CHI2[1]):
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
             loosest = inflation

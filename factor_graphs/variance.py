@@ -42,10 +42,11 @@ def _squares(fit: Fit, k: int) -> float:
 
 def _redundancy(fit: Fit, covariances: Array) -> float:
     """Rows of the IMU, less what the unknowns take from them: all unknowns, less what they take from other factors."""
-    linear = fit.graph.linearize(fit.values)
-    k = len(covariances)
-    total = 0.0
-    for n in range(k - 1, linear.size()):
+    k, others, total = len(covariances), gtsam.NonlinearFactorGraph(), 0.0
+    for n in range(k - 1, fit.graph.size()):
+        others.push_back(fit.graph.at(n))
+    linear = others.linearize(fit.values)
+    for n in range(linear.size()):
         factor = linear.at(n)
         assert isinstance(factor, gtsam.JacobianFactor)
         A, begin = factor.jacobian()[0], 0

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs import problem
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
@@ -72,32 +70,6 @@ def test_covariances_know_of_relative_poses(simulate):
     without = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
     assert np.all(stddevs.mean(axis=0) < without.trajectory.position_stddevs.mean(axis=0))
     assert (np.abs(off) / stddevs).max() < 5
-
-
-@pytest.mark.parametrize("fails", [False, True])
-def test_a_drive_that_relative_poses_bind_is_solved_by_cholesky_and_has_the_answer_of_qr(
-    simulate, monkeypatch, fails
-):
-    """Also where Cholesky throws, as it does on graphs that are hardly bound: QR follows."""
-    drive = simulate(33, seconds=60.0, noise=ImuNoise(), outages=[(20.0, 40.0)])
-    relative = measured(drive.motion, 0.5, 59.0, np.random.default_rng(0))
-    solvers, original = [], gtsam.LevenbergMarquardtOptimizer
-
-    def watched(graph, values, params):
-        solvers.append(params.getLinearSolverType())
-        if fails and "CHOLESKY" in solvers[-1]:
-            raise RuntimeError("Indeterminant linear system")
-        return original(graph, values, params)
-
-    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", watched)
-    bound = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, relative_poses=relative)
-    assert ("MULTIFRONTAL_QR" in solvers) == fails
-    assert "MULTIFRONTAL_CHOLESKY" in solvers
-    monkeypatch.setattr(problem.Problem, "is_bound", False)
-    settings = SmootherSettings(vehicle_constraint="off")
-    by_qr = smooth(drive.imu, drive.fixes, FRAME, settings, LEVER, relative_poses=relative)
-    off = np.abs(bound.trajectory.positions - by_qr.trajectory.positions)
-    assert (off / by_qr.trajectory.position_stddevs).max() < 0.02
 
 
 def test_wrong_relative_poses_lose_their_weight(simulate):

@@ -74,7 +74,8 @@ def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
     unit, x, y, z = gtsam.noiseModel.Unit.Create(3), *problem.p_imu_antenna
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     scales = np.sqrt(fit.weights)[:, None] / problem.fixes.stddevs
-    for i, fix, scale in zip(problem.at.tolist(), problem.fixes.positions, scales, strict=True):
+    found = problem.antennas_found(T, velocities)
+    for i, fix, scale in zip(problem.at.tolist(), found, scales, strict=True):
         R, p = T[i, :3, :3], T[i, :3, 3]
         by_pose, by_calibration = np.hstack([-R @ lever, R]), np.column_stack([velocities[i], R])
         off = fix - p - R @ problem.p_imu_antenna

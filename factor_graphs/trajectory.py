@@ -26,12 +26,11 @@ _METADATA = {
 
 
 class _Segments(NamedTuple):
-    """Position as a cubic and rotation as a turn about a fixed axis, from each knot to the next."""
+    """The way from each knot to the next."""
 
-    cubic: Array  # (k, 4, 3): coefficients of u⁰ to u³, u from 0 to 1 over the segment
-    rotation: Array  # (k, 3, 9): R, row by row, is [0] + sin(u a) [1] + (1 - cos(u a)) [2] (Rodrigues)
-    angle: Array  # (k,) rad
     duration: Array  # (k,) s
+    step: Array  # (k, 3) m
+    turn: Array  # (k, 3) rad, a rotation vector in the axes of the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,17 +113,23 @@ class Trajectory:
         self._check_span(t, extrapolate_s)
         segments = self._segments
         i = np.clip(np.searchsorted(self.stamps, t, side="right") - 1, 0, len(self) - 1)
-        u = (t - self.stamps[i]) / segments.duration[i]
-        turn = u * segments.angle[i]
-        powers = np.clip(u, 0.0, None)[:, None, None] ** [0, 1, 2, 3]
-        turns = np.stack([np.ones_like(turn), np.sin(turn), 1 - np.cos(turn)], axis=-1)[:, None]
+        u = ((t - self.stamps[i]) / segments.duration[i])[:, None]
         T = np.zeros((len(t), 4, 4))
-        T[:, :3, :3] = (turns @ segments.rotation[i]).reshape(-1, 3, 3)
-        T[:, :3, 3] = (powers @ segments.cubic[i])[:, 0]
-        before = np.minimum(t - self.start, 0.0)[:, None]
-        T[:, :3, 3] += before * segments.cubic[0, 1] / segments.duration[0]
+        T[:, :3, :3] = self.T_map_imu[i, :3, :3] @ Rotation.from_rotvec(u * segments.turn[i]).as_matrix()
+        T[:, :3, 3] = self.positions[i] + self._moved(i, u, segments)
         T[:, 3, 3] = 1.0
         return T
+
+    def _moved(self, i: NDArray[np.intp], u: Array, segments: _Segments) -> Array:
+        """How far from knots i (j,) the imu is at shares u (j, 1) of the segments after them, (j, 3) m."""
+        step, h = segments.step[i], segments.duration[i, None]
+        if self.velocities is None:
+            return u * step
+        last = len(self) - 1
+        v0, v1 = self.velocities[i] * h, self.velocities[np.minimum(i + 1, last)] * h
+        moved: Array = u * (v0 + u * (3 * step - 2 * v0 - v1 + u * (v0 + v1 - 2 * step)))
+        beyond = (u < 0) | (i == last)[:, None]
+        return np.where(beyond, u * v0, moved)
 
     def _check_span(self, t: Array, extrapolate_s: float) -> None:
         if t.ndim != 1 or not np.isfinite(t).all():
@@ -137,28 +142,15 @@ class Trajectory:
 
     @cached_property
     def _segments(self) -> _Segments:
-        k, p, R = len(self), self.positions, self.T_map_imu[:, :3, :3]
-        # one more segment, after the last knot, makes that knot exact and carries the extrapolation
-        h = np.append(np.diff(self.stamps), 1.0)
-        step = np.vstack([np.diff(p, axis=0), np.zeros((1, 3))])
-        cubic = np.zeros((k, 4, 3))
-        cubic[:, 0] = p
-        cubic[:, 1] = step
-        if self.velocities is not None:
-            v0, v1 = self.velocities * h[:, None], np.roll(self.velocities, -1, axis=0) * h[:, None]
-            cubic[:, 1], cubic[:, 2], cubic[:, 3] = v0, 3 * step - 2 * v0 - v1, v0 + v1 - 2 * step
-        elif k > 1:
-            cubic[-1, 1] = step[-2] / h[-2]
-        cubic[-1, 2:] = 0.0
-        turn = np.zeros((k, 3))
-        turn[:-1] = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec()
-        if k > 1:
-            turn[-1] = turn[-2] / h[-2]
-        angle = np.linalg.norm(turn, axis=1)
-        x, y, z = (turn / np.maximum(angle, 1e-300)[:, None]).T
-        zero = np.zeros(k)
-        K = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-        return _Segments(cubic, np.stack([R, R @ K, R @ K @ K], axis=1).reshape(k, 3, 9), angle, h)
+        R = self.T_map_imu[:, :3, :3]
+        h, step = np.diff(self.stamps), np.diff(self.positions, axis=0)
+        turn = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).as_rotvec() if len(h) else step
+        # one more segment, after the last knot, goes on for a second as the one before it ends
+        step, turn = (
+            np.vstack([of_segment, of_segment[-1:] / h[-1:, None] if len(h) else np.zeros((1, 3))])
+            for of_segment in (step, turn)
+        )
+        return _Segments(np.append(h, 1.0), step, turn)
 
     def save(self, path: Path | str) -> None:
         """Write the trajectory as a Parquet table, units and frame in its schema metadata."""

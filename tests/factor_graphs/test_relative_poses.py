@@ -24,13 +24,13 @@ STDDEVS = np.repeat([5e-4, 5e-3], 3)
 
 
 def measured(
-    motion: Motion, first: float, last: float, rng: np.random.Generator, step: float = 0.2
+    motion: Motion, first: float, last: float, rng: np.random.Generator | None, step: float = 0.2
 ) -> RelativePoses:
-    """Relative poses from step to step, noisy as they say."""
+    """Relative poses from step to step, noisy as they say; exact without `rng`."""
     stamps = np.arange(first, last, step)
     pairs = np.column_stack([stamps[:-1], stamps[1:]])
     T = np.linalg.inv(motion.poses(pairs[:, 0])) @ motion.poses(pairs[:, 1])
-    noise = rng.standard_normal((len(pairs), 6)) * STDDEVS
+    noise = np.zeros((len(pairs), 6)) if rng is None else rng.standard_normal((len(pairs), 6)) * STDDEVS
     off = np.tile(np.eye(4), (len(pairs), 1, 1))
     off[:, :3, :3] = Rotation.from_rotvec(noise[:, :3]).as_matrix()
     off[:, :3, 3] = noise[:, 3:]
@@ -70,6 +70,30 @@ def test_covariances_know_of_relative_poses(simulate):
     without = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
     assert np.all(stddevs.mean(axis=0) < without.trajectory.position_stddevs.mean(axis=0))
     assert (np.abs(off) / stddevs).max() < 5
+
+
+@pytest.mark.parametrize("late_s", [-0.02, 0.005, 0.02])
+def test_fixes_beside_relative_poses_are_carried_to_them_along_the_exact_motion(simulate, late_s):
+    drive = simulate(33, seconds=40.0)
+    relative = measured(drive.motion, 0.5, 39.0, None)
+    stamps = relative.stamps[5::5, 0] + late_s
+    fixes = simulate_gnss(drive.motion, stamps, (0.01, 0.01, 0.01), LEVER, None)
+    bound = smooth(drive.imu, fixes, FRAME, None, LEVER, relative_poses=relative)
+    assert not np.isin(stamps, bound.keyframes.stamps).any()
+    off = (bound.trajectory.at(stamps) - drive.motion.poses(stamps))[:, :3, 3]
+    assert np.abs(off).max() < 2e-3
+    np.testing.assert_allclose(bound.fix_residuals, 0.0, atol=2e-3)
+    assert bound.fix_weights.min() == 1.0
+
+
+def test_a_fix_far_from_relative_poses_has_a_keyframe_of_its_own(simulate):
+    drive = simulate(33, seconds=20.0)
+    relative = measured(drive.motion, 0.5, 19.0, None)
+    stamps = relative.stamps[5::5, 0] + 0.1
+    fixes = simulate_gnss(drive.motion, stamps, (0.01, 0.01, 0.01), LEVER, None)
+    bound = smooth(drive.imu, fixes, FRAME, None, LEVER, relative_poses=relative)
+    distance = np.abs(bound.keyframes.stamps[:, None] - stamps).min(axis=0)
+    assert distance.max() < 1e-3
 
 
 def test_wrong_relative_poses_lose_their_weight(simulate):
@@ -173,7 +197,7 @@ def test_a_stream_bridges_an_outage_with_relative_poses(simulate):
 
 def test_a_stream_refuses_relative_poses_that_end_elsewhere(simulate):
     drive = simulate(36, seconds=40.0, noise=ImuNoise())
-    relative = measured(drive.motion, 0.5, 39.0, np.random.default_rng(0))
+    relative = measured(drive.motion, 0.5, 39.0, None)
     begin = smooth(upto(drive.imu, 30.0), drive.fixes[:29], FRAME, None, LEVER)
     online = StreamingSmoother(begin, FRAME, LEVER)
     with pytest.raises(MeasurementError, match=r"relative poses end at 0\.700"):

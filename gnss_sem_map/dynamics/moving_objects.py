@@ -116,8 +116,9 @@ def _observations_by_others(
     parts = [seen.segments.parts for seen in observations]
     _, row = distinct(np.concatenate([seen.segments.keys for seen in observations]))
     points = np.bincount(row, np.concatenate([part.points for part in parts]))
-    sums = np.concatenate([part.sums for part in parts])
-    centroids = np.stack([np.bincount(row, sums[:, axis]) / points for axis in range(3)], axis=1)
+    centroids = np.empty((len(points), 3))
+    for axis in range(3):  # one at a time: all of a chunk take 60 MB
+        centroids[:, axis] = np.bincount(row, np.concatenate([part.sums[:, axis] for part in parts])) / points
     images = [*before, *(seen.seen for seen in observations)]
     order = spatial_order(centroids)
     centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)

@@ -32,8 +32,8 @@ MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
 MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand."""
 FILES_HELD = 2
-"""Files of keyframes in memory at a time, some 19 MB each: short drives are read once, and of long ones every tile
-reads so many that four of them help no more."""
+"""Files of keyframes in memory at a time, some 19 MB each: those of short drives are read once. Of longer ones every
+tile reads so many that none is held."""
 
 PACKING = 2
 """Level of compression: 5 % larger than with zlib's usual 6, in a quarter of its time (0.5 s of a drive of 30 s)."""
@@ -72,8 +72,8 @@ class RunEvidence:
 
     @cached_property
     def _read_keyframes(self) -> Callable[[Path], KeyframeScans]:
-        """Reads files, and holds some; another run may have files of the same names."""
-        return lru_cache(FILES_HELD)(read_keyframes)
+        """Reads files, and holds a few; another run may have files of the same names."""
+        return lru_cache(FILES_HELD if len(self.keyframes) <= FILES_HELD else 0)(read_keyframes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def read(run: Path, label_set: LabelSet) -> RunEvidence:
         raise DataError(
             f"{shown(run)}: found no {FOLDER}/ in it, which is needed to refine the map; make the run again"
         )
-    moved = tiles.open_map(folder / MOVED, label_set)
+    moved = tiles.open_map(folder / MOVED, label_set, voxels_held=0)
     return RunEvidence(moved, _numbered(folder / MOVING_POINTS), _numbered(folder / KEYFRAMES))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, reduce
+from functools import cache, cached_property, reduce
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -40,11 +40,23 @@ class RawMap:
 
     def around(self, tile: Tile, margin_m: float) -> VoxelMap:
         """The voxels of a tile and of a margin around it, without the points that moved; raises DataError."""
-        everything = self.fused.around(tile, margin_m)
-        try:
-            return everything - self.evidence.moved.around(tile, margin_m)
-        except DataError:
-            raise DataError("map/ and evidence/ are not of one run; make the run again") from None
+        found = replace(self.fused, read_voxels=self._static).around(tile, margin_m)
+        self._static.leave_room(len(found))
+        return found
+
+    @cached_property
+    def _static(self) -> tiles.Recent:
+        """Reads the voxels of a tile without the points that moved."""
+        moved = self.evidence.moved
+
+        def read(tile: Tile) -> VoxelMap:
+            everything = self.fused.read_voxels(tile)
+            try:
+                return everything - moved.around(tile, 0)
+            except DataError:
+                raise DataError("map/ and evidence/ are not of one run; make the run again") from None
+
+        return tiles.Recent(read)
 
 
 def open_raw(run: Path, label_set: LabelSet) -> RawMap:
@@ -53,7 +65,7 @@ def open_raw(run: Path, label_set: LabelSet) -> RawMap:
     drives = sorted((run / DRIVES).iterdir()) if is_folder(run / DRIVES) else []
     keyframes = [path for drive in drives for path in evidence.read(drive, label_set).keyframes]
     found = replace(found, keyframes=[*found.keyframes, *keyframes])
-    return RawMap(tiles.open_map(run / MAP, label_set), found)
+    return RawMap(tiles.open_map(run / MAP, label_set, voxels_held=0), found)
 
 
 def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:

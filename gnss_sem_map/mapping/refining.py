@@ -205,11 +205,12 @@ class _Inputs:
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
     def beside(self, tile: Tile) -> Evidence:
-        fused, keyframes = self.raw.fused.around(tile, 0), None
-        if len(fused) and self.steps.free_space.enabled:
-            box = (np.stack(limits_of(fused.indices)) + 0.5) * fused.voxel_size_m
+        moved, keyframes = self.raw.evidence.moved.around(tile, 0), None
+        indices = np.concatenate([self.raw.around(tile, 0).indices, moved.indices])
+        if len(indices) and self.steps.free_space.enabled:
+            box = (np.stack(limits_of(indices)) + 0.5) * moved.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
-        return Evidence(self.raw.evidence.moved.around(tile, 0), self.model, keyframes)
+        return Evidence(moved, self.model, keyframes)
 
 
 @lru_cache(1)
@@ -249,8 +250,9 @@ def refine_tiles(
 
 
 def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
-    beside = inputs.beside(tile)
-    state, report = refine_tile(tile, inputs.raw.around(tile, inputs.halo), beside, inputs.steps, figures)
+    beside, around = inputs.beside(tile), [inputs.raw.around(tile, inputs.halo)]
+    release_memory()  # 110 MB of tiles that were read and cut
+    state, report = refine_tile(tile, around.pop(), beside, inputs.steps, figures)
     about["said"]["report"] = report.to_json()
     assert state.decided is not None
     # heights are in the raw map: here they would take a sixth of the bytes

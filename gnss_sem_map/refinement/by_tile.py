@@ -56,8 +56,10 @@ def sums_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
 def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
     """What a tile adds to the figures of the whole map, from the voxels of the tile and its halo."""
     size = around.voxel_size_m
-    state = MapState.of(around[places_around(around, tile, sums_halo_m(settings, size))], beside)
-    state = state[places_around(state.voxels, tile, _sums_reach_m(settings, size))]
+    around = around[places_around(around, tile, sums_halo_m(settings, size))]
+    heights = height_above_ground.height_over_ground(around.centres)
+    near = places_around(around, tile, _sums_reach_m(settings, size))
+    state = MapState.of(around[near], beside, heights=heights[near])
     state, _ = do(STEPS[0], state, settings)
     images = state.scores
     state, _ = do(STEPS[1], state, settings)
@@ -86,10 +88,14 @@ def refine_tile(
     Of what is `around` and `beside` the tile there may be more than its halo. The report counts changes and objects of
     the tile alone; reports of tiles add up.
     """
-    size, halo, reports = around.voxel_size_m, halo_m(settings, around.voxel_size_m), []
+    size, reports = around.voxel_size_m, []
+    halo = _reach_from(0, settings, size)
     if beside.moved is not None:
         beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, 0)])
-    state = MapState.of(around[places_around(around, tile, halo)], beside, figures)
+    around = around[places_around(around, tile, halo_m(settings, size))]
+    heights, near = height_above_ground.height_over_ground(around.centres), places_around(around, tile, halo)
+    around, heights = around[near], heights[near]
+    state = MapState.of(around, beside, figures, heights)
     del around  # 50 MB: the steps see less and less of it
     own = _inside(state.voxels, tile)
     for i, step in enumerate(STEPS):

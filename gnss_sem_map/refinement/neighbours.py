@@ -20,10 +20,13 @@ OFFSETS = np.array([(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x, y, z in H
 
 def pairs_of_neighbours(keys: NDArray[np.int64]) -> NDArray[np.int32]:
     """Places (p, 2) of every two sorted packed voxels (v,) that touch, be it in a corner; each pair once."""
-    buffer, pairs = np.empty((len(keys) + 1, 2), np.int32), []
+    pairs, count = (
+        np.empty((len(OFFSETS) * len(keys) + 1, 2), np.int32),
+        0,
+    )  # memory is taken where it is filled in
     for offset in OFFSETS:
-        pairs.append(buffer[: _find_pairs(keys, offset, buffer)].copy())
-    return np.concatenate(pairs)
+        count += _find_pairs(keys, offset, pairs[count:])
+    return pairs[:count]
 
 
 @njit(cache=True, nogil=True)

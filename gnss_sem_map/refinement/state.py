@@ -90,10 +90,20 @@ class MapState:
     """The map with its decisions, once they are made; later steps change those, and the last adds a layer."""
 
     @classmethod
-    def of(cls, voxels: VoxelMap, beside: Evidence, figures: Figures | None = None) -> MapState:
-        """The state before the first step: eq. 6, every observation counted in full."""
-        heights = height_over_ground(voxels.centres)
-        scores = voxels.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
+    def of(
+        cls,
+        voxels: VoxelMap,
+        beside: Evidence,
+        figures: Figures | None = None,
+        heights: NDArray[np.float32] | None = None,
+    ) -> MapState:
+        """The state before the first step: eq. 6, every observation counted in full.
+
+        `heights` (v,) m over ground, if voxels around these tell where it is.
+        """
+        if heights is None:
+            heights = height_over_ground(voxels.centres)
+        scores = np.divide(voxels.evidence, np.float32(UNITS_PER_NAT), dtype=np.float32)
         nothing = np.zeros(len(voxels), np.bool_)
         return cls(voxels, beside, figures or Figures(), heights, scores, nothing, nothing)
 

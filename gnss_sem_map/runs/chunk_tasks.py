@@ -19,7 +19,7 @@ from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 
-RANGES_PER_WORKER, LEAST_CHUNKS = 2, 2
+RANGES_PER_WORKER, LEAST_CHUNKS = 1, 2
 """Shorter ranges end more evenly, but each processes a window of scans before it and one after it as well."""
 CHUNKS_ON_CLUSTER = 4
 """Chunks of a range on a cluster, whose workers come and go."""

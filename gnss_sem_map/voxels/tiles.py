@@ -32,7 +32,8 @@ Z_ORDER_BITS = AXIS_BITS - TILE_BITS
 TILES_HELD = 6
 """Tiles of a map with all that is decided about them in memory at a time: several exports read each."""
 VOXELS_HELD = 1_000_000
-"""Voxels in memory at a time, 40 MB: a tile is read again with its neighbours, and a small map is read once."""
+"""Voxels in memory at a time, 40 MB: a tile is read again with its neighbours, and a small map is read once. Those of
+a large tile at work are among them, see `Recent.leave_room`."""
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
@@ -171,22 +172,26 @@ def open_map(
         read_frame(folder),
         tuple(sorted(names)),
         lru_cache(held)(lambda tile: tile_files.read(*of(tile))),
-        _Recent(lambda tile: tile_files.read_voxels(*of(tile)), voxels_held),
+        Recent(lambda tile: tile_files.read_voxels(*of(tile)), voxels_held),
     )
 
 
-class _Recent:
+class Recent:
     """Reads tiles, and holds those read last, up to so many voxels."""
 
-    def __init__(self, read: Callable[[Tile], VoxelMap], most: int) -> None:
+    def __init__(self, read: Callable[[Tile], VoxelMap], most: int = VOXELS_HELD) -> None:
         self._read, self._most, self._held = read, most, dict[Tile, VoxelMap]()
 
     def __call__(self, tile: Tile) -> VoxelMap:
         voxels = self._held.pop(tile) if tile in self._held else self._read(tile)
         self._held[tile] = voxels  # the last one
-        while sum(map(len, self._held.values())) > self._most:
-            del self._held[next(iter(self._held))]
+        self.leave_room(0)
         return voxels
+
+    def leave_room(self, voxels: int) -> None:
+        """Hold fewer by so many."""
+        while self._held and sum(map(len, self._held.values())) > self._most - voxels:
+            del self._held[next(iter(self._held))]
 
 
 def read(
@@ -224,13 +229,15 @@ def joined_voxels(parts: Sequence[VoxelMap], voxel_size_m: float, label_set: Lab
     """The voxels of parts that share none."""
     keys = np.concatenate([np.empty(0, np.int64), *(part.keys for part in parts)])
     order = np.argsort(keys, kind="stable")  # quick: the keys of each part are sorted
-    evidence = np.concatenate(
-        [np.empty((0, len(label_set.names)), np.int32), *(part.evidence for part in parts)]
-    )
+    evidence = np.empty((len(keys), len(label_set.names)), np.int32)
+    rows = np.empty(len(keys), np.int64)
+    rows[order] = np.arange(len(keys))
+    for part, of_part in zip(parts, np.split(rows, np.cumsum([len(part) for part in parts])), strict=False):
+        evidence[of_part] = part.evidence  # 26 MB less than all of them in a row
     hits = np.concatenate([np.empty(0, np.uint32), *(part.hits for part in parts)])
     heights = [part.heights for part in parts if part.heights is not None]
     of_all = np.concatenate([np.empty(0, np.int64), *heights])[order] if len(heights) == len(parts) else None
-    return VoxelMap(voxel_size_m, label_set, keys[order], evidence.take(order, axis=0), hits[order], of_all)
+    return VoxelMap(voxel_size_m, label_set, keys[order], evidence, hits[order], of_all)
 
 
 def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSet) -> SemanticMap:

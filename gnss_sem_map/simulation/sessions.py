@@ -16,8 +16,7 @@ from gnss_sem_map.simulation.town import GREY, SIGN, Builder, Colour, Thing, Tow
 
 _LEAVE = 0.3  # share of the cars at the kerb and on the sidewalk
 _TAKEN_DOWN = {"sign": 0.25, "bollard": 0.1, "wall": 0.1, "fence": 0.1}
-_EXTENDED = 0.2  # share of the smooth facades of two storeys and more
-_CARS, _CONTAINERS, _SIGNS = 3, 0.4, 0.4  # that come to each kerb, where there is room
+_CARS, _SIGNS = 3, 0.4  # that come to each kerb, where there is room
 _YELLOW: Colour = (0.62, 0.35, 0.08)
 
 
@@ -84,10 +83,13 @@ def session_of(town: Town, seed: int, session: int) -> Town:
     builder = Builder(np.random.default_rng([seed, 7, session]), list(town.models), [], list(town.things))
     taken = [_footprint(town, thing) for thing in town.things if _is_at_kerb(town, thing)]
     _clear(builder, town)
-    container = builder.model(models.container())
-    for side in sides(town.streets, town.ground):
-        _line(builder, side, container, taken)
-    _extend(builder, town)
+    smooth = [thing for thing in town.things if _is_smooth(town.models[thing.model])]
+    container, kerbs = builder.model(models.container()), sides(town.streets, town.ground)
+    for street in zip(kerbs[::2], kerbs[1::2], strict=True):
+        any(_stand(builder, side, container, _YELLOW, taken) for side in street)  # one of the two
+        _extend(builder, street, smooth, taken)
+        for side in street:
+            _line(builder, side, taken)
     return replace(town, models=builder.models, things=builder.things)
 
 
@@ -112,44 +114,72 @@ def _clear(builder: Builder, town: Town) -> None:
             builder.things[k] = replace(thing, model=nothing, is_vehicle=False)
 
 
-def _line(builder: Builder, side: Side, container: int, taken: list[Floats]) -> None:
-    """Cars, a container and a sign along one kerb, where nothing stands and where nothing stood in session 0."""
+def _line(builder: Builder, side: Side, taken: list[Floats]) -> None:
+    """Put cars and a sign along one kerb."""
     rng = builder.rng
     for model in rng.integers(0, 5, _CARS).tolist():
         along, depth = _room(builder, side, model, taken)
         if along > 0.0:
             builder.park(side, along, depth, np.pi if rng.random() < 0.85 else 0.0, model)
-    for model, share, colour in ((container, _CONTAINERS, _YELLOW), (SIGN, _SIGNS, GREY)):
-        if rng.random() < share:
-            along, depth = _room(builder, side, model, taken)
-            if along > 0.0:
-                builder.put(side, model, along, depth, colour, np.pi)
+    if rng.random() < _SIGNS:
+        _stand(builder, side, SIGN, GREY, taken)
+
+
+def _stand(builder: Builder, side: Side, model: int, colour: Colour, taken: list[Floats]) -> bool:
+    """Put something up at a kerb; whether there is room for it."""
+    along, depth = _room(builder, side, model, taken)
+    if along > 0.0:
+        builder.put(side, model, along, depth, colour, np.pi)
+    return along > 0.0
 
 
 def _room(builder: Builder, side: Side, model: int, taken: list[Floats]) -> tuple[float, float]:
-    """A free place for a model, along a kerb and behind it, which is then taken; (0, 0) where there is none."""
+    """A place along a kerb and behind it where nothing stands and nothing stood in session 0; (0, 0) if none is found.
+
+    It is taken from then on.
+    """
     length, width = builder.models[model].bounds[3:5].tolist()
     depth = 0.45 if model == SIGN else -width - 0.06
-    for along in builder.rng.uniform(10.0, side.length - 12.0, 5).tolist():
-        place, others = side.at(along, depth), np.array(taken)
-        gap_along, gap_across = (
-            np.abs((others[:, :2] - place) @ axis) - others[:, 2 + k] - half
-            for k, (axis, half) in enumerate(((side.along, length), (side.inwards, width)))
-        )
-        if np.all((gap_along > 0.5) | (gap_across > 0.1)):
+    for along in builder.rng.uniform(10.0, side.length - 12.0, 20).tolist():
+        place = side.at(along, depth)
+        if _is_free(side, place, length, width, taken):
             taken.append(np.array([*place, length, width]))
             return along, depth
     return 0.0, 0.0
 
 
-def _extend(builder: Builder, town: Town) -> None:
-    """Give some smooth facades an oriel."""
-    rng = builder.rng
-    for thing, chance in zip(town.things, rng.random(len(town.things)), strict=True):
-        model = town.models[thing.model]
-        low, high = model.bounds[:3], model.bounds[3:]
-        is_smooth = not np.isin(Surface.STEEL, model.shapes[:, 12])
-        height = float(model.shapes[0, 2] + model.shapes[0, 5]) - 0.4  # below the cornice
-        if model.name == "building" and is_smooth and height > 6.0 and chance < _EXTENDED:
-            width, depth = float(rng.uniform(2.5, 0.6 * (high[0] - low[0]))), float(rng.uniform(0.8, 1.2))
-            builder.things.append(replace(thing, model=builder.model(models.oriel(width, depth, height))))
+def _is_free(side: Side, place: Floats, length: float, width: float, taken: list[Floats]) -> bool:
+    """Whether something of this half length along the kerb and half width has room there."""
+    others = np.array(taken)
+    gap_along = np.abs((others[:, :2] - place) @ side.along) - others[:, 2] - length
+    gap_across = np.abs((others[:, :2] - place) @ side.inwards) - others[:, 3] - width
+    return bool(np.all((gap_along > 0.5) | (gap_across > 0.1)))
+
+
+def _extend(builder: Builder, street: tuple[Side, Side], houses: list[Thing], taken: list[Floats]) -> None:
+    """Give one of the houses along a street an oriel, where no lamp stands before it."""
+    rng, candidates = builder.rng, []
+    for side in street:
+        for house in houses:
+            place, half = np.array([house.u, house.v]), float(builder.models[house.model].bounds[3])
+            along, depth = (place - side.corner) @ side.along, (place - side.corner) @ side.inwards
+            faces = house.heading == side.heading and 0.0 < along < side.length and 0.0 < depth < 9.0
+            if faces and _is_free(side, place, 0.6 * half, 0.5, taken):
+                candidates.append(house)
+    if candidates:
+        house = candidates[int(rng.integers(len(candidates)))]
+        model = builder.models[house.model]
+        width, depth = rng.uniform([2.5, 0.8], [1.2 * model.bounds[3], 1.2]).tolist()
+        oriel = models.oriel(width, depth, _eaves(model) - 0.4)
+        builder.things.append(replace(house, model=builder.model(oriel)))
+
+
+def _is_smooth(model: Model) -> bool:
+    """Whether it is a house of two storeys or more without balconies."""
+    has_balconies = bool(np.any(model.shapes[:, 12] == Surface.STEEL))
+    return model.name == "building" and not has_balconies and _eaves(model) > 6.0
+
+
+def _eaves(model: Model) -> float:
+    """How high the facade of a house is, m."""
+    return float(model.shapes[0, 2] + model.shapes[0, 5])

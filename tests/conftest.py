@@ -38,6 +38,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/segmentation/test_onnx_file.py",
         "gnss_sem_map/segmentation/test_refinenet.py",
         "gnss_sem_map/segmentation/test_training.py",
+        "gnss_sem_map/simulation/test_sessions.py",
         "gnss_sem_map/simulation/test_town.py",
         "gnss_sem_map/test_finished_run.py",
         "gnss_sem_map/test_many_drives.py",

@@ -13,16 +13,42 @@ from gnss_sem_map.cli.options import Out
 
 def simulate(
     out: Out,
-    seconds: Annotated[float, typer.Option(min=0.3, help="Length of the drive, s.")] = 30.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            min=0.3,
+            help="Length of the drive, s; 30, or as long as the laps take (about 50 s each).",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[
         int, typer.Option(min=0, help="Town, traffic and noise; the same seed gives the same bytes.")
     ] = 0,
+    laps: Annotated[
+        int, typer.Option(min=1, help="From 2 on: so many times around a block of the town, in one drive.")
+    ] = 1,
+    session: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            help="The same town so many days later: other traffic, other parked cars, some things built or gone.",
+        ),
+    ] = 0,
+    gnss: Annotated[
+        Literal["unit", "consumer"],
+        typer.Option(
+            help="Positions of an inertial unit (0.35 m, drifting), or of a consumer's receiver (1 m)."
+        ),
+    ] = "unit",
 ) -> None:
     """Write a simulated drive in KITTI raw format, with the exact truth beside it."""
     from gnss_sem_map.simulation import simulate as write_drive
 
     with progress_bars() as progress:
-        drive = write_drive(out, seconds, seed, lambda done, total: progress("simulate", done, total))
+        drive = write_drive(
+            out, seconds, seed, lambda done, total: progress("simulate", done, total),
+            laps=laps, session=session, gnss=gnss,
+        )  # fmt: skip
     typer.echo(f"drive in {drive}")
 
 

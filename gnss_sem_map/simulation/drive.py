@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,26 @@ from gnss_sem_map.files.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
-from gnss_sem_map.simulation.oxts import DATAFORMAT, oxts_rows, row_text, sweep_rows
+from gnss_sem_map.simulation.oxts import DATAFORMAT, Gnss, oxts_rows, row_text, sweep_rows
 from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_imu, camera_in_lidar, write_calibration
+from gnss_sem_map.simulation.sessions import Change, changes, session_of
+from gnss_sem_map.simulation.streets import around_the_block
 from gnss_sem_map.simulation.town import build_town
 from gnss_sem_map.simulation.tracklets import write_tracklets
-from gnss_sem_map.simulation.traffic import EARLY_S, LATE_S, drive_through
-from gnss_sem_map.simulation.truth import seen_alone, seen_boxes, write_trajectory, write_vehicles
+from gnss_sem_map.simulation.traffic import EARLY_S, LATE_S, drive_through, lap_length, lap_seconds
+from gnss_sem_map.simulation.truth import (
+    seen_alone,
+    seen_boxes,
+    write_changes,
+    write_trajectory,
+    write_vehicles,
+)
 from gnss_sem_map.simulation.world import World
 
-DATE = "2026_04_18"
+SECONDS = 30.0  # of a drive, when nothing else is said
 IMAGE_AFTER_SCAN_S = 0.0105
 EXPOSURE_AFTER_SCAN_S = 0.0020  # 8.5 ms before the image's stamp, as measured on KITTI
-_MORNING_NS = 1_776_504_600_000_000_000  # 2026-04-18 09:30:00 UTC, stamp zero of the simulation
+_MORNING = np.timedelta64(9 * 60 + 30, "m")  # UTC, stamp zero of the simulation
 _PLACE = LocalFrame(lat_deg=49.0131, lon_deg=8.4044, alt_m=115.0)
 
 
@@ -44,6 +52,7 @@ class Simulation:
     """
 
     seed: int
+    session: int
     world: World
     lidar: Lidar
     camera: Camera
@@ -55,6 +64,18 @@ class Simulation:
     """(n, 30)"""
     sync: npt.NDArray[np.int64]
     """(frames,) the row of `oxts` that belongs to every sweep."""
+    changes: list[Change]
+    """What came and went since session 0, in the simulation's own axes; see `to_map`."""
+
+    @property
+    def day(self) -> int:
+        """Seed of all that another day brings: traffic, light and noise."""
+        return day_of(self.seed, self.session)
+
+    @property
+    def morning_ns(self) -> int:
+        """Unix time of stamp zero of the simulation."""
+        return int((_date_of(self.session) + _MORNING).astype("datetime64[ns]").astype(np.int64))
 
     @property
     def stamps(self) -> Floats:
@@ -78,13 +99,13 @@ class Simulation:
     def scan(self, frame: int) -> SimulatedScan:
         """The sweep of a frame."""
         start, end = self.sweeps[frame]
-        return render_scan(self.world, T_IMU_LIDAR, start, end, lidar=self.lidar, seed=self.seed, frame=frame)
+        return render_scan(self.world, T_IMU_LIDAR, start, end, lidar=self.lidar, seed=self.day, frame=frame)
 
     def image(self, frame: int) -> SimulatedImage:
         """The image of a frame, at its moment of exposure."""
         moment = self.stamps[frame] + EXPOSURE_AFTER_SCAN_S
         T_map_camera = self.world.ego.poses([moment])[0] @ camera_in_imu(self.camera)
-        return render_image(self.world, T_map_camera, moment, camera=self.camera, seed=self.seed, frame=frame)
+        return render_image(self.world, T_map_camera, moment, camera=self.camera, seed=self.day, frame=frame)
 
     def project(
         self, frame: int, scan: SimulatedScan
@@ -103,50 +124,88 @@ class Simulation:
         return u, np.round(f * y / ahead + self.camera.centre_v_px).astype(np.int64), z
 
 
+def _date_of(session: int) -> np.datetime64:
+    return np.datetime64("2026-04-18") + np.timedelta64(session, "D")
+
+
+def day_of(seed: int, session: int) -> int:
+    """Seed of all that differs between two sessions of one town, but for the town itself."""
+    return seed + 1_000_000 * session
+
+
 def prepare(
-    seconds: float, seed: int, lidar: Lidar | None = None, camera: Camera | None = None
+    seconds: float | None,
+    seed: int,
+    lidar: Lidar | None = None,
+    camera: Camera | None = None,
+    *,
+    laps: int = 1,
+    session: int = 0,
+    gnss: Gnss = "unit",
 ) -> Simulation:
-    """Build the town, the traffic and the measurements of the navigation unit; nothing is rendered yet."""
+    """Build the town, the traffic and the measurements of the navigation unit; nothing is rendered yet.
+
+    See `simulate`.
+    """
+    usual = build_town(seed, crossings=4 + int((seconds or SECONDS) / 7.0))
+    if laps > 1:
+        usual = replace(usual, route=around_the_block(usual.route, laps))
+    if seconds is None:
+        seconds = lap_seconds(usual, laps) if laps > 1 else SECONDS
     frames = round(10.0 * seconds)
     if frames < 3:
         raise DataError(
             f"a drive of {seconds} s has {frames} scans, expected at least 3; ask for 0.3 s or more"
         )
-    town = build_town(seed, crossings=4 + int(seconds / 7.0))
-    town, ego, movers = drive_through(town, seconds, seed)
-    rng = np.random.default_rng([seed, 5])
-    edges = 0.05 + 0.1 * np.arange(frames + 1) + np.concatenate([[0.0], rng.uniform(-4e-4, 4e-4, frames)])
+    day, built = day_of(seed, session), session_of(usual, seed, session)
+    town, ego, movers = drive_through(built, seconds, day, laps=laps, weaves=laps > 1 or session > 0)
+    rng = np.random.default_rng([day, 5])
+    first = 0.05 + (
+        float(rng.uniform(0.0, 0.1)) if session else 0.0
+    )  # no two days' scans are of the same places
+    edges = first + 0.1 * np.arange(frames + 1) + np.concatenate([[0.0], rng.uniform(-4e-4, 4e-4, frames)])
     sweeps = np.column_stack([edges[:-1], edges[1:]])
     ticks = np.arange(-EARLY_S + 0.05, seconds + LATE_S - 0.3, 0.01)
     oxts_stamps = ticks + rng.uniform(-2e-4, 2e-4, len(ticks))
-    rows = oxts_rows(ego, oxts_stamps, _PLACE, rng)
+    driven = ego.way(oxts_stamps) / lap_length(town) if laps > 1 else None
+    rows = oxts_rows(ego, oxts_stamps, _PLACE, rng, gnss, driven)
     sync = sweep_rows(oxts_stamps, sweeps.mean(axis=1), rng)
     world = World(town, ego, movers)
     middles = sweeps.mean(axis=1)
     world.remember(np.concatenate([sweeps[:, 0], middles, sweeps[:, 1], middles + EXPOSURE_AFTER_SCAN_S]))
-    return Simulation(seed, world, lidar or Lidar(), camera or Camera(), sweeps, oxts_stamps, rows, sync)
+    return Simulation(
+        seed, session, world, lidar or Lidar(), camera or Camera(), sweeps, oxts_stamps, rows, sync,
+        changes(usual, built),
+    )  # fmt: skip
 
 
 def simulate(
     folder: Path,
-    seconds: float = 30.0,
+    seconds: float | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
     *,
     lidar: Lidar | None = None,
     camera: Camera | None = None,
     workers: int | None = None,
+    laps: int = 1,
+    session: int = 0,
+    gnss: Gnss = "unit",
 ) -> Path:
     """Write the drive of a seed in KITTI raw format, with its truth, under `folder`; returns the drive's folder.
 
+    `seconds` (None: 30, or as long as the laps take) is the length of the drive. More than one of `laps` lead around a
+    block of the town. `session` K is the drive K days later. `gnss`: positions of the inertial unit, or of a consumer's
+    receiver of 1 m.
     `progress(done, frames)` is called after every frame; `workers` threads render (None: one per core). The bytes
     do not depend on the threads. Raises DataError when the drive is already there or is too short.
     """
-    drive = Path(folder) / DATE / f"{DATE}_drive_{seed:04d}_sync"
+    date = str(_date_of(session)).replace("-", "_")
+    drive = Path(folder) / date / f"{date}_drive_{seed:04d}_sync"
     for path in (drive, _twin(drive)):
         if path.exists():
             raise DataError(f"{path}: is already there; remove it or simulate into another folder")
-    simulation = prepare(seconds, seed, lidar, camera)
+    simulation = prepare(seconds, seed, lidar, camera, laps=laps, session=session, gnss=gnss)
     with _for_us_alone(drive) as partial:
         write_calibration(partial / "calibration", camera or Camera())
         _refuse_other_calibration(partial / "calibration", drive.parent)
@@ -223,15 +282,18 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
         "truth/single_frame",
     ):
         (partial / name).mkdir(parents=True)
-    _write_oxts(partial, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
-    _write_oxts(folder / "extract", simulation.oxts_stamps, simulation.oxts)
+    morning_ns = simulation.morning_ns
+    _write_oxts(
+        partial, morning_ns, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync]
+    )
+    _write_oxts(folder / "extract", morning_ns, simulation.oxts_stamps, simulation.oxts)
     stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}
     for name, values in stamps.items():
-        _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", values)
-    _write_stamps(partial / "image_02" / "timestamps.txt", simulation.stamps + IMAGE_AFTER_SCAN_S)
+        _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", morning_ns, values)
+    _write_stamps(partial / "image_02" / "timestamps.txt", morning_ns, simulation.stamps + IMAGE_AFTER_SCAN_S)
     truth, frame = partial / "truth", simulation.frame
     about = {
-        "epoch_ns": _MORNING_NS + round(simulation.zero_s * 1e9),
+        "epoch_ns": morning_ns + round(simulation.zero_s * 1e9),
         "lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m, "seed": simulation.seed,
     }  # fmt: skip
     (truth / "world.json").write_text(json.dumps(about, indent=2) + "\n")
@@ -239,19 +301,21 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
     write_trajectory(truth / "trajectory.tum", simulation.world.ego, simulation.oxts_stamps, zero, to_map)
     write_trajectory(truth / "trajectory_lidar.tum", simulation.world.ego, simulation.stamps, zero, to_map)
     write_vehicles(truth / "vehicles.csv", simulation.world, simulation.stamps, zero, to_map)
+    if simulation.session:
+        write_changes(truth / "changes.json", simulation.session, simulation.changes, to_map)
 
 
-def _write_oxts(drive: Path, stamps: Floats, rows: Floats) -> None:
+def _write_oxts(drive: Path, morning_ns: int, stamps: Floats, rows: Floats) -> None:
     (drive / "oxts" / "data").mkdir(parents=True)
     (drive / "oxts" / "dataformat.txt").write_text(DATAFORMAT)
-    _write_stamps(drive / "oxts" / "timestamps.txt", stamps)
+    _write_stamps(drive / "oxts" / "timestamps.txt", morning_ns, stamps)
     for k, row in enumerate(rows):
         (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(row_text(row))
 
 
-def _write_stamps(path: Path, stamps: Floats) -> None:
+def _write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
     """One line `date time` with nanoseconds for each stamp."""
-    times = (_MORNING_NS + np.round(stamps * 1e9).astype(np.int64)).astype("datetime64[ns]")
+    times = (morning_ns + np.round(stamps * 1e9).astype(np.int64)).astype("datetime64[ns]")
     path.write_text("".join(str(time).replace("T", " ") + "\n" for time in times))
 
 

@@ -26,7 +26,9 @@ class Model:
 
     @property
     def bounds(self) -> Floats:
-        """(6,) smallest and largest x, y, z in metres."""
+        """(6,) smallest and largest x, y, z in metres; zeros without shapes."""
+        if not len(self.shapes):
+            return np.zeros(6)
         centre, half = self.shapes[:, :3], self.shapes[:, 3:6]
         return np.concatenate([(centre - half).min(0), (centre + half).max(0)])
 
@@ -355,6 +357,17 @@ def sign() -> Model:
 def bollard() -> Model:
     """A short post."""
     return _model("bollard", [_round(Form.UPRIGHT, (0, 0, 0.3), (0.05, 0.05, 0.7), Surface.STEEL, Kind.POLE)])
+
+
+def container() -> Model:
+    """A skip for rubble that stands in the parking lane."""
+    return _model("container", [_block((-1.7, 1.7), (-0.9, 0.9), (0.1, 1.6), Surface.STEEL, Kind.CONTAINER)])
+
+
+def oriel(width: float, depth: float, height: float) -> Model:
+    """A part of a house that comes forward above the ground floor, up to this height; its house's front is y = 0."""
+    x = 0.5 * width
+    return _model("oriel", [_block((-x, x), (-depth, 0.0), (3.3, height), Surface.FACADE, Kind.BUILDING)])
 
 
 def cars() -> list[Model]:

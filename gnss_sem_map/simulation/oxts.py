@@ -4,7 +4,8 @@ Like the real unit it reports a fused solution, smooth and wrong by slowly drift
 velocity by centimetres per second, attitude by hundredths of a degree.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,13 @@ from factor_graphs.measurements import ImuNoise
 from factor_graphs.simulation import Motion, simulate_gnss, simulate_imu
 from gnss_sem_map.simulation.compiled import Floats
 
-POSITION_STDDEVS_M = (0.35, 0.35, 0.5)
+Gnss = Literal["unit", "consumer"]
+_Axes = tuple[float, float, float]
+# white noise and drift of the positions (east, north, up), and the accuracy that is claimed, m
+_POSITION_STDDEVS_M: Final[dict[Gnss, tuple[_Axes, _Axes, float]]] = {
+    "unit": ((0.002, 0.002, 0.003), (0.35, 0.35, 0.5), 0.35),
+    "consumer": ((0.3, 0.3, 0.3), (0.95, 0.95, 0.95), 1.0),
+}
 NOISE = ImuNoise(
     accelerometer_noise_density=1.5e-3,
     gyroscope_noise_density=8e-5,
@@ -76,34 +83,50 @@ _MEANINGS = {
 DATAFORMAT = "".join(f"{name + ':':<14} {_MEANINGS[name]}\n" for name in COLUMNS)
 
 
-def oxts_rows(motion: Motion, stamps: Floats, frame: LocalFrame, rng: np.random.Generator) -> Floats:
-    """The 30 columns at these stamps (100 Hz): (n, 30)."""
-    fixes = simulate_gnss(
-        motion,
-        stamps,
-        (0.002, 0.002, 0.003),
-        rng=rng,
-        correlated_stddevs=POSITION_STDDEVS_M,
-        correlation_time_s=120.0,
-    )
+def oxts_rows(
+    motion: Motion,
+    stamps: Floats,
+    frame: LocalFrame,
+    rng: np.random.Generator,
+    gnss: Gnss = "unit",
+    laps: Floats | None = None,
+) -> Floats:
+    """The 30 columns at these stamps (100 Hz): (n, 30).
+
+    `laps` (n,): how many laps are driven, with fractions. Then the drifting errors of two passes of one place are
+    independent, as if minutes lay between them.
+    """
+    white, drifting, claimed = _POSITION_STDDEVS_M[gnss]
+
+    def reported() -> Floats:
+        return simulate_gnss(
+            motion, stamps, white, rng=rng, correlated_stddevs=drifting, correlation_time_s=120.0
+        ).positions
+
+    true = motion.poses(stamps)[:, :3, 3]
+    positions = reported() if laps is None else true + _renewed(laps, lambda: reported() - true)
     imu = simulate_imu(motion, stamps, frame, NOISE, rng)
     rate = 1.0 / float(np.median(np.diff(stamps)))
-    drifts = [_drift(len(stamps), rate, sigma, rng) for sigma in (3e-4, 3e-4, 1.2e-3, 0.02, 0.02, 0.02)]
+    sigmas = np.array([3e-4, 3e-4, 1.2e-3, 0.02, 0.02, 0.02])
+
+    def drift() -> Floats:
+        return np.column_stack([_drift(len(stamps), rate, sigma, rng) for sigma in sigmas])
+
+    drifts = (drift() if laps is None else _renewed(laps, drift)).T
     euler = Rotation.from_matrix(motion.poses(stamps)[:, :3, :3]).as_euler("ZYX")
     yaw, pitch, roll = euler[:, 0] + drifts[2], euler[:, 1] + drifts[1], euler[:, 2] + drifts[0]
-    velocity = motion.velocities(stamps) + np.column_stack(drifts[3:])
+    velocity = motion.velocities(stamps) + drifts[3:].T
     east, north, up = velocity.T
     forward, left = np.cos(yaw) * east + np.sin(yaw) * north, np.cos(yaw) * north - np.sin(yaw) * east
     level = Rotation.from_euler("YX", np.column_stack([pitch, roll])).as_matrix()
     force, turn = imu.specific_force[..., None], imu.angular_rate[..., None]
     count = len(stamps)
-    accuracy = np.full(count, float(np.hypot(*POSITION_STDDEVS_M[:2]) / np.sqrt(2.0)))
     modes = np.tile([4.0, 10.0, 4.0, 4.0, 0.0], (count, 1))
     return np.column_stack([
-        *frame.to_geodetic(fixes.positions), roll, pitch, (yaw + np.pi) % (2 * np.pi) - np.pi,
+        *frame.to_geodetic(positions), roll, pitch, (yaw + np.pi) % (2 * np.pi) - np.pi,
         north, east, forward, left, up,
         force[..., 0], (level @ force)[..., 0], turn[..., 0], (level @ turn)[..., 0],
-        accuracy, np.full(count, 0.04), modes,
+        np.full(count, claimed), np.full(count, 0.04), modes,
     ])  # fmt: skip
 
 
@@ -113,6 +136,17 @@ def _drift(count: int, rate: float, sigma: float, rng: np.random.Generator, seco
     drive = rng.standard_normal(count) * sigma * np.sqrt(1.0 - keep**2)
     drive[0] = sigma * rng.standard_normal()
     return np.asarray(lfilter([1.0], [1.0, -keep], drive))
+
+
+def _renewed(laps: Floats, draw: Callable[[], Floats]) -> Floats:
+    """An error (n, k) that is drawn anew twice a lap, each draw fading into the next one.
+
+    Its variance is that of one draw everywhere, and what lies a lap apart has no draw in common.
+    """
+    number = np.floor(2.0 * laps).astype(int)
+    draws = np.stack([draw() for _ in range(number.max() + 2)])
+    fade, rows = 0.5 * np.pi * (2.0 * laps - number)[:, None], np.arange(len(laps))
+    return np.asarray(np.cos(fade) * draws[number, rows] + np.sin(fade) * draws[number + 1, rows])
 
 
 def sweep_rows(stamps: Floats, sweeps: Floats, rng: np.random.Generator) -> npt.NDArray[np.int64]:

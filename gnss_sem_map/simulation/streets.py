@@ -120,6 +120,12 @@ def random_route(streets: Streets, crossings: int, rng: np.random.Generator) -> 
     return route
 
 
+def around_the_block(route: list[Node], laps: int) -> list[Node]:
+    """The first two streets of a route and the two that lead back: so many laps, and one more that nobody finishes."""
+    a, b, c = route[:3]
+    return [a, b, c, (a[0] + c[0] - b[0], a[1] + c[1] - b[1])] * (laps + 1)
+
+
 def _inside(streets: Streets, node: Node) -> bool:
     """Whether a crossing is inside the town, not on its rim."""
     return 0 < node[0] < len(streets.u) - 1 and 0 < node[1] < len(streets.v) - 1
@@ -145,18 +151,18 @@ def lane_path(streets: Streets, route: list[Node], step_m: float = 1.5) -> Float
             corner - radius * courses[k - 1],
             corner - radius * courses[k - 1] + radius * courses[k],
         )
-        pieces.append(_line(begin, entry, step_m))
+        pieces.append(straight(begin, entry, step_m))
         angles = np.linspace(0, np.pi / 2, max(4, round(radius * np.pi / 2 / step_m)) + 1)[:-1]
         pieces.append(
             centre
             - radius * (np.outer(np.cos(angles), courses[k]) - np.outer(np.sin(angles), courses[k - 1]))
         )
         begin = corner + radius * courses[k]
-    pieces.append(_line(begin, spots[-1] + LANE_M * rights[-1], step_m))
+    pieces.append(straight(begin, spots[-1] + LANE_M * rights[-1], step_m))
     return np.concatenate(pieces)
 
 
-def _line(a: Floats, b: Floats, step_m: float) -> Floats:
+def straight(a: Floats, b: Floats, step_m: float) -> Floats:
     """Points from a towards b, without b."""
     count = max(1, round(float(np.linalg.norm(b - a)) / step_m))
     return a + np.linspace(0, 1, count + 1)[:-1, None] * (b - a)

@@ -61,6 +61,7 @@ class Kind(IntEnum):
     TRUCK = 15
     PERSON = 16
     CYCLIST = 17
+    CONTAINER = 18
 
 
 # kind -> (SemanticKITTI id at rest, the same when moving, Cityscapes trainId)
@@ -83,13 +84,14 @@ _CODES: Final = {
     Kind.TRUCK: (18, 258, 14),
     Kind.PERSON: (30, 254, 11),
     Kind.CYCLIST: (31, 253, 12),
+    Kind.CONTAINER: (99, 99, 255),
 }
 
 RAW_IDS: Final[npt.NDArray[np.uint32]] = np.array([_CODES[kind][:2] for kind in Kind], np.uint32).T.copy()
 """(2, kinds): the SemanticKITTI id of a kind at rest and moving."""
 
 TRAIN_IDS: Final[npt.NDArray[np.uint8]] = np.array([_CODES[kind][2] for kind in Kind], np.uint8)
-"""(kinds,): the Cityscapes trainId of a kind; nothing at all is sky, parking is void as in Cityscapes."""
+"""(kinds,): the Cityscapes trainId of a kind; nothing is sky, parking and containers are void as in Cityscapes."""
 
 # Reflectance at normal incidence; painted signs and lamps are retro-reflectors.
 _REFLECTANCES: Final = {

@@ -29,7 +29,7 @@ _GREENS: list[Colour] = [
     (0.30, 0.34, 0.11),
     (0.36, 0.30, 0.10),
 ]
-_GREY: Colour = (0.30, 0.31, 0.32)
+GREY: Colour = (0.30, 0.31, 0.32)
 _LOT_DEPTH_M = 14.0
 
 
@@ -71,7 +71,7 @@ class Town:
 
 
 @dataclass(eq=False)
-class _Builder:
+class Builder:
     """State of the construction of a town."""
 
     rng: np.random.Generator
@@ -118,7 +118,7 @@ def build_town(seed: int, crossings: int = 3) -> Town:
     streets = lay_streets(rng)
     route = random_route(streets, crossings, np.random.default_rng([seed, 3]))
     bare = _ground(streets, route, rng)
-    builder = _Builder(rng, [*models.cars(), models.lamp_post(), models.traffic_light(), models.sign()], [])
+    builder = Builder(rng, [*models.cars(), models.lamp_post(), models.traffic_light(), models.sign()], [])
     builder.models += [models.bollard(), models.person(), models.cyclist()]
     for k in range(7):
         height, reach = rng.uniform(4.4, 8.5), rng.uniform(2.2, 3.1)
@@ -185,7 +185,7 @@ def _plan(route: list[Node]) -> dict[tuple[tuple[Node, Node], bool], tuple[str, 
     return plan
 
 
-def _line_with_lots(builder: _Builder, side: Side, ground: Ground, first: list[str]) -> None:
+def _line_with_lots(builder: Builder, side: Side, ground: Ground, first: list[str]) -> None:
     """Houses, gardens, parks and parking areas behind the sidewalk, side by side."""
     rng, w = builder.rng, ground.sidewalk_width
     along, end = (w, side.length - w) if side.deep else (w + _LOT_DEPTH_M, side.length - w - _LOT_DEPTH_M)
@@ -206,7 +206,7 @@ def _line_with_lots(builder: _Builder, side: Side, ground: Ground, first: list[s
         along += width
 
 
-def _house(builder: _Builder, side: Side, along: float, width: float, depth: float) -> None:
+def _house(builder: Builder, side: Side, along: float, width: float, depth: float) -> None:
     rng = builder.rng
     storeys, reach = int(rng.integers(2, 5)), float(rng.uniform(8.5, 10.5))
     balconies = [
@@ -219,7 +219,7 @@ def _house(builder: _Builder, side: Side, along: float, width: float, depth: flo
     builder.put(side, model, along + width / 2, depth, builder.pick(_FACADES))
 
 
-def _garden(builder: _Builder, side: Side, along: float, width: float, depth: float, edge: str) -> None:
+def _garden(builder: Builder, side: Side, along: float, width: float, depth: float, edge: str) -> None:
     """A house behind a front garden, with a wall, fence or hedge to the street and trees that touch it."""
     rng, middle = builder.rng, along + width / 2
     setback = float(rng.uniform(3.6, 4.8))
@@ -236,7 +236,7 @@ def _garden(builder: _Builder, side: Side, along: float, width: float, depth: fl
         builder.put(side, bush, float(at), depth + setback - 0.7, builder.pick(_GREENS))
 
 
-def _park(builder: _Builder, side: Side, along: float, width: float, depth: float) -> None:
+def _park(builder: Builder, side: Side, along: float, width: float, depth: float) -> None:
     rng = builder.rng
     for _ in range(int(width / 3)):
         builder.tree(
@@ -248,7 +248,7 @@ def _park(builder: _Builder, side: Side, along: float, width: float, depth: floa
         builder.put(side, bush, along + float(at), depth + float(inwards), builder.pick(_GREENS))
 
 
-def _court(builder: _Builder, side: Side, along: float, width: float, depth: float) -> None:
+def _court(builder: Builder, side: Side, along: float, width: float, depth: float) -> None:
     """Parking bays across the street's direction in front of a wall with trees."""
     rng = builder.rng
     a, b = side.at(along, depth), side.at(along + width, depth + 6.2)
@@ -266,7 +266,7 @@ def _court(builder: _Builder, side: Side, along: float, width: float, depth: flo
         builder.tree(side, float(at), depth + 7.6)
 
 
-def _furnish(builder: _Builder, side: Side, parking: str, trees: bool) -> None:
+def _furnish(builder: Builder, side: Side, parking: str, trees: bool) -> None:
     """Things along one kerb: parked cars, trees, lamps, signs, bollards."""
     rng = builder.rng
     if parking != "none":
@@ -276,14 +276,14 @@ def _furnish(builder: _Builder, side: Side, parking: str, trees: bool) -> None:
             builder.tree(side, float(at), 0.85)
     depth = 2.85 if parking == "sidewalk" else 0.45  # where the cars leave room for posts
     for at in np.arange(12.5, side.length - 6.0, 27.0):
-        builder.put(side, LAMP_POST, float(at), depth, _GREY)
-    builder.put(side, SIGN, float(rng.uniform(9.0, side.length - 9.0)), depth, _GREY, np.pi)
+        builder.put(side, LAMP_POST, float(at), depth, GREY)
+    builder.put(side, SIGN, float(rng.uniform(9.0, side.length - 9.0)), depth, GREY, np.pi)
     if parking == "none":
         for at in np.arange(14.0, min(26.0, side.length - 12.0), 1.8):
-            builder.put(side, BOLLARD, float(at), 0.35, _GREY)
+            builder.put(side, BOLLARD, float(at), 0.35, GREY)
 
 
-def _park_row(builder: _Builder, side: Side, on_sidewalk: bool, tight: bool) -> None:
+def _park_row(builder: Builder, side: Side, on_sidewalk: bool, tight: bool) -> None:
     """Cars along the kerb, most of them in the direction of the lane; `tight`: bumper to bumper."""
     rng = builder.rng
     shares = [0.35, 0.22, 0.2, 0.13, 0.1, 0.0] if on_sidewalk else [0.32, 0.22, 0.2, 0.13, 0.1, 0.03]
@@ -301,7 +301,7 @@ def _park_row(builder: _Builder, side: Side, on_sidewalk: bool, tight: bool) -> 
             along += float(rng.uniform(3.0, 6.5))
 
 
-def _signals(builder: _Builder, streets: Streets) -> None:
+def _signals(builder: Builder, streets: Streets) -> None:
     """A traffic light on the right before every crossing, for each of the four approaches."""
     for i, u in enumerate(streets.u):
         for j, v in enumerate(streets.v):
@@ -311,4 +311,4 @@ def _signals(builder: _Builder, streets: Streets) -> None:
                 (u - hu - 7.6, v - hv - 0.6, 0.0), (u + hu + 7.6, v + hv + 0.6, np.pi),
             ]  # fmt: skip
             for x, y, heading in approaches:
-                builder.things.append(Thing(TRAFFIC_LIGHT, float(x), float(y), heading, _GREY))
+                builder.things.append(Thing(TRAFFIC_LIGHT, float(x), float(y), heading, GREY))

@@ -1,14 +1,15 @@
 """Traffic: the recording vehicle on its route, and other moving objects without collisions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from factor_graphs.simulation import Motion, follow
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.streets import LANE_M, STOP_LINE_M, Node, lane_path
+from gnss_sem_map.simulation.streets import LANE_M, STOP_LINE_M, Node, lane_path, straight
 from gnss_sem_map.simulation.town import CAR_COLOURS, CYCLIST, PERSON, Colour, Thing, Town
 from gnss_sem_map.simulation.world import Mover
 
@@ -16,6 +17,7 @@ IMU_HEIGHT_M = 0.93
 EARLY_S, LATE_S = 0.6, 1.0  # how long before and after the drive everybody's motion is known
 _GREEN_S = 10.5  # when the light at the first crossing turns green
 _START_M = 56.0  # how far before the first crossing the drive begins
+_WEAVE_M, _WEAVE_EVERY_M = 0.2, 25.0
 _GAIN, _BRAKE, _SIDEWAYS = 1.5, 1.8, 2.0  # m/s2
 _CLOTHES: list[Colour] = [
     (0.5, 0.08, 0.08),
@@ -131,15 +133,42 @@ class _Crowd:
         return True
 
 
-def drive_through(town: Town, seconds: float, seed: int) -> tuple[Town, Motion, list[Mover]]:
-    """The town (without the car that leaves its bay), the recording vehicle's exact motion, and all other movers.
+def lap_length(town: Town) -> float:
+    """Length of one lap of a route around the block, m."""
+    rest = replace(town, route=town.route[4:])
+    return float(_path(town, _own_lane(town)).way[-1] - _path(town, _own_lane(rest)).way[-1])
 
-    They are: one who drives ahead, one behind, some who wait at the light of the first crossing and some who pass it,
-    oncoming and stop-and-go traffic, a car that creeps out of a bay, cyclists and people on foot.
-    """
-    rng = np.random.default_rng([seed, 4])
-    before = (2 * town.route[0][0] - town.route[1][0], 2 * town.route[0][1] - town.route[1][1])
-    own = _path(town, lane_path(town.streets, [before, *town.route]))
+
+def lap_seconds(town: Town, laps: int) -> float:
+    """How long so many laps around the block take, in whole tenths of a second."""
+    stamps = np.arange(0.0, 120.0 * laps, 0.1)
+    way = _ride(town, _path(town, _own_lane(town)), 120.0 * laps).way(stamps)
+    return round(float(stamps[np.searchsorted(way, laps * lap_length(town))]), 1)
+
+
+def _own_lane(town: Town) -> Floats:
+    """The lane of the recording vehicle, (k, 2) in town axes, from one crossing before its route."""
+    return lane_path(town.streets, [_before(town), *town.route])
+
+
+def _before(town: Town) -> Node:
+    a, b = town.route[:2]
+    return 2 * a[0] - b[0], 2 * a[1] - b[1]
+
+
+def _weaving(uv: Floats, rng: np.random.Generator) -> Floats:
+    """A way as people drive it: some decimetres to the left and right of the lane's middle."""
+    course = np.gradient(uv, axis=0)
+    course /= np.linalg.norm(course, axis=1, keepdims=True)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(uv, axis=0), axis=1))])
+    knots = np.arange(0.0, way[-1] + 2 * _WEAVE_EVERY_M, _WEAVE_EVERY_M)
+    aside = CubicSpline(knots, np.clip(rng.normal(0.0, _WEAVE_M, len(knots)), -0.4, 0.4))(way)
+    return np.asarray(uv + aside[:, None] * course[:, ::-1] * [-1.0, 1.0])
+
+
+def _start_and_line(town: Town, own: _Path) -> tuple[float, float]:
+    """Where on its path the recording vehicle starts, and where the stop line of the first crossing is, m."""
+    before = _before(town)
     first = own.nearest(town.to_map(town.streets.position(town.route[1])[None])[0])
     approach = _length(town, town.route[0], town.route[1])
     length = _length(town, before, town.route[0]) + approach
@@ -149,19 +178,44 @@ def drive_through(town: Town, seconds: float, seed: int) -> tuple[Town, Motion, 
         raise ValueError(
             f"route {town.route[:2]}: the stop line at {line:.1f} m is not behind the start {start:.1f} m"
         )
+    return start, line
+
+
+def _ride(town: Town, own: _Path, seconds: float) -> Motion:
+    """The motion of the recording vehicle on its path."""
+    start, line = _start_and_line(town, own)
     cruise = {"speed": 7.0, "limit": 8.5}
-    ego = _drive(
+    return _drive(
         own, seconds, start=start, stops=_stops(line - 10.2), lift=IMU_HEIGHT_M, suspension_deg=0.25, **cruise
     )
+
+
+def drive_through(
+    town: Town, seconds: float, day: int, *, laps: int = 1, weaves: bool = False
+) -> tuple[Town, Motion, list[Mover]]:
+    """The town (without the car that leaves its bay), the recording vehicle's exact motion, and all other movers.
+
+    They are: one who drives ahead, one behind, some who wait at the light of the first crossing and some who pass it,
+    oncoming and stop-and-go traffic, a car that creeps out of a bay, cyclists and people on foot. `day` is the seed of
+    them all. A vehicle that weaves does not come back to the very same points.
+    """
+    rng = np.random.default_rng([day, 4])
+    lane = _own_lane(town)
+    own = _path(town, lane)
+    usual = ego = _ride(town, own, seconds)
+    if weaves:
+        own = _path(town, _weaving(lane, np.random.default_rng([day, 6])))
+        ego = _ride(town, own, seconds)
+    start, line = _start_and_line(town, own)
     crowd = _Crowd(town, ego, seconds)
     ahead = _drive(own, seconds, start=start + 14.0, stops=_stops(line - 2.6, -1.0), speed=7.0, limit=9.5)
     crowd.admit("leader", 4, CAR_COLOURS[0], ahead)
     behind = _drive(own, seconds, start=start - 13.0, stops=_stops(line - 18.0, 1.3), speed=7.0, limit=8.0)
     crowd.admit("follower", 1, CAR_COLOURS[5], behind)
     _meet_at_the_light(town, crowd, seconds, rng)
-    town = _creep(town, crowd, ego, seconds)
-    _oncoming(town, crowd, seconds, rng)
-    _on_foot(town, crowd, seconds, rng)
+    town = _creep(town, crowd, usual, seconds)  # the same car every day
+    _oncoming(town, crowd, seconds, rng, laps)
+    _on_foot(town, crowd, seconds, rng, laps)
     return town, ego, crowd.movers
 
 
@@ -209,8 +263,11 @@ def _colour(rng: np.random.Generator) -> Colour:
     return CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
 
 
-def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
-    """Traffic against the drive on every street of the route, some of it stop and go; a cyclist on the first."""
+def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
+    """Traffic against the drive on every street of the route, some of it stop and go; a cyclist on the first.
+
+    Who is to be met in a later lap comes from so much farther away.
+    """
     for number, (a, b) in enumerate(pairwise(town.route[1:])):
         step = (b[0] - a[0], b[1] - a[1])
         nodes = _within(town, [(b[0] + k * step[0], b[1] + k * step[1]) for k in (2, 1, 0, -1, -2)])
@@ -221,14 +278,22 @@ def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generato
                 motion = _drive(edge, seconds, start=float(share * edge.way[-1]), speed=4.0, limit=4.2)
                 if crowd.admit("cyclist", CYCLIST, _CLOTHES[1], motion):
                     break
-        path = _path(town, lane)
+        later = seconds / laps * ((number + 1) // 4) if laps > 1 else 0.0
+        far = 7.0 * later
+        path = _path(town, _from_afar(lane, far))
         for k in range(8):
-            start = float(rng.uniform(0.05, 0.7) * path.way[-1])
-            halt = (start + float(rng.uniform(15, 40)), float(rng.uniform(6, 14)))
+            start = float(rng.uniform(0.05, 0.7) * (path.way[-1] - far))
+            halt = (start + far + float(rng.uniform(15, 40)), later + float(rng.uniform(6, 14)))
             stops = [halt, (halt[0] + 9.0, halt[1] + 5.0)] if k % 3 == 0 else []
             speed = float(rng.uniform(5.5, 8.5))
             motion = _drive(path, seconds, start=start, speed=speed, limit=speed + 1.0, stops=stops)
             crowd.admit("stop and go" if stops else "oncoming", int(rng.integers(0, 6)), _colour(rng), motion)
+
+
+def _from_afar(uv: Floats, metres: float) -> Floats:
+    """A straight way that begins so much earlier."""
+    course = (uv[-1] - uv[0]) / np.linalg.norm(uv[-1] - uv[0])
+    return np.concatenate([straight(uv[0] - metres * course, uv[0], 1.5), uv]) if metres else uv
 
 
 def _shifted(uv: Floats, right: float) -> Floats:
@@ -275,9 +340,10 @@ def _depth(town: Town, uv: Floats) -> float:
     return float(min((np.abs(v[0] - u.u) - u.half_u).min(), (np.abs(v[1] - u.v) - u.half_v).min()))
 
 
-def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
+def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
     """People on both sidewalks of the route, and one on the zebra while the drive waits."""
-    for a, b in zip(town.route[:-1], town.route[1:], strict=True):
+    route, reach = (town.route, 60.0) if laps == 1 else (town.route[:5], 60.0 + 1.5 * seconds)
+    for a, b in pairwise(route):
         pa, pb = town.streets.position(a), town.streets.position(b)
         course = (pb - pa) / np.linalg.norm(pb - pa)
         right = np.array([course[1], -course[0]])
@@ -286,7 +352,7 @@ def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator
             way = float(rng.uniform(14.0, np.linalg.norm(pb - pa) - 16.0))
             here = pa + course * way + (right if k % 2 else -right) * out
             towards = course if rng.random() < 0.5 else -course
-            line = here + np.arange(0.0, 60.0, 1.5)[:, None] * towards
+            line = here + np.arange(0.0, reach, 1.5)[:, None] * towards
             speed = float(rng.uniform(1.0, 1.5))
             motion = _drive(_path(town, line), seconds, start=0.0, speed=speed, limit=speed)
             crowd.admit("walks", PERSON, _CLOTHES[k % 5], motion)

@@ -1,5 +1,6 @@
 """Truth of a drive: trajectory, poses of all vehicles, and the labels of each scan by its image."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from gnss_sem_map.simulation.camera import SimulatedImage
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.models import Model
 from gnss_sem_map.simulation.rig import T_LIDAR_IMU
+from gnss_sem_map.simulation.sessions import Change
 from gnss_sem_map.simulation.tracklets import Box, Tracklet
 from gnss_sem_map.simulation.world import World
 
@@ -60,6 +62,22 @@ def write_vehicles(
                 f"{length:.3f},{width:.3f},{height:.3f}\n"
             )
     path.write_text("".join(lines))
+
+
+def write_changes(
+    path: Path, session: int, changes: list[Change], to_map: Callable[[Floats], Floats]
+) -> None:
+    """What came and went since session 0, as boxes."""
+    rows = []
+    for change in changes:
+        (x, y, z), (length, width, height) = to_map(change.centre[None])[0], change.size
+        rows.append({
+            "change": "appeared" if change.appeared else "vanished", "cause": change.cause, "name": change.name,
+            "labels": list(change.labels), "x_m": round(x, 4), "y_m": round(y, 4), "z_m": round(z, 4),
+            "yaw_rad": round(change.yaw, 6), "length_m": round(length, 3), "width_m": round(width, 3),
+            "height_m": round(height, 3),
+        })  # fmt: skip
+    path.write_text(json.dumps({"session": session, "since": 0, "changes": rows}, indent=1) + "\n")
 
 
 def _everybody(world: World) -> list[tuple[int, str, Model, bool]]:

@@ -46,9 +46,12 @@ def read_rows(path: Path, expected: dict[str, int]) -> dict[str, Array]:
 def _pykitti_utils() -> ModuleType:
     """`pykitti.utils` alone: `import pykitti` imports pandas, which takes 0.4 s and 40 MB of every process."""
     package = find_spec("pykitti")
-    assert package is not None and package.submodule_search_locations is not None
-    spec = spec_from_file_location("pykitti.utils", Path(package.submodule_search_locations[0], "utils.py"))
-    assert spec is not None and spec.loader is not None
+    assert package is not None
+    folders = package.submodule_search_locations
+    assert folders is not None
+    spec = spec_from_file_location("pykitti.utils", Path(folders[0], "utils.py"))
+    assert spec is not None
+    assert spec.loader is not None
     utils = module_from_spec(spec)
     spec.loader.exec_module(utils)
     return utils

@@ -45,7 +45,7 @@ class RawMap:
         return found
 
     @cached_property
-    def _static(self) -> tiles.Recent:
+    def _static(self) -> tiles.Recent[VoxelMap]:
         """Reads the voxels of a tile without the points that moved."""
         moved = self.evidence.moved
 

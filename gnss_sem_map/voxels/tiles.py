@@ -6,11 +6,12 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,12 +29,11 @@ from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
+Piece = TypeVar("Piece", bound=Sized)
 Z_ORDER_BITS = AXIS_BITS - TILE_BITS
-TILES_HELD = 6
-"""Tiles of a map with all that is decided about them in memory at a time: several exports read each."""
 VOXELS_HELD = 1_000_000
-"""Voxels in memory at a time, 40 MB: a tile is read again with its neighbours, and a small map is read once. Those of
-a large tile at work are among them, see `Recent.leave_room`."""
+"""Voxels in memory at a time, 40 to 60 MB: a tile is read again with its neighbours and by every export, and a small
+map is read once. Those of a large tile at work are among them, see `Recent.leave_room`."""
 
 
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
@@ -139,10 +139,9 @@ def in_memory(semantic_map: SemanticMap, frame: LocalFrame | None = None) -> Til
 def open_map(
     folder: Path,
     label_set: LabelSet | None = None,
-    held: int = TILES_HELD,
     voxels_held: int = VOXELS_HELD,
 ) -> TiledMap:
-    """A map on disk, of which the tiles read last are held; without `label_set` the class set is the one that it names.
+    """A map on disk; of its tiles those read last are held. Without `label_set` the class set is the one that it names.
 
     Raises DataError when `map.json` is damaged, a tile is missing, or the classes differ; reading raises it for a
     damaged tile.
@@ -171,27 +170,33 @@ def open_map(
         label_set,
         read_frame(folder),
         tuple(sorted(names)),
-        lru_cache(held)(lambda tile: tile_files.read(*of(tile))),
+        Recent(lambda tile: tile_files.read(*of(tile)), voxels_held),
         Recent(lambda tile: tile_files.read_voxels(*of(tile)), voxels_held),
     )
 
 
-class Recent:
-    """Reads tiles, and holds those read last, up to so many voxels."""
+class Recent(Generic[Piece]):
+    """Reads tiles, and holds those read last, up to so many voxels; threads may read at the same time."""
 
-    def __init__(self, read: Callable[[Tile], VoxelMap], most: int = VOXELS_HELD) -> None:
-        self._read, self._most, self._held = read, most, dict[Tile, VoxelMap]()
+    def __init__(self, read: Callable[[Tile], Piece], most: int = VOXELS_HELD) -> None:
+        self._read, self._most, self._held, self._lock = read, most, dict[Tile, Piece](), Lock()
 
-    def __call__(self, tile: Tile) -> VoxelMap:
-        voxels = self._held.pop(tile) if tile in self._held else self._read(tile)
-        self._held[tile] = voxels  # the last one
+    def __call__(self, tile: Tile) -> Piece:
+        with self._lock:
+            piece = self._held.get(tile)
+        if piece is None:
+            piece = self._read(tile)
+        with self._lock:
+            self._held.pop(tile, None)
+            self._held[tile] = piece  # the last one
         self.leave_room(0)
-        return voxels
+        return piece
 
     def leave_room(self, voxels: int) -> None:
         """Hold fewer by so many."""
-        while self._held and sum(map(len, self._held.values())) > self._most - voxels:
-            del self._held[next(iter(self._held))]
+        with self._lock:
+            while self._held and sum(map(len, self._held.values())) > self._most - voxels:
+                del self._held[next(iter(self._held))]
 
 
 def read(

@@ -12,6 +12,7 @@ from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
+from gnss_sem_map.memory import release_memory
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,15 @@ FORMATS = (
 
 def write_exports(exported: Exported, folder: Path) -> None:
     """All files that can be written of a map: two at a time of a small one, as each takes memory with its size."""
+
+    def write(one: Format) -> None:
+        one.write(exported, folder / one.file)
+        release_memory()  # 50 MB of each
+
     possible = [each for each in FORMATS if exported.map.frame is not None or each.name != "geotiff"]
     _ = exported.extent  # once, before both threads ask for it
     with ThreadPoolExecutor(2 if exported.extent.count < SMALL else 1) as pool:
         # the last takes longest, so it begins
-        writing = [pool.submit(each.write, exported, folder / each.file) for each in reversed(possible)]
+        writing = [pool.submit(write, one) for one in reversed(possible)]
     for each in writing:
         each.result()

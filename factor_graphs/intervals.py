@@ -45,6 +45,19 @@ class ImuIntervals:
         """Length of every step, (n,) s."""
         return np.diff(self.nodes)
 
+    def part(self, first: int, last: int) -> "ImuIntervals":
+        """From one keyframe to another."""
+        bounds = self.bounds[first : last + 1]
+        steps = slice(bounds[0], bounds[-1])
+        return ImuIntervals(
+            self.keyframes[first : last + 1],
+            bounds - bounds[0],
+            self.nodes[bounds[0] : bounds[-1] + 1],
+            self.specific_force[steps],
+            self.angular_rate[steps],
+            self.blind[first:last],
+        )
+
     def noise(self, noise: ImuNoise) -> list[ImuNoise]:
         """The noise of every interval: `noise`, or where the IMU is silent what a vehicle may do unseen."""
         spans = np.diff(self.keyframes)

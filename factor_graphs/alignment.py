@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -82,8 +81,16 @@ def spline_through(fixes: GnssFixes, intervals: ImuIntervals) -> tuple[Array, Ar
         np.add.at(weighted[axis], row, information * (fixes.positions[:, axis] - origin[axis]))
         right = np.column_stack([weighted[axis], np.zeros(len(knots))]).ravel()
         states[:, :, axis] = solveh_banded(of_axis, right, lower=True).reshape(-1, 2)
-    spline = CubicHermiteSpline(stamps, states[:, 0] + origin, states[:, 1])
-    return spline(intervals.keyframes), spline(intervals.keyframes, 1)
+    return _between(intervals.keyframes, stamps, states[:, 0] + origin, states[:, 1])
+
+
+def _between(t: Array, knots: Array, p: Array, v: Array) -> tuple[Array, Array]:
+    """Position and velocity on the cubics through knots; importing scipy's takes 0.2 s, 1 % of a run of 30 s."""
+    i = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2)
+    h = np.diff(knots)[i, None]
+    u, step, a, b = (t - knots[i])[:, None] / h, p[i + 1] - p[i], v[i] * h, v[i + 1] * h
+    square, cube = 3 * step - 2 * a - b, a + b - 2 * step
+    return p[i] + u * (a + u * (square + u * cube)), (a + u * (2 * square + 3 * u * cube)) / h
 
 
 def _motion_bands(dt: Array) -> Array:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from factor_graphs.chi_square import probability_below
 
@@ -64,6 +63,8 @@ def explain(
     `y` (k,) m/s; `by` (k, n); `stddevs` (n,) is what x may be at all; `ahead` (k,) m/s is the speed; `grows_with`
     (k, 3) and `spacing` (k,) s as in `Slip.stddevs`.
     """
+    from scipy.optimize import nnls  # takes 0.2 s to import; a drive with LiDAR does without
+
     x: Array = np.zeros(len(stddevs))
     window = (np.cumsum(spacing) / DRIFT_S).astype(int)
     left, drift, parts = y, np.zeros(window[-1] + 1), np.zeros(3)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import (
@@ -8,6 +9,7 @@ from factor_graphs.alignment import (
     START_POSITION_STDDEV,
     START_SPEED_STDDEV,
     AttitudePrior,
+    _between,
     first_guess,
     spline_through,
 )
@@ -96,3 +98,13 @@ def test_without_motion_the_heading_comes_from_what_is_known():
     np.testing.assert_allclose(T[:, :3, :3], np.tile(known, (len(T), 1, 1)), atol=1e-6)
     T, _ = first_guess(cut, fixes, np.zeros(3))
     np.testing.assert_allclose(headings(T), 0.0, atol=1e-9)
+
+
+def test_between_knots_the_motion_is_the_cubic_of_scipy():
+    rng = np.random.default_rng(0)
+    knots, p, v = np.sort(rng.uniform(0, 9, 7)), rng.standard_normal((7, 3)), rng.standard_normal((7, 3))
+    t = np.linspace(knots[0], knots[-1], 50)
+    spline = CubicHermiteSpline(knots, p, v)
+    positions, velocities = _between(t, knots, p, v)
+    np.testing.assert_allclose(positions, spline(t), atol=1e-12)
+    np.testing.assert_allclose(velocities, spline(t, 1), atol=1e-11)

@@ -1,6 +1,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factor_graphs import dense as dense_module
 from factor_graphs.dense import densify
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import split
@@ -48,6 +49,16 @@ def test_it_passes_through_every_keyframe_with_its_velocity_and_covariance_and_w
     np.testing.assert_allclose(dense.covariances[at], keyframes.covariances, atol=1e-9)
     moved = np.diff(dense.positions, axis=0) / np.diff(dense.stamps)[:, None]
     np.testing.assert_allclose(moved, (dense.velocities[1:] + dense.velocities[:-1]) / 2, atol=0.02)
+
+
+def test_blocks_change_nothing(simulate, monkeypatch):
+    drive = simulate(2, seconds=20.0)
+    _, _, whole = dense_of(drive, disturb=0.1)
+    for block in (1, 150, 777):
+        monkeypatch.setattr(dense_module, "BLOCK", block)
+        _, _, parts = dense_of(drive, disturb=0.1)
+        for name in ("stamps", "T_map_imu", "velocities", "covariances"):
+            np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), atol=1e-11)
 
 
 def test_covariances_between_keyframes_are_covariances_and_no_smaller_than_the_mixture_of_both_ends(simulate):

@@ -49,8 +49,8 @@ DASK_SETTINGS = {
     "GNSS_SEM_MAP_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
-    "MALLOC_TRIM_THRESHOLD_": f"{128 << 20}",
-    "MALLOC_MMAP_THRESHOLD_": f"{32 << 20}",
+    "MALLOC_TRIM_THRESHOLD_": f"{64 << 20}",
+    "MALLOC_MMAP_THRESHOLD_": f"{8 << 20}",
 }
 """Environment of the workers."""
 TILED = ("trajectory", "mapping", "refinement")

@@ -26,16 +26,12 @@ def non_holonomic_factors(
 ) -> Iterator[gtsam.NonlinearFactor]:
     """The axle slides by `stddevs` (k, 2) m/s, lateral and vertical, linearised at `values`, which `motion` is of.
 
-    The mounting, M(k), is one unknown of all rows, and has a prior. With v_imu = Rᵀ v and R perturbed on the right,
-    d v_imu = [v_imu]× dθ + Rᵀ dv.
+    The mounting, M(k), is one unknown of all rows, and has a prior.
     """
     k, unit = len(stddevs), gtsam.noiseModel.Unit.Create(2)
     mounting, scale = values.atVector(M(k)), 1 / stddevs[:, :, None]
-    across = motion.by_velocity(mounting)
-    by_pose, by_mounting = np.zeros((k, 2, 6)), -motion.by_mounting()
-    by_pose[:, :, :3] = across @ np.cross(motion.velocity[:, None], np.eye(3)).swapaxes(1, 2)
-    by_velocity = across @ motion.R_imu_map
-    by_pose, by_velocity, by_mounting = by_pose * scale, by_velocity * scale, by_mounting * scale
+    by_state, by_mounting = motion.by_state(mounting) * scale, -motion.by_mounting() * scale
+    by_pose, by_velocity = by_state[:, :, :6], by_state[:, :, 6:]
     off = -motion.sliding(mounting) / stddevs
     for i in range(k):
         row = gtsam.JacobianFactor(X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit)

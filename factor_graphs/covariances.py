@@ -80,13 +80,50 @@ def split_key(key: int) -> tuple[int, int]:
     return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
 
+class SumVariance:
+    """Variance of sums of G x over the keyframes of a window, and of G s of what all keyframes share.
+
+    `rows` (k, m, 15) are G of every keyframe and `windows` (k,) its window, -1 for none; `of_shared` (w, m, 4) are G of
+    the mounting. `found` (w, m) is known once `keyframe_covariances` has gone through all keyframes.
+    """
+
+    def __init__(self, rows: Array, windows: NDArray[np.intp], of_shared: Array) -> None:
+        self.found = np.zeros(of_shared.shape[:2])
+        self._rows, self._windows, self._of_shared = rows, windows, of_shared
+        self._first = {int(w): int(i) for i, w in reversed(list(enumerate(windows))) if w >= 0}
+        self._sum = np.zeros((rows.shape[1], rows.shape[1]))
+        self._beside = np.empty((0, rows.shape[1]))
+        """Covariance of the keyframes known, in their order, and the sum."""
+
+    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None:
+        """Keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`."""
+        later = self._beside[rows] if len(self._beside) else np.zeros((len(rows), len(self._sum)))
+        own, window = -W @ later, int(self._windows[i])
+        if window >= 0:
+            G = self._rows[i]
+            both = G @ own
+            self._sum += G @ joint[:SIZE, :SIZE] @ G.T + both + both.T
+            own, later = own + joint[:SIZE, :SIZE] @ G.T, later + joint[SIZE:, :SIZE] @ G.T
+        self._beside = np.vstack([own, later])
+        if window >= 0 and self._first[window] == i:
+            self._finish(window, joint, known)
+
+    def _finish(self, window: int, joint: Array, known: list[int]) -> None:
+        G = self._of_shared[window]
+        place = SIZE * known.index(len(self._windows)) + np.arange(G.shape[1])
+        both = G @ self._beside[place]
+        total = self._sum + G @ joint[np.ix_(place, place)] @ G.T + both + both.T
+        self.found[window] = total.diagonal()
+        self._sum[:], self._beside = 0.0, np.empty((0, len(self._sum)))
+
+
 def keyframe_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, sums: SumVariance | None = None
 ) -> tuple[Array, Array]:
     """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k) and W(k), where they are.
 
     M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
-    eliminated last, as if they were one more keyframe.
+    eliminated last, as if they were one more keyframe. `sums` finds the variance of sums over keyframes on the way.
     """
     shared = tuple(key for key in (M(k), gtsam.symbol("w", k)) if values.exists(key))
     net = list(eliminate(graph.linearize(values), k, shared))
@@ -106,21 +143,22 @@ def keyframe_covariances(
     for i in reversed(range(k)):
         R, later, S = _of_keyframe(i, net[3 * i : 3 * i + 3])
         own, _ = dtrtri(R)
-        W = own @ S
-        joint = _of(later, known, joint)
+        W, rows = own @ S, _rows(later, known)
+        joint = joint[np.ix_(rows, rows)]
         cross = -W @ joint
         covariance = own @ own.T - cross @ W.T
         covariances[i] = (covariance + covariance.T) / 2
         joint = np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
         known = [i, *later]
+        if sums is not None:
+            sums.add(i, W, rows, joint, known)
     return covariances, of_shared
 
 
-def _of(keyframes: list[int], known: list[int], joint: Array) -> Array:
-    """The joint covariance of some of the keyframes."""
+def _rows(keyframes: list[int], known: list[int]) -> NDArray[np.intp]:
+    """Where some of the keyframes stand in the joint covariance of those known."""
     first = SIZE * np.array([known.index(i) for i in keyframes], np.intp)
-    rows = (first[:, None] + np.arange(SIZE)).ravel()
-    return np.asarray(joint[np.ix_(rows, rows)], np.float64)
+    return (first[:, None] + np.arange(SIZE)).ravel()
 
 
 def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Array]:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from factor_graphs.calibration import Calibration, correct
 from factor_graphs.constraints import non_holonomic_factors, standing, zero_velocity_factors
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.problem import Fit, Problem, first_values, motion_graph, optimise
+from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
+from factor_graphs.slip import Slip
+from factor_graphs.slip_variance import found_slip
 from factor_graphs.vehicle import Vehicle, body_motion, observe, with_mounting
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
 
@@ -26,16 +28,21 @@ INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
-# The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip by this share.
-CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
+# The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip of wheels by
+# this share. Until then the cost need not be better than so much of itself: the next solution begins there.
+CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP, ROUGH = 4, 0.3, 0.2, 1e-3
 
 
 def fit_noise(
-    problem: Problem, start: Fit | None = None, constraints: list[gtsam.NonlinearFactor] | None = None
+    problem: Problem,
+    start: Fit | None = None,
+    constraints: list[gtsam.NonlinearFactor] | None = None,
+    tolerance: float = RELATIVE_TOLERANCE,
 ) -> Fit:
     """Inflate the IMU noise, from the sensor's own or from `start`, until chi2 per degree of freedom fits.
 
-    The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only.
+    The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only. `tolerance` as
+    in `optimise`.
     """
     loss = "huber" if problem.settings.robust else "quadratic"
     inflation, motion, values = (
@@ -43,16 +50,15 @@ def fit_noise(
         if start is None
         else (start.inflation, start.motion, start.values)
     )
-    fit = optimise(problem, motion, values, inflation, loss, constraints or [])
+    fit = optimise(problem, motion, values, inflation, loss, constraints or [], tolerance)
     if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
         return fit
     stiff, loosest = fit, MAX_INFLATION
     for _ in range(INFLATION_ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
-        fit = optimise(
-            problem, motion_graph(problem, inflation), fit.values, inflation, loss, constraints or []
-        )
+        motion = motion_graph(problem, inflation)
+        fit = optimise(problem, motion, fit.values, inflation, loss, constraints or [], tolerance)
         if FITTING_CHI2[0] <= fit.chi2_per_dof <= (INFLATED_CHI2 if start is None else FITTING_CHI2[1]):
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
@@ -94,7 +100,7 @@ def constrain(
 ) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
     """Add what a road vehicle cannot do, and what its wheels say, linearised at the solution, and again at the next.
 
-    Slip is looked at again as well, for a heading that drifts looks like slip until it is held; and the IMU's noise,
+    Slip is looked at again once it is held, for a heading that drifts looks like slip until then; and the IMU's noise,
     which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
     settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
@@ -113,8 +119,10 @@ def constrain(
     rolling = wheels if wheels is not None and (settings.wheel_speed == "on" or not wheels.doubt) else None
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
+    slip: tuple[Slip, Slip] | None = None
+    known: tuple[Slip, Slip] | None = None
     settled = axle is None and rolling is None
-    for _ in range(CONSTRAINT_ROUNDS):
+    for n in range(CONSTRAINT_ROUNDS):
         stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
         if rolling is not None:
             stands &= ~rolling.readings.moving
@@ -130,19 +138,34 @@ def constrain(
             factors += wheel_factors(fit.values, motion, mounting, rolling)
         if not factors:
             break
-        fit = fit_noise(problem, fit, factors)
+        is_rough, start = axle is not None or rolling is not None, fit
+        fit = fit_noise(problem, fit, factors, ROUGH if is_rough else RELATIVE_TOLERANCE)
+        if axle is not None and known is not None and slip != known and _is_bent(fit, start):
+            fit, slip, axle = start, known, replace(axle, slip=known)
+            vehicle = axle
+            continue
         before, motion = motion, body_motion(problem, fit)
-        if axle is not None or rolling is not None:
+        if is_rough:
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
         if axle is not None:
-            mounting, guessed = fit.values.atVector(M(key)), axle.density
+            mounting, guessed = fit.values.atVector(M(key)), axle
             axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
-            settled &= np.allclose(guessed, axle.density, rtol=SETTLED_SLIP)
+            if n > 0:  # held once, the axle is where it belongs
+                if slip is None:
+                    known = guessed.slip
+                    slip = found_slip(problem, fit, replace(guessed, mounting=mounting))
+                axle = vehicle = replace(axle, slip=slip)
+            settled &= axle.slip == guessed.slip
         if speeds is not None and rolling is not None:
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
     return fit, factors, vehicle, rolling or wheels
+
+
+def _is_bent(fit: Fit, start: Fit) -> bool:
+    """Whether the IMU fits no longer: the constraint is stiffer than the axle."""
+    return fit.inflation > start.inflation or fit.chi2_per_dof > FITTING_CHI2[1]
 
 
 def with_inflation(problem: Problem, fit: Fit, inflation: float) -> Fit:
@@ -154,6 +177,6 @@ def with_inflation(problem: Problem, fit: Fit, inflation: float) -> Fit:
 
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:
     """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
-    if not problem.settings.robust or fit.chi2_per_dof > FITTING_CHI2[1]:
-        return fit
-    return optimise(problem, fit.motion, fit.values, fit.inflation, "truncated", constraints)
+    fits = problem.settings.robust and fit.chi2_per_dof <= FITTING_CHI2[1]
+    loss = "truncated" if fits else fit.loss
+    return optimise(problem, fit.motion, fit.values, fit.inflation, loss, constraints)

@@ -222,8 +222,12 @@ def optimise(
     inflation: float,
     loss: str,
     constraints: Iterable[gtsam.NonlinearFactor] = (),
+    tolerance: float = RELATIVE_TOLERANCE,
 ) -> Fit:
-    """The most probable states, given a loss for the fixes; raises EstimationError when they are not found."""
+    """The most probable states, given a loss for the fixes, until the cost changes by less than `tolerance` of itself.
+
+    Raises EstimationError when they are not found.
+    """
     graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
     T, velocities, _ = from_values(start, len(problem.intervals.keyframes))
     fixes = replace(problem.fixes, positions=problem.antennas_found(T, velocities))
@@ -234,7 +238,7 @@ def optimise(
         graph.push_back(between)
     for constraint in constraints:
         graph.push_back(constraint)
-    values, iterations = _minimise(graph, start, problem.settings.max_iterations)
+    values, iterations = _minimise(graph, start, problem.settings.max_iterations, tolerance)
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)
     return Fit(
@@ -263,7 +267,9 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
     return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
 
 
-def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int) -> tuple[gtsam.Values, int]:
+def _minimise(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+) -> tuple[gtsam.Values, int]:
     """Levenberg-Marquardt; where its damping makes it crawl, undamped steps from where it was.
 
     By QR: Cholesky stalls and throws where a stiff IMU meets weak fixes, in short drives and outages. Where relative
@@ -272,6 +278,7 @@ def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int
     """
     damped, undamped = gtsam.LevenbergMarquardtParams(), gtsam.GaussNewtonParams()
     damped.setMaxIterations(limit)
+    damped.setRelativeErrorTol(tolerance)
     damped.setLinearSolverType("MULTIFRONTAL_QR")
     undamped.setLinearSolverType("MULTIFRONTAL_QR")
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, damped)
@@ -282,10 +289,7 @@ def _minimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int
         newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), optimiser.error()
         for iteration in range(limit, 2 * limit):
             newton.iterate()
-            if (
-                abs(cost - newton.error()) <= RELATIVE_TOLERANCE * cost
-                and newton.error() <= optimiser.error()
-            ):
+            if abs(cost - newton.error()) <= tolerance * cost and newton.error() <= optimiser.error():
                 return newton.values(), iteration
             cost = newton.error()
     except RuntimeError as error:

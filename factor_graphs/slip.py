@@ -9,10 +9,8 @@ from factor_graphs.chi_square import probability_below
 
 Array = NDArray[np.float64]
 
-# Slip is never believed to be less, m/s, for as long, s: a fifth of what a car on a road shows (0.1 m/s sideways).
-# The data cannot replace this bound: block means of residuals that the constraint itself has shrunk keep 0.2 of the
-# variance of such slip sideways, 0.4 vertically. With half of it, a car that slides as much has 70 % of its positions
-# in outages inside their 90 % ellipsoid, with this 89 %; a car that never slides has 97 %.
+# At first, slip is not believed to be less, m/s, for as long, s: a fifth of what a car on a road shows sideways. Once the
+# constraint is held, its residuals say more (`slip_variance.py`).
 LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
 # Means over this time, s, show how long slip lasts: several times as long as it lasts, and dozens in a drive.
 BLOCK_S = 10.0

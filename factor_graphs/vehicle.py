@@ -72,6 +72,16 @@ class BodyMotion:
         rows[:, 1, 0] = -mounting[1]
         return rows
 
+    def by_state(self, mounting: Array) -> Array:
+        """How `sliding` changes with the tangent of the pose and the velocity in the map, (k, 2, 9).
+
+        With v_imu = Rᵀ v and R perturbed on the right, d v_imu = [v_imu]× dθ + Rᵀ dv.
+        """
+        across, rows = self.by_velocity(mounting), np.zeros((len(self.velocity), 2, 9))
+        rows[:, :, :3] = across @ np.cross(self.velocity[:, None], np.eye(3)).swapaxes(1, 2)
+        rows[:, :, 6:] = across @ self.R_imu_map
+        return rows
+
     def grows_with(self) -> Array:
         """What the variance of slip grows with: nothing, speed squared, lateral acceleration squared, (k, 3)."""
         speed = self.velocity[:, 0]
@@ -151,8 +161,7 @@ def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
 
 def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     """The vehicle that a solution shows where it is well determined: moving, and beside a fix that fits."""
-    moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
-    where = moving & beside_fixes(problem, fit)
+    where = where_seen(problem, fit, motion)
     seen, skids = motion[where], np.zeros((len(where), 2))
     time, way = seen.spacing.sum(), np.linalg.norm(seen.velocity, axis=1) @ seen.spacing
     if time < LEAST_TIME_S or way < LEAST_WAY_M:
@@ -182,6 +191,12 @@ def _doubt(mounting: Array, motion: BodyMotion) -> str:
     if max(lateral, vertical) > MOST_SLIP:
         return f"it slides {100 * lateral:.0f} % of its speed sideways, {100 * vertical:.0f} % vertically"
     return ""
+
+
+def where_seen(problem: Problem, fit: Fit, motion: BodyMotion) -> NDArray[np.bool_]:
+    """The keyframes (k,) at which slip is seen: moving, and beside a fix that fits."""
+    moving = np.linalg.norm(motion.velocity, axis=1) > MOVING_SPEED
+    return np.asarray(moving & beside_fixes(problem, fit))
 
 
 def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:

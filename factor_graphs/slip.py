@@ -9,8 +9,8 @@ from factor_graphs.chi_square import probability_below
 
 Array = NDArray[np.float64]
 
-# At first, slip is not believed to be less, m/s, for as long, s: a fifth of what a car on a road shows sideways. Once the
-# constraint is held, its residuals say more (`slip_variance.py`).
+# At first, slip is not believed to be less, m/s, for as long, s: a fifth of what a car on a road shows sideways. Once
+# the constraint is held, its residuals say more (`slip_variance.py`).
 LEAST_SLIP, LEAST_LASTING_S = 0.02, 1.0
 # Means over this time, s, show how long slip lasts: several times as long as it lasts, and dozens in a drive.
 BLOCK_S = 10.0

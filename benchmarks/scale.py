@@ -119,9 +119,9 @@ class Drives:
 
 
 def memory(drives: Drives, out: Path) -> Figures:
-    """Peak memory and time of a short and of a long drive, one worker."""
+    """Peak memory and time of drives of growing length, one worker: from some chunks on, memory does not grow."""
     found: Figures = {}
-    for seconds in (60, 480):
+    for seconds in (60, 120, 240, 480):
         words = drives.words(drives.of(seconds)[:1], out / f"{seconds}", "--workers", "1")
         figures = run(words)
         about = json.loads((out / f"{seconds}" / "run.json").read_text())
@@ -133,7 +133,8 @@ def memory(drives: Drives, out: Path) -> Figures:
             f"seconds_by_stage_{seconds}_s": about["seconds"],
             f"sizes_{seconds}_s": sizes(out / f"{seconds}"),
         }
-    found["peak_480_over_60"] = found["peak_mb_480_s"] / found["peak_mb_60_s"]
+    for seconds in (60, 120, 240):
+        found[f"peak_480_over_{seconds}"] = found["peak_mb_480_s"] / found[f"peak_mb_{seconds}_s"]
     return found
 
 

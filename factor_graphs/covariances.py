@@ -47,19 +47,21 @@ def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = 
     GTSAM's own hold all rows that their elimination began with, 100 kB per keyframe. So it eliminates a few keyframes
     at a time, from their factors and what the ones before them left, and only R, S and d are kept.
     """
-    waiting, remaining = _by_first_keyframe(graph, k), gtsam.GaussianFactorGraph()
+    waiting, remaining = factors_by_first_keyframe(graph, k), gtsam.GaussianFactorGraph()
     for begin in range(0, k + 1, TOGETHER):
         window = range(begin, min(begin + TOGETHER, k + 1))
         for factor in [factor for i in window for factor in waiting.pop(i, [])]:
             remaining.push_back(factor)
-        keys = [key for i in window for key in ((X(i), V(i), B(i)) if i < k else last)]
-        net, remaining = remaining.eliminatePartialSequential(_ordering(keys), gtsam.EliminateQR)
+        keys = [key for i in window for key in (state_keys(i) if i < k else last)]
+        net, remaining = remaining.eliminatePartialSequential(ordering_of(keys), gtsam.EliminateQR)
         for part in (net.at(n) for n in range(net.size())):
             # GTSAM returns views into the conditional, which do not keep it alive
             yield Conditional(list(part.keys()), part.R().copy(), part.S().copy(), part.d().copy())
 
 
-def _by_first_keyframe(graph: gtsam.GaussianFactorGraph, k: int) -> dict[int, list[gtsam.GaussianFactor]]:
+def factors_by_first_keyframe(
+    graph: gtsam.GaussianFactorGraph, k: int
+) -> dict[int, list[gtsam.GaussianFactor]]:
     """The factors of a graph by the first keyframe that they bind; k where they bind none."""
     found = defaultdict(list)
     for factor in (graph.at(n) for n in range(graph.size())):
@@ -68,7 +70,13 @@ def _by_first_keyframe(graph: gtsam.GaussianFactorGraph, k: int) -> dict[int, li
     return found
 
 
-def _ordering(keys: Iterable[int]) -> gtsam.Ordering:
+def state_keys(i: int) -> tuple[int, int, int]:
+    """Keys of pose, velocity and biases of keyframe i."""
+    return X(i), V(i), B(i)
+
+
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """These keys, in this order."""
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
+from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.errors import MeasurementError
@@ -49,7 +50,8 @@ class Solution:
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
     `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
     where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
-    slip of the wheels, None where none were given or asked for; `notes` says in words what was repaired or is in doubt.
+    slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
+    asked for; `notes` says in words what was repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -68,6 +70,7 @@ class Solution:
     iterations: int
     vehicle: Vehicle | None = None
     wheels: Wheels | None = None
+    condensed: CondensedDrive | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -80,12 +83,14 @@ def smooth(
     initial_attitude: AttitudePrior | None = None,
     relative_poses: RelativePoses | None = None,
     wheels: WheelSpeeds | None = None,
+    condensed: bool = False,
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
     `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
     IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
-    its wheels rolled; none of them need be given. Raises MeasurementError with fewer than three usable fixes, and
+    its wheels rolled; none of them need be given. With `condensed` the solution says what is needed to bind it to other
+    drives or to itself (`sessions.bind`). Raises MeasurementError with fewer than three usable fixes, and
     EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
@@ -112,7 +117,10 @@ def smooth(
             break
         fit = with_inflation(problem, fit, more * fit.inflation)
     shared_stddevs = np.sqrt(of_shared.diagonal())
-    return _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
+    found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
+    if not condensed:
+        return found
+    return replace(found, condensed=condense(problem, fit, _drift(fixes[problem.used])))
 
 
 def _solution(
@@ -169,10 +177,15 @@ def _no_better_than(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> A
     placed keyframe lacks in variance of a fix is added to all of them, so their differences stay as sure as they are.
     """
     in_map = np.einsum("kij,kjl,kil->ki", R_map_imu, covariances[:, 3:, 3:], R_map_imu)
-    lacking = np.maximum(np.median(fixes.stddevs, axis=0) ** 2 - in_map.min(axis=0), 0.0)
+    lacking = np.maximum(_drift(fixes) - in_map.min(axis=0), 0.0)
     placed = covariances.copy()
     placed[:, 3:, 3:] += np.swapaxes(R_map_imu, 1, 2) * lacking @ R_map_imu
     return placed
+
+
+def _drift(fixes: GnssFixes) -> Array:
+    """Variance (3,) m² by which all fixes of a drive may be wrong together."""
+    return np.median(fixes.stddevs, axis=0) ** 2 if are_drifting(fixes) else np.zeros(3)
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:

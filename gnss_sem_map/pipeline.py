@@ -1,7 +1,8 @@
 """The stages of a run: from a drive to its trajectory and its semantic map (Fig. 1 of the paper).
 
     preflight           check the log against physics, and its sensors against each other; a probable mistake stops
-    trajectory          smooth GNSS and IMU in batch (or take the poses of the drive), then add LiDAR odometry
+    trajectory          smooth GNSS and IMU in batch (or take the poses of the drive), then add LiDAR odometry, and
+                        bind places that are passed again
     sharpness           measure the thickness of surfaces under the trajectories
     mapping             every scan once: deskew, label from its image, fuse into the voxels, find what moved
     refinement          the steps of `refinement.steps`, tile by tile
@@ -15,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from factor_graphs.corrections import Correction
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
@@ -27,6 +29,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans, probabilities_fingerprint
 from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.passes import TwoPasses
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
 from gnss_sem_map.mapping.trajectory import (
@@ -45,7 +48,7 @@ from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
 from gnss_sem_map.sensor_log import SensorLog
 
-__all__ = ["Mapped", "check_drive", "estimate_trajectory", "locate", "map_drive", "refine", "run"]
+__all__ = ["Mapped", "check_drive", "estimate_trajectory", "in_frame", "locate", "map_drive", "refine", "run"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,8 @@ class Mapped:
     """Objects that had too few points to be tracked."""
     solution: Solution | None = None
     """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
+    passes: tuple[TwoPasses, ...] = ()
+    """What the drive passed again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
     """Of the "map"; with LiDAR odometry, also of a map with the poses of "gnss and imu" alone."""
     from_lidar_odometry: bool = False
@@ -84,26 +89,31 @@ def run(
     elsewhere: Elsewhere | None = None,
     labels_from: str = "",
     force: bool = False,
+    correction: Correction | None = None,
 ) -> Mapped:
     """Trajectory of one drive; its raw map and evidence are written into `folder`.
 
     Without a segmenter, or without images, the map has no labels. The frame of the map is that of the drive, or
     `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
     for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` `mapping.trajectory.locate`. With `force`, a
-    red pre-flight does not stop the run.
+    red pre-flight does not stop the run. `correction`: how the trajectory moves in the frame `origin` because the drive
+    is bound to others; without one, the drive is bound to itself only.
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
     check_georeference(log, origin)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
-    page, found, sharpness = _checked_and_located(log, segmenter, settings, stats, progress, force, match)
+    page, found, sharpness = _checked_and_located(
+        log, segmenter, settings, stats, progress, force, match, bound=correction is None
+    )
     log, trajectory = in_frame(log, found.trajectory, origin)
+    trajectory = trajectory if correction is None else correction.of(trajectory)
     drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     mapped = map_drive(
         drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
-    return replace(mapped, solution=found.solution, sharpness=sharpness, preflight=page)
+    return replace(mapped, solution=found.solution, passes=found.passes, sharpness=sharpness, preflight=page)
 
 
 def _checked_and_located(
@@ -114,11 +124,12 @@ def _checked_and_located(
     progress: Progress,
     force: bool,
     match: Matcher | None,
+    bound: bool,
 ) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
     """All that comes before the map; the sweeps that the check has read are not read again."""
     sweeps = KeptSweeps()
     page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
-    found, sharpness = _located(sweeps.taking(log), settings, stats, progress, page.solution, match)
+    found, sharpness = _located(sweeps.taking(log), settings, stats, progress, page.solution, match, bound)
     return replace(page, solution=None), found, sharpness
 
 
@@ -129,12 +140,13 @@ def _located(
     progress: Progress,
     first: Solution | None,
     match: Matcher | None,
+    bound: bool,
 ) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
     """The trajectory of a drive, and how sharp a map it makes; the sweeps that tell it are not held any longer."""
     sample = SweepSample(log)
     with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
-        found = locate(sample.listening(), settings, stats, progress, first, match)
+        found = locate(sample.listening(), settings, stats, progress, first, match, bound)
         progress("trajectory", 1, 1)
     with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]

@@ -6,6 +6,7 @@
           matches/               LiDAR odometry of sections of the drive (`runs.match_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
+          bound/NAME/            where these were driven, and how they are bound (`runs.bound_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
           .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`)
           part/                  the new result while it is written
@@ -23,7 +24,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
 CHUNKS, MATCHES, ANSWERS, DRIVES = "chunks.json", "matches", "answers", "drives"
-TILES, PART, OLD = "tiles", "part", "old"
+BOUND, TILES, PART, OLD = "bound", "tiles", "part", "old"
 JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
@@ -31,7 +32,7 @@ OF_CHUNKS = re.compile(
     r"|\.\d+\.\d+\.waiting/(\d+\.npy)?"
 )
 OURS = re.compile(
-    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
     r"|matches/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
@@ -92,8 +93,9 @@ def clear(folder: Path) -> None:
 
 
 def remove_drives(folder: Path) -> None:
-    """Remove the maps of single drives, and tiles that were made from them; raises OSError."""
+    """Remove the maps of single drives, how they are bound, and tiles that were made from them; raises OSError."""
     _remove_ours(folder / DRIVES)
+    _remove_ours(folder / BOUND)
     _remove_ours(folder / TILES)
 
 

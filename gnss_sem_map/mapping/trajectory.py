@@ -1,4 +1,7 @@
-"""Trajectory of a drive: smoothed from GNSS and IMU, then once more with relative poses from LiDAR odometry."""
+"""Trajectory of a drive: smoothed from GNSS and IMU, then once more with relative poses from LiDAR odometry.
+
+Places that the drive passes again are bound to their first pass in the end (`mapping.passes`).
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, count_passes
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
@@ -34,6 +38,8 @@ class DriveTrajectory:
     """The estimate from GNSS and IMU alone; None if LiDAR odometry was not used."""
     from_lidar_odometry: bool = False
     """Whether nearly all scans were matched, so that static objects are not blurred in the map."""
+    passes: tuple[TwoPasses, ...] = ()
+    """What the drive passed again, and how well it fits."""
 
 
 def estimate_trajectory(
@@ -51,11 +57,12 @@ def locate(
     progress: Progress = silent,
     first: Solution | None = None,
     match: Matcher | None = None,
+    bound: bool = True,
 ) -> DriveTrajectory:
     """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
     `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
-    default `match_scans` in this process.
+    default `match_scans` in this process. If not `bound`, places that are passed again stay as they are.
     """
     if log.given is not None:
         return DriveTrajectory(log.given)
@@ -73,7 +80,20 @@ def locate(
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
     stats.warnings.extend(found.notes)
-    return DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
+    located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
+    return _bound(located, log, settings, stats) if bound else located
+
+
+def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: RunStats) -> DriveTrajectory:
+    """The trajectory, bound to itself where it comes to a place again."""
+    if found.solution is None or found.solution.condensed is None:
+        return found
+    located = LocatedDrive(log, found.trajectory, found.solution.condensed)
+    together = bind_passes([located], settings.trajectory.revisits)
+    count_passes(together, stats)
+    solution, correction = replace(found.solution, condensed=None), together.corrections[0]
+    trajectory = found.trajectory if correction is None else correction.of(found.trajectory)
+    return replace(found, trajectory=trajectory, solution=solution, passes=together.passes)
 
 
 def _in_this_process(
@@ -121,4 +141,5 @@ def smooth_log(
         log.initial_attitude,
         relative_poses,
         log.wheels,
+        condensed=relative_poses is not None and settings.revisits.enabled,
     )

@@ -1,9 +1,12 @@
 """Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
 
+Drives that pass the same places are bound first (`bound_drives`); then every drive is mapped.
+
 OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive; its point labels, by the map of all
 OUT/map, ...        their sum, refined and exported as the map of one drive is
 
-Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once.
+Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once:
+drives that it was bound to are mapped again, the others stay.
 A drive is a task of `mapping.execution`: the name of a function, paths and settings.
 """
 
@@ -17,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
@@ -33,15 +37,19 @@ from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
+from gnss_sem_map.mapping.passes import TwoPasses
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.voxels.map_json import read_frame
+
+Array = NDArray[np.float64]
 
 SETTINGS = "config.yaml"
 OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
@@ -103,13 +111,17 @@ def run_drives(
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
-        failed = _map_all(drives, claim, settings, how, frame, executor, progress)
+        sources = [how.source(drive) for drive in drives]
+        file = _begin(claim, settings, how)
+        tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
+        bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress)
+        failed = _map_all(sources, claim, bound, file, how, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
-        labelled = [how.source(drive) for drive in drives if drive.name in done and write_labels]
-        about = _write(out, done, settings, frame, failed, claim, executor, progress, labelled)
+        labelled = [source for source in sources if source.name in done and write_labels]
+        about = _write(out, done, settings, frame, failed, claim, bound.passes, executor, progress, labelled)
     return ManyDrives(out, about)
 
 
@@ -126,11 +138,7 @@ def add_drive(
     known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
     _check_distinct([*known, (drive.name, drive)])
     with run_folder.claimed_run(out, [drive]) as claim:
-        failed = _map_all([drive], claim, settings, how, frame, InProcess(), progress)
-        if failed:
-            raise DataError(f"{out}: stays as it was; {_first(failed)}")
-        added = {drive.name: claim.work / DRIVES / drive.name}
-        about = _write(out, there | added, settings, frame, {}, claim, InProcess(), progress)
+        about = _changed(out, there, [how.source(drive)], settings, frame, how, claim, progress)
     return ManyDrives(out, about)
 
 
@@ -143,16 +151,85 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
     if not stay:
         raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
     with run_folder.claimed_run(out) as claim:
-        about = _write(out, stay, settings, frame, {}, claim, InProcess(), progress)
+        about = _changed(out, stay, [], settings, frame, HowMapped(force=True), claim, progress)
     return ManyDrives(out, about)
 
 
+def _changed(
+    out: Path,
+    there: Mapping[str, Path],
+    added: Sequence[Source],
+    settings: Settings,
+    frame: LocalFrame,
+    how: HowMapped,
+    claim: Claim,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
+    file = _begin(claim, settings, how)
+    tracks = {name: _driven(folder) for name, folder in there.items()}
+    tracks |= {source.name: track for source in added if (track := _track(source, frame)) is not None}
+    known = [_source_of(name, folder) for name, folder in there.items()]
+    sources = [*known, *added]
+    bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress)
+    moved = [
+        source for source in known
+        if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
+    ]  # fmt: skip
+    failed = _map_all([*moved, *added], claim, bound, file, how, frame, InProcess(), progress)
+    if failed:
+        raise DataError(f"{out}: stays as it was; {_first(failed)}")
+    new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
+    return _write(out, {**there, **new}, settings, frame, {}, claim, bound.passes, InProcess(), progress)
+
+
+def _source_of(name: str, folder: Path) -> Source:
+    """What a drive of a finished map was made from."""
+    inputs = inputs_of(folder)
+    return Source(str(inputs.get("drive", folder / name)), inputs.get("segmenter"), inputs.get("frames"))
+
+
+def _correction_of(folder: Path) -> str:
+    """Digest of the correction with which a drive was mapped."""
+    return str(read_run(folder).get("correction", ""))
+
+
+def _driven(folder: Path) -> Array:
+    """The track of a drive that was mapped, (n, 3) m."""
+    return tracks_of(folder)[0].positions
+
+
+def _track(source: Source, frame: LocalFrame) -> Array | None:
+    """The GNSS track of a drive in this frame, (n, 3) m; None where there is none, or its task will say why."""
+    try:
+        log = source.open_log(with_imu=False)
+    except (SemMapError, FactorGraphError, OSError):
+        return None
+    if log.gnss is None or log.frame is None or not len(log.gnss):
+        return None
+    T = frame.pose_of(log.frame)
+    track: Array = log.gnss.positions @ T[:3, :3].T + T[:3, 3]
+    return track
+
+
 def map_one(
-    source: Mapping[str, Any], folder: str, settings: str, origin: Sequence[float], force: bool
+    source: Mapping[str, Any],
+    folder: str,
+    settings: str,
+    origin: Sequence[float],
+    force: bool,
+    correction: str,
 ) -> str:
     """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
     try:
-        _map_one(Source(**source), Path(folder), config.load(Path(settings)), LocalFrame(*origin), force)
+        _map_one(
+            Source(**source),
+            Path(folder),
+            config.load(Path(settings)),
+            LocalFrame(*origin),
+            force,
+            correction,
+        )
     except (SemMapError, FactorGraphError) as error:
         return str(error)
     except OSError as error:
@@ -160,8 +237,11 @@ def map_one(
     return ""
 
 
-def _map_one(source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool) -> None:
-    if _is_done(folder, settings, source.inputs, frame):  # what is not to be used was removed before
+def _map_one(
+    source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool, correction_file: str
+) -> None:
+    correction, digest = read_correction(correction_file)
+    if _is_done(folder, settings, source.inputs, frame, digest):  # what is not to be used was removed before
         return
     places = run_folder.places_read(Path(source.drive), settings, source.segmenter)
     with run_folder.claimed_run(folder, places) as claim:
@@ -172,50 +252,60 @@ def _map_one(source: Source, folder: Path, settings: Settings, frame: LocalFrame
             mapped = pipeline.run(
                 log, network, settings, part, claim.work,
                 origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),
-                labels_from=source.labels_from, force=force,
+                labels_from=source.labels_from, force=force, correction=correction,
             )  # fmt: skip
-            run_folder.write_drive(part, source, mapped, settings)
+            run_folder.write_drive(part, source, mapped, settings, digest)
 
 
-def _is_done(folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame) -> bool:
+def _is_done(
+    folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame, correction: str
+) -> bool:
     """Whether a folder holds this drive, mapped from the same inputs in the same way."""
     if not is_file(folder / "run.json"):
         return False
     try:
         about = read_run(folder)
         same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
+        same = same and about["correction"] == correction
         return bool(same and config.load(folder / SETTINGS) == settings)
     except (SemMapError, KeyError):
         return False
 
 
-def _map_all(
-    drives: Sequence[Path],
-    claim: Claim,
-    settings: Settings,
-    how: HowMapped,
-    frame: LocalFrame,
-    executor: Executor,
-    progress: Progress,
-) -> dict[str, str]:
-    """Map every drive into the work folder; name -> reason of those that fail."""
+def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
+    """Prepare the work folder; returns the file of the settings, for tasks."""
     if not how.resume:
         work_folder.remove_drives(claim.work)
     work_folder.make(claim.work)
     (claim.work / DRIVES).mkdir(exist_ok=True)
     file = claim.work / DRIVES / SETTINGS
     file.write_text(settings.to_yaml(), "utf-8")
+    return file
+
+
+def _map_all(
+    sources: Sequence[Source],
+    claim: Claim,
+    bound: BoundDrives,
+    settings_file: Path,
+    how: HowMapped,
+    frame: LocalFrame,
+    executor: Executor,
+    progress: Progress,
+) -> dict[str, str]:
+    """Map every drive into the work folder; name -> reason of those that fail."""
     origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
     tasks = []
-    for drive in drives:
+    for source in sources:
         arguments = (
-            asdict(how.source(drive)),
-            str(claim.work / DRIVES / drive.name),
-            str(file),
+            asdict(source),
+            str(claim.work / DRIVES / source.name),
+            str(settings_file),
             origin,
             how.force,
+            str(bound.corrections.get(source.name, "")),
         )
-        tasks.append(Task(drive.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
+        tasks.append(Task(source.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
     found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
     return {task.name: reason.removeprefix(f"{task.name}: ") for task, reason in found if reason}
 
@@ -227,6 +317,7 @@ def _write(
     frame: LocalFrame,
     failed: Mapping[str, str],
     claim: Claim,
+    passes: Sequence[TwoPasses],
     executor: Executor,
     progress: Progress,
     labelled: Sequence[Source] = (),
@@ -253,6 +344,8 @@ def _write(
             "merged": [part.name for part in parts],
             "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
+            "passes": [asdict(row) for row in passes]
+            + [row for part in parts for row in read_run(part)["passes"]],
             "local_frame": asdict(frame),
             "map": run_folder.about_map(folder, refined.report),
         }

@@ -93,10 +93,14 @@ def write_run(
     write_about(folder, settings, about, metrics_of(mapped))
 
 
-def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings) -> None:
-    """Write what is known of one of several drives beside its raw map, which is in the folder already."""
+def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings, correction: str) -> None:
+    """Write what is known of one of several drives beside its raw map, which is in the folder already.
+
+    `correction`: digest of that with which it is bound to others, empty without.
+    """
     write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
-    write_about(folder, settings, about_mapped(source, mapped), metrics_of(mapped))
+    about = about_mapped(source, mapped) | {"correction": correction}
+    write_about(folder, settings, about, metrics_of(mapped))
 
 
 def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
@@ -108,6 +112,7 @@ def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
         "preflight": mapped.preflight.as_dict(),
         "trajectory": _about_solution(mapped.solution),
         "from_lidar_odometry": mapped.from_lidar_odometry,
+        "passes": [asdict(row) for row in mapped.passes],
     }
 
 

@@ -2,7 +2,7 @@
 
 The registration is VGICP of `small_gicp` (Koide et al. 2021: voxelised generalised ICP). This module adds an initial
 guess from the trajectory, a covariance that is large in degenerate directions, and a check of every match. The factor
-graph uses relative poses, because absolute positions drift. There is no loop closure.
+graph uses relative poses, because absolute positions drift. Places that are passed again: `revisits`.
 
 A long drive is matched in sections, which may be matched at the same time. A section begins with the last sweeps of the
 one before, for a local map to start with.
@@ -32,6 +32,7 @@ from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
 from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.scans.revisits import RevisitSettings
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
 Array = NDArray[np.float64]
@@ -98,6 +99,7 @@ class TrajectorySettings(SmootherSettings):
         True, description="Add relative poses from LiDAR odometry to the factor graph."
     )
     scan_matching: ScanMatchingSettings = Field(ScanMatchingSettings(), description="Sweep to local map.")
+    revisits: RevisitSettings = Field(RevisitSettings(), description="Places that are passed again.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,280 @@
+"""One graph over condensed drives: places that were passed twice are bound, and what does not fit is left out.
+
+The corrections x minimise |A x - b|² over the rows of all drives, plus the whitened residuals of the pairs, with
+truncated loss (Gauss-Newton; the pairs alone are not linear). A wrong pair has to pass three tests: it is as near to
+what the drives themselves say as their covariance allows; it agrees with the other pairs; and another one beside it
+says the same.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from factor_graphs.chi_square import quantile
+from factor_graphs.condensing import CondensedDrive
+from factor_graphs.corrections import Correction
+from factor_graphs.covariances import SIZE
+from factor_graphs.errors import EstimationError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# 99.9 % of right pairs lie below, and where the loss of the others begins to grow slower.
+REJECTION, HUBER = quantile(0.999, 6), quantile(0.8, 6)
+# The drives' own covariance is believed up to this factor of a standard deviation when a pair is held against it.
+BELIEVED = 1.5
+# Pairs support each other that are at most so many anchors apart, on both ways.
+NEIGHBOURS = 12
+# Rounds of weights and of solutions; corrections stand still when they move less, m and rad.
+ROUNDS, STILL = 30, 1e-4
+# Columns that are solved for at once.
+TOGETHER = 240
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorPairs:
+    """Relative poses between anchors, of two drives or of one.
+
+    `drives` (p, 2) and `anchors` (p, 2) number them; `T` (p, 4, 4): p_first = T p_second, in imu axes; `covariances`
+    (p, 6, 6) of the tangent with T Exp(tangent), rotation rad before translation m, in the axes of the second.
+    """
+
+    drives: NDArray[np.intp]
+    anchors: NDArray[np.intp]
+    T: Array
+    covariances: Array
+
+    def __len__(self) -> int:
+        return len(self.drives)
+
+    def __getitem__(self, rows: Mask) -> "AnchorPairs":
+        return AnchorPairs(self.drives[rows], self.anchors[rows], self.T[rows], self.covariances[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Bound:
+    """The anchors of every drive once the pairs are known.
+
+    `corrections`: how the anchors of each drive move; `used` (p,): the pairs that hold them;
+    `expected` (p,) and `squares` (p,): squared whitened distance, chi2 of 6 dof, of every pair from what the drives
+    alone say, and from the result.
+    """
+
+    corrections: list[Correction]
+    used: Mask
+    expected: Array
+    squares: Array
+
+
+def bind(drives: Sequence[CondensedDrive], pairs: AnchorPairs) -> Bound:
+    """Bind the drives, which are in one map frame, by the pairs that prove right; raises EstimationError."""
+    system = _System(drives)
+    alone = system.solve(pairs, np.zeros(len(pairs)), system.start)
+    expected = _expected(system, pairs, alone)
+    used = expected <= REJECTION
+    while True:
+        found, weights, squares = _robust(system, pairs, used, alone)
+        supported = _supported(pairs, used & (weights > 0.0))
+        if np.array_equal(supported, used):
+            break
+        used = supported
+    corrections = [
+        Correction(drive.stamps, drive.T_map_imu, T, of_poses + _lacking(drives, n, pairs[used], of_poses, T))
+        for n, (drive, T, of_poses) in enumerate(
+            zip(drives, found.poses, system.pose_covariances(found), strict=True)
+        )
+    ]
+    return Bound(corrections, used, expected, squares)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Corrections x, the poses with them, and the factors of the normal equations that they solve."""
+
+    x: Array
+    poses: list[Array]
+    factors: SuperLU
+    scale: Array
+
+
+class _System:
+    """The equations of all drives, stacked; columns that no equation speaks of are left out."""
+
+    def __init__(self, drives: Sequence[CondensedDrive]) -> None:
+        self.drives = drives
+        self._first = np.cumsum([0, *(SIZE * (len(drive) + 1) for drive in drives)])
+        A, b = _stacked(drives, self._first)
+        by_column = A.tocsc()
+        there = np.flatnonzero(np.diff(by_column.indptr))
+        self._column = np.full(A.shape[1], -1)
+        self._column[there] = np.arange(len(there))
+        spoken_of = by_column[:, there]
+        self._H, self._g = (spoken_of.T @ spoken_of).tocsc(), spoken_of.T @ b
+        self.start = np.zeros(len(there))
+
+    def columns_of(self, drive: int, anchor: int) -> NDArray[np.intp]:
+        """Where the pose of an anchor stands among the corrections."""
+        first = self._first[drive] + SIZE * anchor
+        return self._column[first : first + 6]
+
+    def solve(self, pairs: AnchorPairs, weights: Array, x: Array) -> _State:
+        """One step of Gauss-Newton from the corrections x."""
+        J, r = self.residuals(pairs, self._poses(x))
+        J = sparse.diags(np.repeat(np.sqrt(weights), 6)) @ J
+        r = r * np.sqrt(weights)[:, None]
+        H = (self._H + J.T @ J).tocsc()
+        g = self._g - J.T @ (r.ravel() - J @ x)
+        # columns are scaled, for biases and positions differ by a factor of a million
+        scale = 1.0 / np.sqrt(H.diagonal())
+        scaled = sparse.diags(scale)
+        try:
+            factors = splu(
+                (scaled @ H @ scaled).tocsc(),
+                "MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError as error:
+            raise EstimationError(f"the equations of the drives have no solution: {error}") from error
+        x = scale * factors.solve(scale * g)
+        return _State(x, self._poses(x), factors, scale)
+
+    def residuals(self, pairs: AnchorPairs, poses: Sequence[Array]) -> tuple[sparse.csr_array, Array]:
+        """Whitened residuals of the pairs (p, 6), and their derivatives."""
+        r, rows, columns, values = np.empty((len(pairs), 6)), [], [], []
+        for n, (of_drives, of_anchors) in enumerate(zip(pairs.drives, pairs.anchors, strict=True)):
+            (a, b), (i, j) = of_drives.tolist(), of_anchors.tolist()
+            first, second = gtsam.Pose3(poses[a][i]), gtsam.Pose3(poses[b][j])
+            whiten = np.linalg.inv(np.linalg.cholesky(pairs.covariances[n]))
+            off = gtsam.Pose3.Logmap(gtsam.Pose3(pairs.T[n]).inverse() * first.inverse() * second)
+            r[n] = whiten @ off
+            own = -whiten @ second.between(first).AdjointMap()
+            for J, place in ((own, self.columns_of(a, i)), (whiten, self.columns_of(b, j))):
+                rows.append(np.repeat(6 * n + np.arange(6), 6))
+                columns.append(np.tile(place, 6))
+                values.append(J.ravel())
+        empty = np.empty(0)
+        triple = (np.concatenate([*part, empty]) for part in (values, rows, columns))
+        data, row, column = triple
+        return sparse.csr_array(
+            (data, (row.astype(int), column.astype(int))), (6 * len(pairs), len(self.start))
+        ), r
+
+    def variances(self, state: _State, J: sparse.csr_array) -> Array:
+        """Covariance of every six rows of J x, (p, 6, 6)."""
+        found = np.empty((J.shape[0] // 6, 6, 6))
+        for begin in range(0, J.shape[0], TOGETHER):
+            some = J[begin : begin + TOGETHER]
+            half = state.factors.solve(state.scale[:, None] * some.T.toarray()) * state.scale[:, None]
+            for n in range(some.shape[0] // 6):
+                own = slice(6 * n, 6 * n + 6)
+                found[begin // 6 + n] = some[own] @ half[:, own]
+        return (found + np.swapaxes(found, 1, 2)) / 2
+
+    def pose_covariances(self, state: _State) -> Iterator[Array]:
+        """Covariances (a, 6, 6) of the poses of each drive's anchors."""
+        for drive, condensed in enumerate(self.drives):
+            columns = np.concatenate([self.columns_of(drive, anchor) for anchor in range(len(condensed))])
+            picked = (np.ones(len(columns)), (np.arange(len(columns)), columns))
+            yield self.variances(state, sparse.csr_array(picked, (len(columns), len(self.start))))
+
+    def _poses(self, x: Array) -> list[Array]:
+        return [
+            np.array([
+                T @ gtsam.Pose3.Expmap(x[self.columns_of(drive, anchor)]).matrix()
+                for anchor, T in enumerate(condensed.T_map_imu)
+            ])
+            for drive, condensed in enumerate(self.drives)
+        ]  # fmt: skip
+
+
+def _stacked(drives: Sequence[CondensedDrive], first: NDArray[np.intp]) -> tuple[sparse.csr_array, Array]:
+    data, row, column, b, count = [], [], [], [], 0
+    for start, drive in zip(first, drives, strict=False):
+        for part in drive.rows:
+            m, places = len(part.b), (start + SIZE * part.anchors[:, None] + np.arange(SIZE)).ravel()
+            r, c = np.nonzero(part.A)
+            data.append(part.A[r, c])
+            row.append(count + r)
+            column.append(places[c])
+            b.append(part.b)
+            count += m
+    entries = (np.concatenate(data), (np.concatenate(row), np.concatenate(column)))
+    return sparse.csr_array(entries, (count, int(first[-1]))), np.concatenate(b)
+
+
+def _expected(system: _System, pairs: AnchorPairs, alone: _State) -> Array:
+    """Squared distance (p,) of each pair from what the drives alone say, in units of its covariance."""
+    J, r = system.residuals(pairs, alone.poses)
+    S = BELIEVED**2 * system.variances(alone, J) + np.eye(6)
+    for n, (of_drives, of_anchors) in enumerate(zip(pairs.drives, pairs.anchors, strict=True)):
+        (a, b), j = of_drives.tolist(), int(of_anchors[1])
+        if a != b:  # the fixes of each may all be wrong together
+            whiten = np.linalg.inv(np.linalg.cholesky(pairs.covariances[n]))[:, 3:]
+            R = alone.poses[b][j][:3, :3]
+            both = system.drives[a].position_variances + system.drives[b].position_variances
+            S[n] += whiten @ (R.T * both) @ R @ whiten.T
+    found: Array = np.einsum("pi,pi->p", r, np.linalg.solve(S, r[..., None])[..., 0])
+    return found
+
+
+def _robust(system: _System, pairs: AnchorPairs, used: Mask, start: _State) -> tuple[_State, Array, Array]:
+    """The solution, weights (p,) and squared residuals (p,) of the pairs: Huber's loss first, then truncated."""
+    state = start
+    for loss in (_huber, _truncated):
+        weights = np.full(len(pairs), -1.0)
+        for _ in range(ROUNDS):
+            squares = np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
+            before, weights = weights, used * loss(squares)
+            x, state = state.x, system.solve(pairs, weights, state.x)
+            if np.abs(state.x - x).max(initial=0.0) < STILL and np.allclose(weights, before, atol=0.01):
+                break
+    return state, weights, np.sum(system.residuals(pairs, state.poses)[1] ** 2, axis=1)
+
+
+def _huber(squares: Array) -> Array:
+    return np.minimum(1.0, np.sqrt(HUBER / np.maximum(squares, HUBER)))
+
+
+def _truncated(squares: Array) -> Array:
+    return np.where(squares <= REJECTION, 1.0, 0.0)
+
+
+def _supported(pairs: AnchorPairs, fits: Mask) -> Mask:
+    """The pairs that fit and have another one beside them, of the same drives, that fits."""
+    places, supported = pairs.anchors, np.zeros(len(pairs), np.bool_)
+    for n in np.flatnonzero(fits):
+        beside = np.abs(places - places[n]).max(axis=1) <= NEIGHBOURS
+        beside &= fits & (pairs.drives == pairs.drives[n]).all(axis=1)
+        beside[n] = False
+        supported[n] = beside.any()
+    return supported
+
+
+def _lacking(drives: Sequence[CondensedDrive], n: int, used: AnchorPairs, of_poses: Array, T: Array) -> Array:
+    """What the covariances (a, 6, 6) of a drive lack, because its fixes drift together: see `smoothing`.
+
+    Drives that are bound share what theirs say of the place, so the variance falls with their number.
+    """
+    together = _bound_to(n, used)
+    wrong = np.mean([drives[m].position_variances for m in together], axis=0) / len(together)
+    R = T[:, :3, :3]
+    in_map = np.einsum("kij,kjl,kil->ki", R, of_poses[:, 3:, 3:], R)
+    more = np.zeros_like(of_poses)
+    more[:, 3:, 3:] = np.swapaxes(R, 1, 2) * np.maximum(wrong - in_map.min(axis=0), 0.0) @ R
+    return more
+
+
+def _bound_to(drive: int, pairs: AnchorPairs) -> set[int]:
+    """The drives that are bound to one, itself included."""
+    found, before = {drive}, 0
+    while len(found) > before:
+        before = len(found)
+        touched = np.isin(pairs.drives, list(found)).any(axis=1)
+        found |= set(pairs.drives[touched].ravel().tolist())
+    return found

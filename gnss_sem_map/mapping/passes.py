@@ -1,0 +1,107 @@
+"""Passes of one place, bound into one graph: how each drive's trajectory moves, and how far surfaces lay apart."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from factor_graphs.condensing import CondensedDrive
+from factor_graphs.corrections import Correction
+from factor_graphs.sessions import Bound, bind
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.scans.revisits import Revisits, RevisitSettings, pass_of, register_passes
+from gnss_sem_map.sensor_log import SensorLog
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedDrive:
+    """A drive that can be bound to others, in the frame of all."""
+
+    log: SensorLog
+    trajectory: Trajectory
+    condensed: CondensedDrive
+
+
+@dataclass(frozen=True)
+class TwoPasses:
+    """What binds a drive to another one, or to itself: distances between the surfaces of both, medians, m."""
+
+    first: str
+    second: str
+    places: int
+    """Registered."""
+    bound: int
+    """Of them, those that hold the drives together."""
+    before_m: float
+    after_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Drives that are bound: corrections of each, None where no pair holds one; `refused` places did not match."""
+
+    corrections: list[Correction | None]
+    passes: tuple[TwoPasses, ...]
+    refused: int
+
+
+def bind_passes(drives: Sequence[LocatedDrive], settings: RevisitSettings) -> Together:
+    """Find what the drives passed again, and bind those together that have a place in common; raises EstimationError.
+
+    Of several drives, one that only passes its own places again is left to bind itself.
+    """
+    passes = [pass_of(drive.log, drive.trajectory, drive.condensed, settings) for drive in drives]
+    revisits = register_passes(passes, settings)
+    corrections: list[Correction | None] = [None] * len(drives)
+    table: list[TwoPasses] = []
+    for group in _components(len(drives), revisits.pairs.drives):
+        inside = revisits.of(np.isin(revisits.pairs.drives[:, 0], group))
+        if not len(inside.pairs) or len(group) == 1 < len(drives):
+            continue
+        number = np.full(len(drives), -1)
+        number[group] = np.arange(len(group))
+        inside = inside.numbered(number)
+        some = [drives[n] for n in group]
+        bound = bind([drive.condensed for drive in some], inside.pairs)
+        for n in np.unique(inside.pairs.drives[bound.used]).tolist():
+            corrections[group[n]] = bound.corrections[n]
+        table += _table(some, inside, bound)
+    return Together(corrections, tuple(table), revisits.refused)
+
+
+def _components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:
+    """Drives that are connected by pairs, in their order."""
+    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), (count, count))
+    groups, of_drive = connected_components(graph, directed=False)
+    return [np.flatnonzero(of_drive == group).tolist() for group in range(groups)]
+
+
+def count_passes(together: Together, stats: RunStats) -> None:
+    """Count what was passed again, and what of it was left out."""
+    stats.counts["places passed again"] += sum(row.places for row in together.passes) + together.refused
+    stats.counts["places bound"] += sum(row.bound for row in together.passes)
+
+
+def _table(drives: Sequence[LocatedDrive], revisits: Revisits, bound: Bound) -> list[TwoPasses]:
+    pairs, table = revisits.pairs, []
+    after = [
+        np.linalg.inv(bound.corrections[a].after[i]) @ bound.corrections[b].after[j]
+        for (a, b), (i, j) in zip(pairs.drives.tolist(), pairs.anchors.tolist(), strict=True)
+    ]
+    for a, b in np.unique(pairs.drives, axis=0).tolist():
+        rows = np.flatnonzero((pairs.drives == (a, b)).all(axis=1)).tolist()
+        before_m, after_m = (
+            float(np.median(np.concatenate([revisits.distances(n, T[n]) for n in rows])))
+            for T in (revisits.guesses, after)
+        )
+        used = int(bound.used[rows].sum())
+        table.append(TwoPasses(drives[a].log.name, drives[b].log.name, len(rows), used, before_m, after_m))
+    return table

@@ -1,0 +1,216 @@
+"""Drives that pass the same places are bound to each other before they are mapped.
+
+WORK/bound/NAME/job.json, trajectory.npz    a drive that was located, in the frame of all (`runs.drive_job`)
+               condensed.npz               what its graph says of its anchors (`factor_graphs.condensing`)
+               correction.npz              how its anchors move once all drives are known
+
+Only drives whose tracks come near each other are looked at, and each group that is bound is solved alone: so the result
+for a drive depends on those that it is bound to, not on the order, nor on who else is in the map.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from factor_graphs.condensing import CondensedDrive
+from factor_graphs.corrections import Correction
+from factor_graphs.errors import FactorGraphError
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map import config, pipeline
+from gnss_sem_map.config import Settings
+from gnss_sem_map.errors import SemMapError
+from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.untrusted import read_bytes
+from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB
+from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
+from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.drive_job import read_job, write_job
+from gnss_sem_map.runs.match_tasks import SavedMatches
+from gnss_sem_map.runs.source import Source
+
+Array = NDArray[np.float64]
+
+NEAR_M = 50.0
+"""Tracks that come nearer may have passed the same place: receivers err by metres, and a map reaches 60 m."""
+EVERY_M = 10.0
+"""Tracks are compared by points so far apart."""
+CONDENSED, CORRECTION = "condensed.npz", "correction.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class BoundDrives:
+    """Name -> file of the correction of each drive that is bound to others, and what binds them."""
+
+    corrections: Mapping[str, Path]
+    passes: tuple[TwoPasses, ...] = ()
+
+
+def bind_drives(
+    sources: Sequence[Source],
+    tracks: Mapping[str, Array],
+    settings: Settings,
+    settings_file: Path,
+    frame: LocalFrame,
+    work: Path,
+    executor: Executor,
+    progress: Progress = silent,
+) -> BoundDrives:
+    """Locate the drives that may have passed the same places, and bind those that did.
+
+    `tracks` are of drives by name, (n, 3) m; a drive without one, or that cannot be located, is left as it is.
+    Tasks read the settings from `settings_file`.
+    """
+    groups = [group for group in groups_of(tracks) if len(group) > 1]
+    by_name = {source.name: source for source in sources}
+    wanted = [by_name[name] for group in groups for name in group]
+    if not (wanted and settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
+        return BoundDrives({})
+    located = set(_located(wanted, settings_file, frame, work, executor, progress))
+    corrections: dict[str, Path] = {}
+    passes: list[TwoPasses] = []
+    for group in groups:
+        found = _bound([name for name in group if name in located], settings, work)
+        corrections |= found.corrections
+        passes += found.passes
+    return BoundDrives(corrections, tuple(passes))
+
+
+def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
+    """Names of drives whose tracks come near each other, directly or by others; in the order of names."""
+    names = sorted(tracks)
+    thin = [_thinned(tracks[name]) for name in names]
+    trees = [cKDTree(track) for track in thin]
+    edges = [
+        (a, b)
+        for b in range(len(names))
+        for a in range(b)
+        if np.isfinite(trees[a].query(thin[b], distance_upper_bound=NEAR_M)[0]).any()
+    ]
+    return _components(names, edges)
+
+
+def _thinned(track: Array) -> Array:
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))])
+    return track[np.unique(np.floor(way / EVERY_M), return_index=True)[1]]
+
+
+def _components(names: Sequence[str], edges: Sequence[tuple[int, int]]) -> list[list[str]]:
+    first, second = np.array(edges, np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(first)), (first, second)), (len(names), len(names)))
+    count, of_name = connected_components(graph, directed=False)
+    return [[names[n] for n in np.flatnonzero(of_name == group).tolist()] for group in range(count)]
+
+
+def _located(
+    sources: Sequence[Source],
+    settings_file: Path,
+    frame: LocalFrame,
+    work: Path,
+    executor: Executor,
+    progress: Progress,
+) -> Iterator[str]:
+    """Locate drives as tasks; the names of those that could be."""
+    origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
+    function = f"{locate_one.__module__}:{locate_one.__name__}"
+    tasks = [
+        Task(source.name, function, (asdict(source), str(work), str(settings_file), origin))
+        for source in sources
+    ]
+    for task, reason in run_tasks(
+        tasks, executor, lambda done, total: progress("locating", done, total), lost=str
+    ):
+        if not reason:
+            yield task.name
+
+
+def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequence[float]) -> str:
+    """Locate a drive, and save its trajectory and condensed graph: a task. Returns the reason when it fails.
+
+    What was matched stays in the work folder of the drive, where its mapping finds it.
+    """
+    try:
+        _locate_one(Source(**source), Path(work), config.load(Path(settings)), LocalFrame(*origin))
+    except (SemMapError, FactorGraphError) as error:
+        return str(error) or "failed"
+    except OSError as error:
+        return f"{error.filename or 'a file'}: {error.strerror or error}"
+    return ""
+
+
+def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFrame) -> None:
+    folder, fingerprint = work / BOUND / source.name, _fingerprint(source, settings, frame)
+    if _known(folder, fingerprint):
+        return
+    with run_folder.claimed_run(work / DRIVES / source.name) as claim:
+        log = source.open_log().in_our_conventions(settings.sensors)
+        match = SavedMatches(source, claim.work, resume=True)
+        found = pipeline.locate(log, settings, RunStats(), match=match, bound=False)
+        if found.solution is None or found.solution.condensed is None:
+            return
+        log, trajectory = pipeline.in_frame(log, found.trajectory, frame)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / CONDENSED, found.solution.condensed.to_bytes())
+        write_job(folder, source, settings, trajectory, fingerprint)
+
+
+def _fingerprint(source: Source, settings: Settings, frame: LocalFrame) -> str:
+    said = [source.inputs, settings.model_dump(mode="json"), asdict(frame)]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def _known(folder: Path, fingerprint: str) -> bool:
+    """Whether the drive was located in the same way before an interruption."""
+    try:
+        return bool(json.loads((folder / JOB).read_text("utf-8"))["fingerprint"] == fingerprint)
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _bound(names: Sequence[str], settings: Settings, work: Path) -> BoundDrives:
+    """Bind located drives, and save how each moves."""
+    drives = [_read(work / BOUND / name) for name in names if (work / BOUND / name / JOB).is_file()]
+    names = [name for name in names if (work / BOUND / name / JOB).is_file()]
+    if len(drives) < 2:
+        return BoundDrives({})
+    together = bind_passes(drives, settings.trajectory.revisits)
+    files = {}
+    for name, correction in zip(names, together.corrections, strict=True):
+        if correction is not None:
+            files[name] = work / BOUND / name / CORRECTION
+            write_whole(files[name], _as_bytes(correction))
+    return BoundDrives(files, together.passes)
+
+
+def _read(folder: Path) -> LocatedDrive:
+    _, _, _, log, trajectory = read_job(folder)
+    condensed = CondensedDrive.from_bytes(read_bytes(folder / CONDENSED))
+    return LocatedDrive(log, trajectory, condensed.at(trajectory))
+
+
+def _as_bytes(correction: Correction) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **{field.name: getattr(correction, field.name) for field in fields(Correction)})
+    return file.getvalue()
+
+
+def read_correction(file: str) -> tuple[Correction | None, str]:
+    """The correction in a file of `bind_drives`, and its digest; neither of them without a file."""
+    if not file:
+        return None, ""
+    content = read_bytes(Path(file))
+    with np.load(io.BytesIO(content)) as arrays:
+        return Correction(**arrays), hashlib.sha256(content).hexdigest()

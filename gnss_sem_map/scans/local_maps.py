@@ -1,0 +1,77 @@
+"""Local maps: the surfaces around some places of a track, each out of a few sweeps, in the imu frame at that place."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans.deskew import usable_points_in_map
+from gnss_sem_map.scans.downsampling import one_per_cube, thinned
+from gnss_sem_map.sensor_log import SensorLog
+
+Array = NDArray[np.float64]
+
+CUBE_M, NEAREST_M, FARTHEST_M = 0.4, 2.5, 60.0
+"""One point per cube of this edge; nearer and farther returns are left out."""
+SWEEP_M, SWEEPS = 5.0, 5
+"""Sweeps are so far apart along the track, and so many make a local map."""
+NEIGHBOURS = 10
+"""Of a point, for its plane."""
+KEPT_SWEEPS, KEPT_MAPS = 16, 4
+"""Neighbouring local maps have sweeps in common, and a place may be registered more than once."""
+
+
+class LocalMaps:
+    """The local maps of a drive, made when they are asked for; sweeps that cannot be read are left out.
+
+    `stamps` (p,) s are those of the places, in the span of the sweeps; `trajectory` deskews these.
+    """
+
+    def __init__(self, log: SensorLog, trajectory: Trajectory, stamps: Array) -> None:
+        self._log, self._trajectory, self._stamps = log, trajectory, stamps
+        scans = np.array([scan.stamp for scan in log.scans])
+        way = way_along(trajectory, scans)
+        lattice = np.arange(0.0, way[-1] + SWEEP_M, SWEEP_M)
+        self._lattice = np.unique(np.abs(way[None] - lattice[:, None]).argmin(axis=1))
+        self._nearest = np.abs(scans[self._lattice][None] - stamps[:, None]).argmin(axis=1)
+        self._sweep = lru_cache(KEPT_SWEEPS)(self._read)
+        self.at = lru_cache(KEPT_MAPS)(self._made)
+        """The local map of a place: points, each with its plane, m; empty where no sweep can be read."""
+
+    def _made(self, place: int) -> small_gicp.PointCloud:
+        first = max(int(self._nearest[place]) - SWEEPS // 2, 0)
+        there = [self._sweep(int(scan)) for scan in self._lattice[first : first + SWEEPS]]
+        T = np.linalg.inv(self._trajectory.at(self._stamps[place : place + 1])[0])
+        points = np.concatenate(there) @ T[:3, :3].T + T[:3, 3]
+        cloud = small_gicp.PointCloud(one_per_cube(np.ascontiguousarray(points), CUBE_M))
+        if cloud.size() > NEIGHBOURS:
+            small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
+        return cloud
+
+    def _read(self, number: int) -> Array:
+        """A thinned sweep in the map frame."""
+        scan, T_imu_lidar = self._log.scans[number], self._log.calibration.T_imu_lidar
+        try:
+            some = thinned(scan.read(), CUBE_M, NEAREST_M, FARTHEST_M)
+            return usable_points_in_map(some, scan.stamp, self._trajectory, T_imu_lidar)[0]
+        except (DataError, MeasurementError):  # reported when the map is built
+            return np.empty((0, 3))
+
+
+def way_along(trajectory: Trajectory, stamps: Array) -> Array:
+    """How far the imu has moved until each stamp, (n,) m; stamps beyond an end count as there."""
+    inside = np.clip(stamps, trajectory.start, trajectory.end)
+    steps = np.linalg.norm(np.diff(trajectory.at(inside)[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def normals(cloud: small_gicp.PointCloud) -> Array:
+    """Unit normals (n, 3) of the planes of a cloud's points: the axis of least variance."""
+    covariances = np.asarray(cloud.covs())[:, :3, :3]
+    return np.asarray(np.linalg.eigh(covariances)[1][:, :, 0])

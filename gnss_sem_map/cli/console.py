@@ -68,7 +68,22 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
         f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
     )
     typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
+    _print_passes(about)
     typer.echo(f"results in {out}")
+
+
+def _print_passes(about: dict[str, Any]) -> None:
+    """How far the surfaces of two passes lie from each other."""
+    for row in about.get("passes", ()):
+        again = (
+            f"{row['first']} and {row['second']}"
+            if row["first"] != row["second"]
+            else f"{row['first']}, again"
+        )
+        typer.echo(
+            f"{again}: {row['bound']} of {row['places']} places bound, surfaces {100 * row['before_m']:.1f} cm apart"
+            f" before, {100 * row['after_m']:.1f} cm after"
+        )
 
 
 def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
@@ -77,6 +92,7 @@ def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
         typer.echo(json.dumps(about))
     else:
         typer.echo(f"{len(about['merged'])} drives, {about['map']['voxels']} voxels; results in {out}")
+        _print_passes(about)
     warn(f"{name} is left out: {reason}" for name, reason in about["failed"].items())
 
 

@@ -79,6 +79,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _picture(folder, "perspective.png"),
         _warnings(run.get("warnings", ())),
         _section("Drives", _drives(run.get("drives", {}), run.get("failed", {}))),
+        _section("Places passed again", _passes(run.get("passes", ()))),
         _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
@@ -244,6 +245,19 @@ def _drives(drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) 
     return f'<div class="scroll"><table>{head}{rows}</table></div>' + (
         f"<h3>Left out</h3>{_table(('drive', 'why'), list(failed.items()))}" if failed else ""
     )
+
+
+def _passes(passes: Sequence[Mapping[str, Any]]) -> str:
+    """How far the surfaces of two passes lay from each other, and lie now."""
+    if not passes:
+        return ""
+    head = ("first pass", "again", "places registered", "bound", "surfaces apart before, cm", "after, cm")
+    rows = [
+        (row["first"], row["second"], row["places"], row["bound"],
+         f"{100 * row['before_m']:.1f}", f"{100 * row['after_m']:.1f}")
+        for row in passes
+    ]  # fmt: skip
+    return _table(head, rows)
 
 
 def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -53,10 +53,14 @@ CONDENSED, CORRECTION = "condensed.npz", "correction.npz"
 
 @dataclass(frozen=True, eq=False)
 class BoundDrives:
-    """Name -> file of the correction of each drive that is bound to others, and what binds them."""
+    """Name -> file of the correction of each drive that is bound to others, and what binds them.
+
+    `failed`: name -> reason of drives that could not be located.
+    """
 
     corrections: Mapping[str, Path]
     passes: tuple[TwoPasses, ...] = ()
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 def bind_drives(
@@ -79,14 +83,15 @@ def bind_drives(
     wanted = [by_name[name] for group in groups for name in group]
     if not (wanted and settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
         return BoundDrives({})
-    located = set(_located(wanted, settings_file, frame, work, executor, progress))
+    reasons = _located(wanted, settings_file, frame, work, executor, progress)
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
     for group in groups:
-        found = _bound([name for name in group if name in located], settings, work)
+        found = _bound([name for name in group if not reasons[name]], settings, work)
         corrections |= found.corrections
         passes += found.passes
-    return BoundDrives(corrections, tuple(passes))
+    failed = {name: reason for name, reason in reasons.items() if reason}
+    return BoundDrives(corrections, tuple(passes), failed)
 
 
 def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
@@ -122,19 +127,16 @@ def _located(
     work: Path,
     executor: Executor,
     progress: Progress,
-) -> Iterator[str]:
-    """Locate drives as tasks; the names of those that could be."""
+) -> dict[str, str]:
+    """Locate drives as tasks; name -> reason of failure, empty for those that could be."""
     origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
     function = f"{locate_one.__module__}:{locate_one.__name__}"
     tasks = [
         Task(source.name, function, (asdict(source), str(work), str(settings_file), origin))
         for source in sources
     ]
-    for task, reason in run_tasks(
-        tasks, executor, lambda done, total: progress("locating", done, total), lost=str
-    ):
-        if not reason:
-            yield task.name
+    found = run_tasks(tasks, executor, lambda done, total: progress("locating", done, total), lost=str)
+    return {task.name: reason for task, reason in found}
 
 
 def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequence[float]) -> str:
@@ -182,11 +184,10 @@ def _known(folder: Path, fingerprint: str) -> bool:
 
 def _bound(names: Sequence[str], settings: Settings, work: Path) -> BoundDrives:
     """Bind located drives, and save how each moves."""
-    drives = [_read(work / BOUND / name) for name in names if (work / BOUND / name / JOB).is_file()]
-    names = [name for name in names if (work / BOUND / name / JOB).is_file()]
-    if len(drives) < 2:
+    names = [name for name in names if (work / BOUND / name / JOB).is_file()]  # others have no LiDAR odometry
+    if len(names) < 2:
         return BoundDrives({})
-    together = bind_passes(drives, settings.trajectory.revisits)
+    together = bind_passes([_read(work / BOUND / name) for name in names], settings.trajectory.revisits)
     files = {}
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:
@@ -203,7 +204,7 @@ def _read(folder: Path) -> LocatedDrive:
 
 def _as_bytes(correction: Correction) -> bytes:
     file = io.BytesIO()
-    np.savez(file, **{field.name: getattr(correction, field.name) for field in fields(Correction)})
+    np.savez(file, **{part.name: getattr(correction, part.name) for part in fields(Correction)})
     return file.getvalue()
 
 

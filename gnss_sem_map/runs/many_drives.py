@@ -172,6 +172,12 @@ def _changed(
     known = [_source_of(name, folder) for name, folder in there.items()]
     sources = [*known, *added]
     bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress)
+    for name in there:
+        if name in bound.failed:
+            raise DataError(
+                f"{out}: stays as it was; {name} passes the same places, and would have to be bound and mapped again:"
+                f" {bound.failed[name]}; put it back, or make a map with trajectory.revisits.enabled=false"
+            )
     moved = [
         source for source in known
         if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
@@ -345,7 +351,7 @@ def _write(
             "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
             "passes": [asdict(row) for row in passes]
-            + [row for part in parts for row in read_run(part)["passes"]],
+            + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),
             "map": run_folder.about_map(folder, refined.report),
         }

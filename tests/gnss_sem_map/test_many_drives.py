@@ -46,7 +46,8 @@ import os, signal, sys
 
 def look(event, details):
     place = os.fsdecode(details[1]) if event == "os.rename" else ""
-    if "/drives/.b.work/" in place and "/matches/" not in place:  # a chunk of its scans is put away
+    folder, _, name = place.rpartition("/")
+    if folder.endswith("/drives/.b.work") and name.isdecimal():  # a chunk of its scans is put away
         os.kill(os.getpid(), signal.SIGKILL)
 
 sys.addaudithook(look)

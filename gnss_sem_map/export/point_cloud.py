@@ -104,7 +104,7 @@ def write_laz(exported: Exported, path: Path | str) -> None:
     import laspy
 
     frame = exported.map.frame
-    header = _las_header(exported.map.label_set, frame)
+    header = las_header(exported.map.label_set, frame)
     with (
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
@@ -115,7 +115,8 @@ def write_laz(exported: Exported, path: Path | str) -> None:
                 writer.write_points(_las_points(part, frame, header))
 
 
-def _las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader:
+def las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader:
+    """The header of a file of voxels: coordinate system, names of the classes, extra bytes."""
     import laspy
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
     from pyproj import CRS

@@ -32,6 +32,8 @@ FILES = {
     "map": "the map before refinement, with all evidence, as Parquet tiles",
     "refined": "the refined map as Parquet tiles",
     "drives": "map, evidence, trajectory and report of each of several drives",
+    "changes.geojson": "what changed between drives, as boxes in WGS 84, for web maps and QGIS",
+    "changes.laz": "the voxels of what changed, in UTM; user_data 1: appeared, 2: vanished",
     "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",
@@ -80,6 +82,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         _warnings(run.get("warnings", ())),
         _section("Drives", _drives(run.get("drives", {}), run.get("failed", {}))),
         _section("Places passed again", _passes(run.get("passes", ()))),
+        _section("What changed", _changes(run.get("changes", ()))),
         _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
         _section("What went in", _pairs(run.get("counts", {}))),
         _section("What was left out", _skips(run.get("skips", {}))),
@@ -258,6 +261,27 @@ def _passes(passes: Sequence[Mapping[str, Any]]) -> str:
         for row in passes
     ]  # fmt: skip
     return _table(head, rows)
+
+
+def _changes(changes: Sequence[Mapping[str, Any]]) -> str:
+    """Objects that stand in one session and not in the other one."""
+    head = (
+        "",
+        "what",
+        "kind",
+        "between",
+        "where (east, north, up), m",
+        "size, m",
+        "voxels",
+        "seen through by scans",
+    )
+    rows = [
+        (row["change"], row["class"], row["kind"], f"{row['before']} and {row['after']}",
+         ", ".join(f"{axis:.1f}" for axis in row["centre_m"]), " x ".join(f"{axis:.1f}" for axis in row["size_m"]),
+         row["voxels"], f"{row['seen_through']:g}")
+        for row in changes
+    ]  # fmt: skip
+    return _table(head, rows) if rows else ""
 
 
 def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:

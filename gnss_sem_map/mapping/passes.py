@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 class LocatedDrive:
     """A drive that can be bound to others, in the frame of all."""
 
+    name: str
     log: SensorLog
     trajectory: Trajectory
     condensed: CondensedDrive
@@ -103,5 +104,5 @@ def _table(drives: Sequence[LocatedDrive], revisits: Revisits, bound: Bound) -> 
             for T in (revisits.guesses, after)
         )
         used = int(bound.used[rows].sum())
-        table.append(TwoPasses(drives[a].log.name, drives[b].log.name, len(rows), used, before_m, after_m))
+        table.append(TwoPasses(drives[a].name, drives[b].name, len(rows), used, before_m, after_m))
     return table

@@ -88,7 +88,7 @@ def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: Ru
     """The trajectory, bound to itself where it comes to a place again."""
     if found.solution is None or found.solution.condensed is None:
         return found
-    located = LocatedDrive(log, found.trajectory, found.solution.condensed)
+    located = LocatedDrive(log.name, log, found.trajectory, found.solution.condensed)
     together = bind_passes([located], settings.trajectory.revisits)
     count_passes(together, stats)
     solution, correction = replace(found.solution, condensed=None), together.corrections[0]

@@ -197,9 +197,9 @@ def _bound(names: Sequence[str], settings: Settings, work: Path) -> BoundDrives:
 
 
 def _read(folder: Path) -> LocatedDrive:
-    _, _, _, log, trajectory = read_job(folder)
+    _, source, _, log, trajectory = read_job(folder)
     condensed = CondensedDrive.from_bytes(read_bytes(folder / CONDENSED))
-    return LocatedDrive(log, trajectory, condensed.at(trajectory))
+    return LocatedDrive(source.name, log, trajectory, condensed.at(trajectory))
 
 
 def _as_bytes(correction: Correction) -> bytes:

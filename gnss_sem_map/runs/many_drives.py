@@ -29,16 +29,19 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.evaluation.changes import changes_between
+from gnss_sem_map.export.changes import Change, write_changes
 from gnss_sem_map.files import ownership, work_folder
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
 from gnss_sem_map.mapping.passes import TwoPasses
-from gnss_sem_map.mapping.raw_map import MAP, write_sum
+from gnss_sem_map.mapping.raw_map import MAP, open_raw, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
@@ -329,7 +332,7 @@ def _write(
     labelled: Sequence[Source] = (),
 ) -> dict[str, Any]:
     """Write the map of these drives, whose folders are linked into it, and the point labels of some."""
-    stats = RunStats()
+    stats, label_set = RunStats(), open_label_set(settings.classes)
     with new_folder(out) as folder:
         parts = [folder / DRIVES / name for name in sorted(drives)]
         for part in parts:
@@ -345,6 +348,9 @@ def _write(
             part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
             trajectory = Trajectory.load(part / "trajectory.parquet")
             run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
+        changes = _changes(folder, parts, passes, settings, stats)
+        if changes is not None:
+            write_changes(changes, frame, label_set, folder)
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],
@@ -353,10 +359,34 @@ def _write(
             "passes": [asdict(row) for row in passes]
             + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),
+            "changes": [change.about(label_set) for change in changes or ()],
             "map": run_folder.about_map(folder, refined.report),
         }
         write_merged(folder, settings, about)
     return about
+
+
+def _changes(
+    folder: Path, parts: Sequence[Path], passes: Sequence[TwoPasses], settings: Settings, stats: RunStats
+) -> list[Change] | None:
+    """What changed from each drive to the next one that is bound to it; None where no two drives are bound."""
+    begun = {part.name: _begun(part) for part in parts}
+    bound = [tuple(sorted((row.first, row.second), key=begun.__getitem__)) for row in passes if row.bound]
+    if not bound:
+        return None
+    label_set, found = open_label_set(settings.classes), list[Change]()
+    with stats.stage("changes"):
+        for after in sorted({pair[1] for pair in bound}, key=begun.__getitem__):
+            before = max((pair[0] for pair in bound if pair[1] == after), key=begun.__getitem__)
+            first, second = (open_raw(folder / DRIVES / name, label_set) for name in (before, after))
+            found += [Change(before, after, thing) for thing in changes_between(first, second)]
+    return found
+
+
+def _begun(drive: Path) -> tuple[int, str]:
+    """When a drive began, ns; those of one moment are ordered by name."""
+    about = read_run(drive)
+    return int(about["epoch_ns"] or 0) + int(1e9 * about["scans_s"][0]), drive.name
 
 
 def _summary(drive: Path) -> dict[str, Any]:

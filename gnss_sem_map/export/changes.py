@@ -1,0 +1,115 @@
+"""What changed between sessions, for everybody's own tools: boxes as GeoJSON, voxels as LAZ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.evaluation.changes import ChangedObject
+from gnss_sem_map.export.point_cloud import colours, las_header
+from gnss_sem_map.export.utm import to_utm
+from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.labels.label_set import LabelSet
+
+DEGREE_DIGITS = 9
+GEOJSON, LAZ = "changes.geojson", "changes.laz"
+APPEARED, VANISHED = 1, 2
+"""`user_data` of a voxel."""
+MOVES_BY_ITSELF = "vehicle"
+"""What is of this class was parked, not built."""
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A changed object, and the sessions between which it changed."""
+
+    before: str
+    after: str
+    thing: ChangedObject
+
+    def about(self, label_set: LabelSet) -> dict[str, Any]:
+        """In words and numbers, for run.json, the report and the file."""
+        thing = self.thing
+        name = label_set.names[thing.label] if thing.label >= 0 else "unknown"
+        return {
+            "change": "appeared" if thing.appeared else "vanished",
+            "class": name,
+            "kind": "parked" if name == MOVES_BY_ITSELF else "unknown" if thing.label < 0 else "built",
+            "before": self.before,
+            "after": self.after,
+            "centre_m": thing.centre.round(2).tolist(),
+            "size_m": thing.size.round(2).tolist(),
+            "yaw_deg": round(float(np.degrees(thing.yaw)), 1),
+            "voxels": len(thing.voxels),
+            "seen_through": thing.misses,
+            "hit": thing.hits,
+        }
+
+
+def write_changes(changes: Sequence[Change], frame: LocalFrame, label_set: LabelSet, folder: Path) -> None:
+    """Write `changes.geojson` (RFC 7946: the footprint of every box) and `changes.laz`; raises DataError."""
+    with replacing(folder / GEOJSON) as file:
+        features = [_feature(change, frame, label_set) for change in changes]
+        file.write(json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
+    _write_laz(changes, frame, label_set, folder / LAZ)
+
+
+def _feature(change: Change, frame: LocalFrame, label_set: LabelSet) -> dict[str, Any]:
+    thing = change.thing
+    (length, width, height), (c, s) = thing.size / 2, (np.cos(thing.yaw), np.sin(thing.yaw))
+    # counter-clockwise, and closed
+    corners = np.array(
+        [(-length, -width), (length, -width), (length, width), (-length, width), (-length, -width)]
+    )
+    turned = corners @ np.array([[c, s], [-s, c]])
+    at = np.column_stack([turned, np.full(len(turned), -height)]) + thing.centre
+    lat_deg, lon_deg, alt_m = frame.to_geodetic(at)
+    ring = np.column_stack([lon_deg, lat_deg]).round(DEGREE_DIGITS).tolist()
+    return {
+        "type": "Feature",
+        "geometry": {
+            "type": "Polygon",
+            "coordinates": [
+                [[*place, alt] for place, alt in zip(ring, alt_m.round(3).tolist(), strict=True)]
+            ],
+        },
+        "properties": change.about(label_set),
+    }
+
+
+def _write_laz(changes: Sequence[Change], frame: LocalFrame, label_set: LabelSet, path: Path) -> None:
+    """The voxels of all objects: class and colour of each, `user_data` 1 appeared or 2 vanished, `point_source_id` the
+    number of the object in the GeoJSON file.
+    """
+    import laspy
+
+    header = las_header(label_set, frame)
+    with (
+        replacing(path) as file,
+        laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
+    ):
+        for number, change in enumerate(changes):
+            thing = change.thing
+            labels = np.full(len(thing.voxels), thing.label, np.int8)
+            points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
+            points.x, points.y, points.z = to_utm(frame, thing.voxels.centres).T
+            points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)
+            points.return_number[:] = 1
+            points.number_of_returns[:] = 1
+            points.classification = _code(labels, label_set)
+            points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
+            points.hits = thing.voxels.hits
+            points.user_data[:] = APPEARED if thing.appeared else VANISHED
+            points.point_source_id[:] = number % (1 << 16)
+            writer.write_points(points)
+
+
+def _code(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
+    return np.where(labels < 0, 1, label_set.asprs_codes[labels]).astype(np.uint8)

@@ -65,6 +65,8 @@ class Mapped:
     """Objects that had too few points to be tracked."""
     solution: Solution | None = None
     """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
+    alone: Trajectory | None = None
+    """The trajectory before the drive was bound, to others or to itself; None where nothing binds it."""
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
@@ -107,13 +109,17 @@ def run(
     page, found, sharpness = _checked_and_located(
         log, segmenter, settings, stats, progress, force, match, bound=correction is None
     )
+    alone = None if found.alone is None else in_frame(log, found.alone, origin)[1]
     log, trajectory = in_frame(log, found.trajectory, origin)
-    trajectory = trajectory if correction is None else correction.of(trajectory)
+    if correction is not None:
+        alone, trajectory = trajectory, correction.of(trajectory)
     drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
     mapped = map_drive(
         drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
-    return replace(mapped, solution=found.solution, passes=found.passes, sharpness=sharpness, preflight=page)
+    return replace(
+        mapped, solution=found.solution, alone=alone, passes=found.passes, sharpness=sharpness, preflight=page
+    )
 
 
 def _checked_and_located(

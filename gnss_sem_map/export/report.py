@@ -25,6 +25,7 @@ FILES = {
     "viewer": "the finer voxels of viewer.html, where the map is too large for one page",
     "trajectory.png": PICTURES["trajectory.png"],
     "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
+    "trajectory_alone.parquet": "the same before places that were passed again bound them",
     "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
     "trajectory_covariance.tum": "the same with the covariance of every pose, for smfeval",
     "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",

@@ -38,6 +38,8 @@ class DriveTrajectory:
     """The estimate from GNSS and IMU alone; None if LiDAR odometry was not used."""
     from_lidar_odometry: bool = False
     """Whether nearly all scans were matched, so that static objects are not blurred in the map."""
+    alone: Trajectory | None = None
+    """The trajectory before it was bound to itself; None where nothing binds it."""
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again, and how well it fits."""
 
@@ -92,8 +94,10 @@ def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: Ru
     together = bind_passes([located], settings.trajectory.revisits)
     count_passes(together, stats)
     solution, correction = replace(found.solution, condensed=None), together.corrections[0]
-    trajectory = found.trajectory if correction is None else correction.of(found.trajectory)
-    return replace(found, trajectory=trajectory, solution=solution, passes=together.passes)
+    found = replace(found, solution=solution, passes=together.passes)
+    if correction is None:
+        return found
+    return replace(found, trajectory=correction.of(found.trajectory), alone=found.trajectory)
 
 
 def _in_this_process(

@@ -85,7 +85,7 @@ def write_run(
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
     refined = replace(refined, report=with_objects(refined.report, mapped))
     with mapped.stats.stage("export"):
-        write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
+        write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution, mapped.alone)
         write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
         if write_labels:
             write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
@@ -98,7 +98,7 @@ def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings
 
     `correction`: digest of that with which it is bound to others, empty without.
     """
-    write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution)
+    write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution, mapped.alone)
     about = about_mapped(source, mapped) | {"correction": correction}
     write_about(folder, settings, about, metrics_of(mapped))
 
@@ -192,7 +192,7 @@ def write_trajectory_run(
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        write_trajectory_files(folder, log, found.trajectory, found.solution)
+        write_trajectory_files(folder, log, found.trajectory, found.solution, found.alone)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
@@ -203,9 +203,16 @@ def write_trajectory_run(
 
 
 def write_trajectory_files(
-    folder: Path, log: SensorLog, trajectory: Trajectory, solution: Solution | None
+    folder: Path,
+    log: SensorLog,
+    trajectory: Trajectory,
+    solution: Solution | None,
+    alone: Trajectory | None = None,
 ) -> None:
+    """Write a trajectory in every format, and that before it was bound, if it was."""
     trajectory.save(folder / "trajectory.parquet")
+    if alone is not None:
+        alone.save(folder / "trajectory_alone.parquet")
     write_tum(trajectory, folder / "trajectory.tum")
     if trajectory.covariances is not None:
         write_covariance_tum(trajectory, folder / "trajectory_covariance.tum")

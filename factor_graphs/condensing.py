@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 
 # Without relative poses anchors are so far apart, s.
 ANCHOR_S = 1.5
+# Standard deviations of what stands.
+FIXED_RAD, FIXED_M = 1e-7, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,14 @@ class CondensedDrive:
     T_map_imu: Array
     rows: tuple[Rows, ...]
     position_variances: Array
+
+    @staticmethod
+    def fixed() -> "CondensedDrive":
+        """What stands: one anchor at the origin of the map, which hardly moves."""
+        prior = np.zeros((6, SIZE))
+        prior[:, :6] = np.diag(np.repeat([1 / FIXED_RAD, 1 / FIXED_M], 3))
+        rows = (Rows(np.array([0]), prior, np.zeros(6)),)
+        return CondensedDrive(np.zeros(1), np.eye(4)[None], rows, np.zeros(3))
 
     def __len__(self) -> int:
         return len(self.stamps)

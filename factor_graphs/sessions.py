@@ -259,10 +259,12 @@ def _supported(pairs: AnchorPairs, fits: Mask) -> Mask:
 def _lacking(drives: Sequence[CondensedDrive], n: int, used: AnchorPairs, of_poses: Array, T: Array) -> Array:
     """What the covariances (a, 6, 6) of a drive lack, because its fixes drift together: see `smoothing`.
 
-    Drives that are bound share what theirs say of the place, so the variance falls with their number.
+    Drives that are bound share what theirs say of the place, so their information adds up.
     """
-    together = _bound_to(n, used)
-    wrong = np.mean([drives[m].position_variances for m in together], axis=0) / len(together)
+    variances = np.array([drives[m].position_variances for m in _bound_to(n, used)])
+    wrong = np.where(
+        (variances > 0.0).all(axis=0), 1.0 / np.sum(1.0 / np.maximum(variances, 1e-12), axis=0), 0.0
+    )
     R = T[:, :3, :3]
     in_map = np.einsum("kij,kjl,kil->ki", R, of_poses[:, 3:, 3:], R)
     more = np.zeros_like(of_poses)

@@ -75,6 +75,12 @@ def run(
             help="Also write a class per original LiDAR point; of several drives, in OUT/drives/NAME/."
         ),
     ] = False,
+    align_to: Annotated[
+        Path | None,
+        typer.Option(
+            help="A georeferenced LAS or LAZ of the same place, which stands: the drives are held onto it."
+        ),
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -87,12 +93,12 @@ def run(
     settings, frame, found = settings_of(config, set_), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
-    if len(found) > 1:
+    if len(found) > 1 or align_to is not None:
         if segmenter is None:
             typer.echo(no_segmenter_message(str(found[0])), err=True)
             raise typer.Exit(1)
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)
-        _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, as_json)
+        _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, align_to, as_json)
         return
     [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config)):
@@ -121,6 +127,7 @@ def _run_many(
     workers: int | None,
     scheduler: str | None,
     write_labels: bool,
+    align_to: Path | None,
     as_json: bool,
 ) -> None:
     from gnss_sem_map.runs.many_drives import run_drives
@@ -129,7 +136,7 @@ def _run_many(
         made = run_drives(
             drives, out, settings, how,
             origin=origin, workers=workers or default_workers(), scheduler=scheduler,
-            write_labels=write_labels, progress=progress,
+            write_labels=write_labels, align_to=align_to, progress=progress,
         )  # fmt: skip
     print_many(made.about, out, as_json)
     if made.failed:

@@ -15,7 +15,14 @@ from factor_graphs.corrections import Correction
 from factor_graphs.sessions import Bound, bind
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.scans.revisits import Revisits, RevisitSettings, pass_of, register_passes
+from gnss_sem_map.scans.base_cloud import BaseCloud
+from gnss_sem_map.scans.revisits import (
+    Revisits,
+    RevisitSettings,
+    pass_of,
+    register_passes,
+    register_to_base,
+)
 from gnss_sem_map.sensor_log import SensorLog
 
 Array = NDArray[np.float64]
@@ -54,28 +61,34 @@ class Together:
     refused: int
 
 
-def bind_passes(drives: Sequence[LocatedDrive], settings: RevisitSettings) -> Together:
+def bind_passes(
+    drives: Sequence[LocatedDrive], settings: RevisitSettings, base: BaseCloud | None = None
+) -> Together:
     """Find what the drives passed again, and bind those together that have a place in common; raises EstimationError.
 
-    Of several drives, one that only passes its own places again is left to bind itself.
+    A `base` stands, and counts as one more drive. Of several drives, one that only passes its own places again is left
+    to bind itself.
     """
     passes = [pass_of(drive.log, drive.trajectory, drive.condensed, settings) for drive in drives]
-    revisits = register_passes(passes, settings)
-    corrections: list[Correction | None] = [None] * len(drives)
+    revisits, condensed = register_passes(passes, settings), [drive.condensed for drive in drives]
+    names = [drive.name for drive in drives]
+    if base is not None:
+        revisits += register_to_base(base, len(drives), passes, settings)
+        condensed, names = [*condensed, CondensedDrive.fixed()], [*names, base.name]
+    corrections: list[Correction | None] = [None] * len(names)
     table: list[TwoPasses] = []
-    for group in _components(len(drives), revisits.pairs.drives):
+    for group in _components(len(names), revisits.pairs.drives):
         inside = revisits.of(np.isin(revisits.pairs.drives[:, 0], group))
-        if not len(inside.pairs) or len(group) == 1 < len(drives):
+        if not len(inside.pairs) or len(group) == 1 < len(names):
             continue
-        number = np.full(len(drives), -1)
+        number = np.full(len(names), -1)
         number[group] = np.arange(len(group))
         inside = inside.numbered(number)
-        some = [drives[n] for n in group]
-        bound = bind([drive.condensed for drive in some], inside.pairs)
+        bound = bind([condensed[n] for n in group], inside.pairs)
         for n in np.unique(inside.pairs.drives[bound.used]).tolist():
             corrections[group[n]] = bound.corrections[n]
-        table += _table(some, inside, bound)
-    return Together(corrections, tuple(table), revisits.refused)
+        table += _table([names[n] for n in group], inside, bound)
+    return Together(corrections[: len(drives)], tuple(table), revisits.refused)
 
 
 def _components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:
@@ -91,7 +104,7 @@ def count_passes(together: Together, stats: RunStats) -> None:
     stats.counts["places bound"] += sum(row.bound for row in together.passes)
 
 
-def _table(drives: Sequence[LocatedDrive], revisits: Revisits, bound: Bound) -> list[TwoPasses]:
+def _table(names: Sequence[str], revisits: Revisits, bound: Bound) -> list[TwoPasses]:
     pairs, table = revisits.pairs, []
     after = [
         np.linalg.inv(bound.corrections[a].after[i]) @ bound.corrections[b].after[j]
@@ -104,5 +117,5 @@ def _table(drives: Sequence[LocatedDrive], revisits: Revisits, bound: Bound) -> 
             for T in (revisits.guesses, after)
         )
         used = int(bound.used[rows].sum())
-        table.append(TwoPasses(drives[a].name, drives[b].name, len(rows), used, before_m, after_m))
+        table.append(TwoPasses(names[a], names[b], len(rows), used, before_m, after_m))
     return table

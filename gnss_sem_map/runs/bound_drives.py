@@ -41,13 +41,17 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.drive_job import read_job, write_job
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.source import Source
+from gnss_sem_map.scans.base_cloud import BaseCloud
+from gnss_sem_map.scans.downsampling import one_per_cube
 
 Array = NDArray[np.float64]
 
 NEAR_M = 50.0
 """Tracks that come nearer may have passed the same place: receivers err by metres, and a map reaches 60 m."""
 EVERY_M = 10.0
-"""Tracks are compared by points so far apart."""
+"""Tracks are compared by one point per cube of this edge."""
+BASE = "/base"
+"""Stands for the base among the names of drives, none of which holds a slash."""
 CONDENSED, CORRECTION = "condensed.npz", "correction.npz"
 
 
@@ -72,22 +76,25 @@ def bind_drives(
     work: Path,
     executor: Executor,
     progress: Progress = silent,
+    base: BaseCloud | None = None,
 ) -> BoundDrives:
-    """Locate the drives that may have passed the same places, and bind those that did.
+    """Locate the drives that may have passed the same places, and bind those that did, and what is near a `base`.
 
     `tracks` are of drives by name, (n, 3) m; a drive without one, or that cannot be located, is left as it is.
     Tasks read the settings from `settings_file`.
     """
-    groups = [group for group in groups_of(tracks) if len(group) > 1]
+    places = {**tracks, **({} if base is None else {BASE: base.points})}
+    groups = [group for group in groups_of(places) if len(group) > 1]
     by_name = {source.name: source for source in sources}
-    wanted = [by_name[name] for group in groups for name in group]
+    wanted = [by_name[name] for group in groups for name in group if name != BASE]
     if not (wanted and settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
         return BoundDrives({})
     reasons = _located(wanted, settings_file, frame, work, executor, progress)
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
     for group in groups:
-        found = _bound([name for name in group if not reasons[name]], settings, work)
+        names = [name for name in group if name != BASE and not reasons[name]]
+        found = _bound(names, settings, work, base if BASE in group else None)
         corrections |= found.corrections
         passes += found.passes
     failed = {name: reason for name, reason in reasons.items() if reason}
@@ -97,7 +104,7 @@ def bind_drives(
 def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
     """Names of drives whose tracks come near each other, directly or by others; in the order of names."""
     names = sorted(tracks)
-    thin = [_thinned(tracks[name]) for name in names]
+    thin = [one_per_cube(np.ascontiguousarray(tracks[name]), EVERY_M) for name in names]
     trees = [cKDTree(track) for track in thin]
     edges = [
         (a, b)
@@ -106,11 +113,6 @@ def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
         if np.isfinite(trees[a].query(thin[b], distance_upper_bound=NEAR_M)[0]).any()
     ]
     return _components(names, edges)
-
-
-def _thinned(track: Array) -> Array:
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))])
-    return track[np.unique(np.floor(way / EVERY_M), return_index=True)[1]]
 
 
 def _components(names: Sequence[str], edges: Sequence[tuple[int, int]]) -> list[list[str]]:
@@ -182,12 +184,15 @@ def _known(folder: Path, fingerprint: str) -> bool:
         return False
 
 
-def _bound(names: Sequence[str], settings: Settings, work: Path) -> BoundDrives:
+def _bound(
+    names: Sequence[str], settings: Settings, work: Path, base: BaseCloud | None = None
+) -> BoundDrives:
     """Bind located drives, and save how each moves."""
     names = [name for name in names if (work / BOUND / name / JOB).is_file()]  # others have no LiDAR odometry
-    if len(names) < 2:
+    if not names or (len(names) == 1 and base is None):
         return BoundDrives({})
-    together = bind_passes([_read(work / BOUND / name) for name in names], settings.trajectory.revisits)
+    drives = [_read(work / BOUND / name) for name in names]
+    together = bind_passes(drives, settings.trajectory.revisits, base)
     files = {}
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:

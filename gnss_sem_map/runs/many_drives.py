@@ -28,6 +28,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.evaluation.changes import changes_between
 from gnss_sem_map.export.changes import Change, write_changes
@@ -99,9 +100,12 @@ def run_drives(
     workers: int = 1,
     scheduler: str | None = None,
     write_labels: bool = False,
+    align_to: Path | None = None,
     progress: Progress = silent,
 ) -> ManyDrives:
     """Map several drives into one map, in the frame `origin`, by default that of the first drive.
+
+    `align_to` is a georeferenced LAS or LAZ, which stands: the drives are held onto it.
 
     Drives are shared among `workers` processes, or the workers of the Dask scheduler at the address `scheduler`.
     A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises DataError when all
@@ -110,21 +114,24 @@ def run_drives(
     drives = [_absolute(drive) for drive in drives]
     _check_distinct([(drive.name, drive) for drive in drives])
     with (
-        run_folder.claimed_run(out, drives) as claim,
+        run_folder.claimed_run(out, [*drives, align_to]) as claim,
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
         sources = [how.source(drive) for drive in drives]
         file = _begin(claim, settings, how)
         tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
-        bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress)
+        base = None if align_to is None else read_base(align_to, frame)
+        bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress, base)
         failed = _map_all(sources, claim, bound, file, how, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
         labelled = [source for source in sources if source.name in done and write_labels]
-        about = _write(out, done, settings, frame, failed, claim, bound.passes, executor, progress, labelled)
+        about = _write(
+            out, done, settings, frame, failed, claim, bound.passes, executor, progress, labelled, align_to
+        )
     return ManyDrives(out, about)
 
 
@@ -169,12 +176,13 @@ def _changed(
     progress: Progress,
 ) -> dict[str, Any]:
     """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
-    file = _begin(claim, settings, how)
+    file, align_to = _begin(claim, settings, how), read_run(out).get("aligned_to")
+    base = None if align_to is None else read_base(Path(align_to), frame)
     tracks = {name: _driven(folder) for name, folder in there.items()}
     tracks |= {source.name: track for source in added if (track := _track(source, frame)) is not None}
     known = [_source_of(name, folder) for name, folder in there.items()]
     sources = [*known, *added]
-    bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress)
+    bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress, base)
     for name in there:
         if name in bound.failed:
             raise DataError(
@@ -189,7 +197,10 @@ def _changed(
     if failed:
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
     new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
-    return _write(out, {**there, **new}, settings, frame, {}, claim, bound.passes, InProcess(), progress)
+    return _write(
+        out, {**there, **new}, settings, frame, {}, claim, bound.passes, InProcess(), progress,
+        align_to=None if align_to is None else Path(align_to),
+    )  # fmt: skip
 
 
 def _source_of(name: str, folder: Path) -> Source:
@@ -330,6 +341,7 @@ def _write(
     executor: Executor,
     progress: Progress,
     labelled: Sequence[Source] = (),
+    align_to: Path | None = None,
 ) -> dict[str, Any]:
     """Write the map of these drives, whose folders are linked into it, and the point labels of some."""
     stats, label_set = RunStats(), open_label_set(settings.classes)
@@ -356,6 +368,7 @@ def _write(
             "merged": [part.name for part in parts],
             "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
+            "aligned_to": None if align_to is None else str(align_to.resolve()),
             "passes": [asdict(row) for row in passes]
             + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),
@@ -371,7 +384,11 @@ def _changes(
 ) -> list[Change] | None:
     """What changed from each drive to the next one that is bound to it; None where no two drives are bound."""
     begun = {part.name: _begun(part) for part in parts}
-    bound = [tuple(sorted((row.first, row.second), key=begun.__getitem__)) for row in passes if row.bound]
+    bound = [
+        tuple(sorted((row.first, row.second), key=begun.__getitem__))
+        for row in passes
+        if row.bound and {row.first, row.second} <= begun.keys()
+    ]
     if not bound:
         return None
     label_set, found = open_label_set(settings.classes), list[Change]()

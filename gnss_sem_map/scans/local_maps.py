@@ -49,10 +49,7 @@ class LocalMaps:
         there = [self._sweep(int(scan)) for scan in self._lattice[first : first + SWEEPS]]
         T = np.linalg.inv(self._trajectory.at(self._stamps[place : place + 1])[0])
         points = np.concatenate(there) @ T[:3, :3].T + T[:3, 3]
-        cloud = small_gicp.PointCloud(one_per_cube(np.ascontiguousarray(points), CUBE_M))
-        if cloud.size() > NEIGHBOURS:
-            small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
-        return cloud
+        return cloud_of(one_per_cube(np.ascontiguousarray(points), CUBE_M))
 
     def _read(self, number: int) -> Array:
         """A thinned sweep in the map frame."""
@@ -62,6 +59,15 @@ class LocalMaps:
             return usable_points_in_map(some, scan.stamp, self._trajectory, T_imu_lidar)[0]
         except (DataError, MeasurementError):  # reported when the map is built
             return np.empty((0, 3))
+
+
+def cloud_of(points: Array) -> small_gicp.PointCloud:
+    """Points (n, 3) m, each with the plane of its neighbours; empty where there are too few."""
+    if len(points) <= NEIGHBOURS:
+        return small_gicp.PointCloud(np.empty((0, 3)))
+    cloud = small_gicp.PointCloud(np.ascontiguousarray(points))
+    small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
+    return cloud
 
 
 def way_along(trajectory: Trajectory, stamps: Array) -> Array:

@@ -8,7 +8,8 @@ is metres away. What the pairs are worth in the end, the graph decides (`factor_
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 import small_gicp
@@ -19,6 +20,7 @@ from factor_graphs.condensing import CondensedDrive
 from factor_graphs.sessions import AnchorPairs
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.scans import registration
+from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.local_maps import LocalMaps, normals, way_along
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -134,6 +136,16 @@ class Revisits:
         samples = [self.samples[n] for n in np.flatnonzero(rows)]
         return Revisits(self.pairs[rows], self.guesses[rows], samples, self.refused)
 
+    def __add__(self, more: Revisits) -> Revisits:
+        pairs = AnchorPairs(
+            *(
+                np.concatenate([getattr(self.pairs, part.name), getattr(more.pairs, part.name)])
+                for part in fields(AnchorPairs)
+            )
+        )
+        guesses = np.concatenate([self.guesses, more.guesses])
+        return Revisits(pairs, guesses, self.samples + more.samples, self.refused + more.refused)
+
     def numbered(self, number: NDArray[np.intp]) -> Revisits:
         """The same pairs, drive n being called number[n]."""
         return replace(self, pairs=replace(self.pairs, drives=number[self.pairs.drives]))
@@ -148,7 +160,7 @@ class Revisits:
 
 def register_passes(passes: Sequence[Pass], settings: RevisitSettings) -> Revisits:
     """Register all places that were passed again."""
-    found, samples, refused = [], [], 0
+    found, refused = list[_Found](), 0
     for earlier, i, later, j in candidates(passes, settings):
         first, second = passes[earlier], passes[later]
         guess = registration.rigid(registration.inverse(first.T_map_imu[i]) @ second.T_map_imu[j])
@@ -157,16 +169,51 @@ def register_passes(passes: Sequence[Pass], settings: RevisitSettings) -> Revisi
         if match is None:
             refused += 1
         else:
-            samples.append(_sample(surfaces))
-            found.append(((earlier, later), (first.anchors[i], second.anchors[j]), *match, guess))
-    drives, anchors, T, covariances, guesses = zip(*found, strict=True) if found else ((),) * 5
+            anchors = int(first.anchors[i]), int(second.anchors[j])
+            found.append(_Found((earlier, later), anchors, *match, guess, _sample(surfaces)))
+    return _revisits(found, refused)
+
+
+def register_to_base(
+    base: BaseCloud, number: int, passes: Sequence[Pass], settings: RevisitSettings
+) -> Revisits:
+    """Register all places to a cloud that stands: it has one anchor, at the origin, and this number as a drive."""
+    found, refused = list[_Found](), 0
+    for later, drive in enumerate(passes):
+        for j, T in enumerate(drive.T_map_imu):
+            around = base.around(T)
+            if not around.size():
+                continue
+            surfaces = drive.maps.at(j)
+            match = register(around, surfaces, np.eye(4), settings)
+            if match is None:
+                refused += 1
+            else:
+                T_here, covariance = match
+                anchors = 0, int(drive.anchors[j])
+                at = registration.rigid(T @ T_here)
+                found.append(_Found((number, later), anchors, at, covariance, T, _sample(surfaces)))
+    return _revisits(found, refused)
+
+
+class _Found(NamedTuple):
+    drives: tuple[int, int]
+    anchors: tuple[int, int]
+    T: Array
+    covariance: Array
+    guess: Array
+    sample: tuple[Array, Array]
+
+
+def _revisits(found: Sequence[_Found], refused: int) -> Revisits:
     pairs = AnchorPairs(
-        np.array(drives, np.intp).reshape(-1, 2),
-        np.array(anchors, np.intp).reshape(-1, 2),
-        np.array(T).reshape(-1, 4, 4),
-        np.array(covariances).reshape(-1, 6, 6),
+        np.array([one.drives for one in found], np.intp).reshape(-1, 2),
+        np.array([one.anchors for one in found], np.intp).reshape(-1, 2),
+        np.array([one.T for one in found]).reshape(-1, 4, 4),
+        np.array([one.covariance for one in found]).reshape(-1, 6, 6),
     )
-    return Revisits(pairs, np.array(guesses).reshape(-1, 4, 4), samples, refused)
+    guesses = np.array([one.guess for one in found]).reshape(-1, 4, 4)
+    return Revisits(pairs, guesses, [one.sample for one in found], refused)
 
 
 def _sample(surfaces: small_gicp.PointCloud) -> tuple[Array, Array]:

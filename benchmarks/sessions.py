@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -35,6 +36,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.dynamics.visibility import hits_and_misses
 from gnss_sem_map.evaluation.changes import ChangeSettings
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
+from gnss_sem_map.export.utm import from_utm
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.passes import LocatedDrive, bind_passes
@@ -189,7 +191,11 @@ def search_ms(days: Sequence[Day]) -> float:
 
 
 def changes(days: Sequence[Day], drives: Sequence[Path], out: Path) -> Figures:
-    """Objects that were found and that there are; those that one session hardly saw do not count."""
+    """Objects that were found and that there are; those that one session hardly saw do not count.
+
+    One that was found is right when most of its voxels lie in boxes of the truth; one that is there is found when half
+    of its voxels that are seen through are among those that were found.
+    """
     label_set, second = open_label_set(SETTINGS.classes), days[1]
     sessions = [open_raw(out / "drives" / drive.name, label_set) for drive in drives]
     stamps = np.arange(second.true.start + 0.5, second.true.end - 0.5, 0.5)
@@ -201,31 +207,42 @@ def changes(days: Sequence[Day], drives: Sequence[Path], out: Path) -> Figures:
     assert second.log.frame is not None
     G = frame.pose_of(second.log.frame)
     boxes = json.loads((drives[1] / "truth" / "changes.json").read_text())["changes"]
-    found = read_run(out)["changes"]
-    right: set[int] = set()
+    found, voxels = read_run(out)["changes"], _voxels_of_changes(out, frame)
+    covered = [np.zeros(len(of_thing), np.bool_) for of_thing in voxels]
     told = kinds = wanted = hit = 0
     for box in boxes:
         centre = G[:3, :3] @ np.array([box["x_m"], box["y_m"], box["z_m"]]) + G[:3, 3] + offset
         appeared = box["change"] == "appeared"
-        mine = [
-            n for n, thing in enumerate(found)
-            if (thing["change"] == "appeared") == appeared and _touches(thing, box, centre)
-        ]  # fmt: skip
-        right |= set(mine)
+        inside = {
+            n: _inside(voxels[n], box, centre, 0.3)
+            for n, thing in enumerate(found)
+            if (thing["change"] == "appeared") == appeared
+        }
+        for n, rows in inside.items():
+            covered[n] |= rows
+        mine = [n for n, rows in inside.items() if rows.mean() > 0.5]
         if mine and found[mine[0]]["kind"] != "unknown":
             told, kinds = told + 1, kinds + (found[mine[0]]["kind"] == box["cause"])
-        if max(box["length_m"], box["width_m"], box["height_m"]) >= 0.5 and _both_saw(
-            sessions[int(appeared)], sessions[1 - int(appeared)], box, centre
-        ):
-            wanted, hit = wanted + 1, hit + bool(mine)
+        if max(box["length_m"], box["width_m"], box["height_m"]) >= 0.5:
+            seen = _seen_through(sessions[int(appeared)], sessions[1 - int(appeared)], box, centre)
+            wanted, hit = wanted + (seen > 0), hit + (0 < seen <= 2 * sum(map(np.sum, inside.values())))
+    right = sum(rows.mean() > 0.5 for rows in covered)
     return {
         "found": len(found),
-        "right": len(right),
+        "right": right,
         "there": wanted,
         "recalled": hit,
         "told": told,
         "kind_right": kinds,
     }
+
+
+def _voxels_of_changes(out: Path, frame: LocalFrame) -> list[Array]:
+    """The voxels of every object that was found, (n, 3) m in the map, from the file that users get."""
+    points = laspy.read(out / "changes.laz")
+    places = from_utm(frame, np.column_stack([points.x, points.y, points.z]))
+    numbers = np.asarray(points.point_source_id, np.int64)
+    return [places[numbers == n] for n in range(numbers.max(initial=-1) + 1)]
 
 
 def _inside(points: Array, box: Figures, centre: Array, margin_m: float) -> NDArray[np.bool_]:
@@ -235,30 +252,22 @@ def _inside(points: Array, box: Figures, centre: Array, margin_m: float) -> NDAr
     return np.asarray((np.abs(turned) <= half).all(axis=1))
 
 
-def _touches(thing: Figures, box: Figures, centre: Array) -> bool:
-    """Whether a box that was found covers or lies in one that there is: a grid in it, or its centre."""
-    u, v, w = np.meshgrid(*[np.linspace(-0.5, 0.5, 7)] * 3)
-    grid = np.column_stack([axis.ravel() for axis in (u, v, w)]) * thing["size_m"]
-    yaw = np.radians(thing["yaw_deg"])
-    c, s = np.cos(yaw), np.sin(yaw)
-    places = grid @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + thing["centre_m"]
-    return bool(_inside(places, box, centre, 0.3).mean() > 0.3)
-
-
-def _both_saw(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> bool:
-    """Whether one session has the object in its map, and the other one looked through where most of it was."""
+def _seen_through(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> int:
+    """How many voxels of an object one session has, and the other one looks through; 0 where that is not most of it."""
     settings = ChangeSettings()
     centres = np.concatenate([stands.around(tile, 0.0).centres for tile in stands.fused.tiles])
     places = centres[_inside(centres, box, centre, 0.1)]
     places = places[places[:, 2] > centre[2] - box["height_m"] / 2 + settings.over_ground_m]
     if len(places) < settings.least_voxels:
-        return False
+        return 0
     counts = np.zeros((2, len(places)), np.int32)
     keyframes = gone.evidence.keyframes_near(places, settings.farthest_m)
     for part in keyframes.parts() if keyframes is not None else ():
         counts += hits_and_misses(places, part, settings.farthest_m)
-    through = (counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])
-    return bool(through.sum() >= max(settings.least_voxels, len(places) / 2))
+    through = int(
+        ((counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])).sum()
+    )
+    return through if through >= max(settings.least_voxels, len(places) / 2) else 0
 
 
 def simulated(gnss: str, seeds: Sequence[int], work: Path) -> Figures:

@@ -39,7 +39,9 @@ class ChangeSettings(BaseModel):
     farthest_m: float = Field(40.0, gt=0, description="Scans farther than this are no evidence.")
     least_points: int = Field(2, ge=1, description="A voxel with fewer points proves nothing.")
     over_ground_m: float = Field(0.3, ge=0, description="Voxels that are not so far above the lowest stay.")
-    together_m: float = Field(0.5, gt=0, description="Changed voxels that are nearer are of one object.")
+    together_m: float = Field(
+        0.36, gt=0, description="Changed voxels that are nearer are of one object: those of 0.2 m that touch."
+    )
     least_voxels: int = Field(12, ge=1, description="Fewer voxels are no object.")
     least_size_m: float = Field(0.5, ge=0, description="Nor is what is smaller in every direction.")
 

@@ -238,3 +238,18 @@ def test_without_pairs_nothing_moves(sessions):
     assert np.abs(correction.after - correction.before).max() < 1e-3
     track = sessions[0].trajectory
     assert np.allclose(correction.of(track).position_stddevs, track.position_stddevs, rtol=0.02)
+
+
+def test_what_stands_draws_drives_to_it_and_makes_them_sure(motion, sessions):
+    drive, rng = condensed(sessions[0]), np.random.default_rng(7)
+    rows = []
+    for anchor in range(2, len(drive) - 2, 6):
+        T = motion.poses(drive.stamps[[anchor]])[0] @ exp(MATCH * rng.standard_normal((1, 6)))[0]
+        rows.append(((1, 0), (0, anchor), T, np.diag(MATCH**2)))
+    bound = bind([drive, CondensedDrive.fixed()], AnchorPairs(*map(np.array, zip(*rows, strict=True))))
+    assert bound.used.all()
+    assert np.abs(bound.corrections[1].after - np.eye(4)).max() < 1e-3
+    track = bound.corrections[0].of(sessions[0].trajectory)
+    off = track.positions - motion.poses(track.stamps)[:, :3, 3]
+    assert np.abs(off).max() < 0.05
+    assert track.position_stddevs.max() < 0.05

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
+from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
@@ -18,6 +21,7 @@ from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.bound_drives import groups_of
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
+from gnss_sem_map.scans.deskew import points_in_map
 from gnss_sem_map.simulation import simulate
 
 pytestmark = pytest.mark.integration
@@ -130,3 +134,76 @@ def test_tracks_are_grouped_by_where_they_come_near() -> None:
     }
     assert groups_of(tracks) == [["a", "b", "c"], ["d"], ["e"]]
     assert groups_of({}) == []
+
+
+def write_base(drive: Path, path: Path) -> None:
+    """What a surveyor has of the first day: its points, exactly georeferenced."""
+    log, true = open_drive(drive, with_imu=False), truth_of(drive)
+    assert log.frame is not None
+    scans = [scan for scan in log.scans[::4] if true.start < scan.stamp - 0.1 and scan.stamp + 0.1 < true.end]
+    points = [points_in_map(scan.read(), scan.stamp, true, log.calibration.T_imu_lidar) for scan in scans]
+    lat_deg, lon_deg, alt_m = log.frame.to_geodetic(np.concatenate(points)[::3])
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_crs(CRS.from_epsg(log.frame.utm_epsg))
+    x, y = Transformer.from_crs(4326, log.frame.utm_epsg, always_xy=True).transform(lon_deg, lat_deg)
+    header.scales, header.offsets = np.full(3, 1e-3), np.floor([x[0], y[0], alt_m[0]])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = x, y, alt_m
+    las.write(path)
+
+
+def test_a_drive_is_held_onto_a_cloud_that_stands(days: list[Path], tmp_path: Path) -> None:
+    write_base(days[0], tmp_path / "base.laz")
+    made = run_drives(days[1:], tmp_path / "out", Settings(), HOW, align_to=tmp_path / "base.laz")
+    (row,) = made.about["passes"]
+    assert (row["first"], row["second"]) == (days[1].name, "base.laz") or row["first"] == "base.laz"
+    assert row["bound"] >= 3
+    frame = LocalFrame(**made.about["local_frame"])
+    log = open_drive(days[1], with_imu=False)
+    assert log.frame is not None
+    true = truth_of(days[1]).moved(frame.pose_of(log.frame))
+    for file, least, most in (("trajectory", 0.0, 0.03), ("trajectory_alone", 0.2, np.inf)):
+        track = Trajectory.load(tmp_path / "out" / "drives" / days[1].name / f"{file}.parquet")
+        stamps = np.arange(true.start + 0.5, true.end - 0.5, 0.5)
+        off = np.linalg.norm(track.at(stamps)[:, :3, 3] - true.at(stamps)[:, :3, 3], axis=1)
+        assert least <= off.min()
+        assert off.max() < most
+
+
+def test_what_changed_is_in_the_truth_and_in_the_files(days: list[Path], both: Path) -> None:
+    about = read_run(both)
+    frame, log = LocalFrame(**about["local_frame"]), open_drive(days[1], with_imu=False)
+    assert log.frame is not None
+    G, true = frame.pose_of(log.frame), truth_of(days[1])
+    stamps = np.arange(true.start + 0.5, true.end - 0.5, 0.5)
+    offset = (tracks_in(both, days)[1].at(stamps) - G @ true.at(stamps))[:, :3, 3].mean(axis=0)
+    truth = json.loads((days[1] / "truth" / "changes.json").read_text())["changes"]
+    cars = [
+        change for change in about["changes"] if min(change["size_m"][:2]) > 1.5 and change["voxels"] > 200
+    ]
+    assert len(cars) >= 3
+    for change in cars:
+        apart = [
+            np.linalg.norm(
+                (G @ [*(box[f"{axis}_m"] for axis in "xyz"), 1.0])[:2] + offset[:2] - change["centre_m"][:2]
+            )
+            for box in truth
+            if box["change"] == change["change"]
+        ]
+        assert min(apart) < 1.0
+    features = json.loads((both / "changes.geojson").read_text())["features"]
+    points = laspy.read(both / "changes.laz")
+    assert [feature["properties"] for feature in features] == about["changes"]
+    lon_lat = Transformer.from_crs(points.header.parse_crs(), 4326, always_xy=True).transform(
+        points.x, points.y
+    )
+    for n, (feature, change) in enumerate(zip(features, about["changes"], strict=True)):
+        ring = np.array(feature["geometry"]["coordinates"][0])[:, :2]
+        assert np.array_equal(ring[0], ring[-1])
+        mine = np.asarray(points.point_source_id) == n
+        assert mine.sum() == change["voxels"]
+        assert set(np.asarray(points.user_data)[mine]) == {1 if change["change"] == "appeared" else 2}
+        places = np.column_stack([axis[mine] for axis in lon_lat])
+        slack = 3e-6  # degrees: 0.3 m
+        assert (places >= ring.min(axis=0) - slack).all()
+        assert (places <= ring.max(axis=0) + slack).all()

@@ -36,6 +36,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.dynamics.visibility import hits_and_misses
 from gnss_sem_map.evaluation.changes import ChangeSettings
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
+from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.export.utm import from_utm
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
@@ -91,10 +92,7 @@ def days_of(drives: Sequence[Path], out: Path) -> list[Day]:
 
 
 def truth_of(drive: Path) -> Trajectory:
-    rows = np.loadtxt(drive / "truth" / "trajectory.tum")
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4]
-    return Trajectory(rows[:, 0], T)
+    return read_tum(drive / "truth" / "trajectory.tum")
 
 
 def surfaces_apart(days: Sequence[Day]) -> tuple[Array, Array]:

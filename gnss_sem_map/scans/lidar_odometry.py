@@ -20,7 +20,7 @@ from operator import add
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.relative_poses import RelativePoses
@@ -32,6 +32,7 @@ from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.deskew import usable_points_at_stamp
 from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.scans.revisits import RevisitSettings
 from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
 
@@ -53,10 +54,8 @@ ANCHOR_SCANS, ANCHORS_BOUND = 10, 3
 WARM_UP_SCANS = 50
 
 
-class ScanMatchingSettings(BaseModel):
+class ScanMatchingSettings(DegenerateSettings):
     """How sweeps are matched; the defaults suit a spinning LiDAR of 16 to 128 beams on a road vehicle."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     nearest_m: float = Field(2.5, ge=0, description="Nearer returns, of the vehicle itself, are left out.")
     farthest_m: float = Field(80.0, gt=0, description="Farther returns are too sparse to match.")
@@ -83,13 +82,6 @@ class ScanMatchingSettings(BaseModel):
     # and 0.2 to 0.5 mrad over a second, several times the value that follows from the number of points.
     translation_stddev_m: float = Field(0.005, gt=0, description="Least standard deviation of translation.")
     rotation_stddev_rad: float = Field(0.0005, gt=0, description="Least standard deviation of rotation.")
-    degenerate_share: float = Field(
-        0.0031,
-        gt=0,
-        lt=1,
-        description="A direction constrained by less than this share of points is degenerate.",
-    )
-    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in degenerate directions.")
 
 
 class TrajectorySettings(SmootherSettings):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
@@ -13,6 +14,20 @@ Array = NDArray[np.float64]
 # them has a weight of at least 1/2 in any direction, even along both planes, where nothing is known; 500 across.
 TANGENTIAL_WEIGHT, NORMAL_WEIGHT = 0.5, 500.0
 MAX_ITERATIONS = 30
+
+
+class DegenerateSettings(BaseModel):
+    """What is done in directions that no surface holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    degenerate_share: float = Field(
+        0.0031,
+        gt=0,
+        lt=1,
+        description="A direction constrained by less than this share of points is degenerate.",
+    )
+    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in degenerate directions.")
 
 
 def has_converged(result: small_gicp.RegistrationResult) -> bool:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.sessions import AnchorPairs
@@ -22,6 +22,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.local_maps import LocalMaps, normals, way_along
+from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.sensor_log import SensorLog
 
 Array = NDArray[np.float64]
@@ -35,10 +36,8 @@ SAMPLED = 300
 """Points of a local map by which the distance of surfaces is told."""
 
 
-class RevisitSettings(BaseModel):
+class RevisitSettings(DegenerateSettings):
     """How places that are passed again are found and registered."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = Field(True, description="Bind places that are passed again, of one drive or of several.")
     every_m: float = Field(10.0, gt=0, description="Places are so far apart along the track.")
@@ -51,13 +50,6 @@ class RevisitSettings(BaseModel):
     # errors of a registration beside noise: simulated passes show 1 to 10 mm
     translation_stddev_m: float = Field(0.005, gt=0, description="Least standard deviation of translation.")
     rotation_stddev_rad: float = Field(0.0005, gt=0, description="Least standard deviation of rotation.")
-    degenerate_share: float = Field(
-        0.0031,
-        gt=0,
-        lt=1,
-        description="A direction constrained by less than this share of points is degenerate.",
-    )
-    degenerate_stddev_m: float = Field(10.0, gt=0, description="Standard deviation in degenerate directions.")
 
 
 @dataclass(frozen=True, eq=False)

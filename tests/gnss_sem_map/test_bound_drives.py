@@ -10,13 +10,13 @@ import laspy
 import numpy as np
 import pytest
 from pyproj import CRS, Transformer
-from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.bound_drives import groups_of
@@ -53,10 +53,7 @@ def both(days: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def truth_of(drive: Path) -> Trajectory:
-    rows = np.loadtxt(drive / "truth" / "trajectory.tum")
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4]
-    return Trajectory(rows[:, 0], T)
+    return read_tum(drive / "truth" / "trajectory.tum")
 
 
 def between(days: list[Path], tracks: list[Trajectory], frame: LocalFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -223,8 +223,11 @@ def changes(days: Sequence[Day], drives: Sequence[Path], out: Path) -> Figures:
             told, kinds = told + 1, kinds + (found[mine[0]]["kind"] == box["cause"])
         if max(box["length_m"], box["width_m"], box["height_m"]) >= 0.5:
             seen = _seen_through(sessions[int(appeared)], sessions[1 - int(appeared)], box, centre)
-            wanted, hit = wanted + (seen > 0), hit + (0 < seen <= 2 * sum(map(np.sum, inside.values())))
-    right = sum(rows.mean() > 0.5 for rows in covered)
+            wanted, hit = (
+                wanted + (seen > 0),
+                hit + (0 < seen <= 2 * sum(int(rows.sum()) for rows in inside.values())),
+            )
+    right = sum(bool(rows.mean() > 0.5) for rows in covered)
     return {
         "found": len(found),
         "right": right,

@@ -7,7 +7,7 @@ OUT/map, ...        their sum, refined and exported as the map of one drive is
 
 Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once:
 drives that it was bound to are mapped again, the others stay.
-A drive is a task of `mapping.execution`: the name of a function, paths and settings.
+Each drive is a task (`drive_tasks`).
 """
 
 from __future__ import annotations
@@ -30,32 +30,31 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
-from gnss_sem_map.evaluation.changes import changes_between
-from gnss_sem_map.export.changes import Change, write_changes
+from gnss_sem_map.export.changes import write_changes
 from gnss_sem_map.files import ownership, work_folder
 from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import Claim, new_folder, refuse_inputs
+from gnss_sem_map.files.output_folder import Claim, new_folder
 from gnss_sem_map.files.run_json import inputs_of, read_run
-from gnss_sem_map.files.untrusted import is_file, is_folder, shown
+from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.passes import TwoPasses
-from gnss_sem_map.mapping.raw_map import MAP, open_raw, write_sum
+from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
+from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
+from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.voxels.map_json import read_frame
 
 Array = NDArray[np.float64]
 
-SETTINGS = "config.yaml"
 OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
 """Files of a drive beside its map, evidence and trajectory."""
 
@@ -123,7 +122,7 @@ def run_drives(
         tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
         base = None if align_to is None else read_base(align_to, frame)
         bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress, base)
-        failed = _map_all(sources, claim, bound, file, how, frame, executor, progress)
+        failed = map_all(sources, claim.work, bound, file, how.force, frame, executor, progress)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
@@ -193,7 +192,7 @@ def _changed(
         source for source in known
         if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
     ]  # fmt: skip
-    failed = _map_all([*moved, *added], claim, bound, file, how, frame, InProcess(), progress)
+    failed = map_all([*moved, *added], claim.work, bound, file, how.force, frame, InProcess(), progress)
     if failed:
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
     new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
@@ -206,7 +205,8 @@ def _changed(
 def _source_of(name: str, folder: Path) -> Source:
     """What a drive of a finished map was made from."""
     inputs = inputs_of(folder)
-    return Source(str(inputs.get("drive", folder / name)), inputs.get("segmenter"), inputs.get("frames"))
+    drive = str(inputs.get("drive", folder / name))
+    return Source(drive, inputs.get("segmenter"), inputs.get("frames"), called=name)
 
 
 def _correction_of(folder: Path) -> str:
@@ -232,66 +232,6 @@ def _track(source: Source, frame: LocalFrame) -> Array | None:
     return track
 
 
-def map_one(
-    source: Mapping[str, Any],
-    folder: str,
-    settings: str,
-    origin: Sequence[float],
-    force: bool,
-    correction: str,
-) -> str:
-    """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
-    try:
-        _map_one(
-            Source(**source),
-            Path(folder),
-            config.load(Path(settings)),
-            LocalFrame(*origin),
-            force,
-            correction,
-        )
-    except (SemMapError, FactorGraphError) as error:
-        return str(error)
-    except OSError as error:
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
-    return ""
-
-
-def _map_one(
-    source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool, correction_file: str
-) -> None:
-    correction, digest = read_correction(correction_file)
-    if _is_done(folder, settings, source.inputs, frame, digest):  # what is not to be used was removed before
-        return
-    places = run_folder.places_read(Path(source.drive), settings, source.segmenter)
-    with run_folder.claimed_run(folder, places) as claim:
-        log = source.open_log()
-        refuse_inputs(claim.out, sorted(log.folders))
-        network = source.open_network(settings, log)
-        with new_folder(folder) as part:
-            mapped = pipeline.run(
-                log, network, settings, part, claim.work,
-                origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),
-                labels_from=source.labels_from, force=force, correction=correction,
-            )  # fmt: skip
-            run_folder.write_drive(part, source, mapped, settings, digest)
-
-
-def _is_done(
-    folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame, correction: str
-) -> bool:
-    """Whether a folder holds this drive, mapped from the same inputs in the same way."""
-    if not is_file(folder / "run.json"):
-        return False
-    try:
-        about = read_run(folder)
-        same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
-        same = same and about["correction"] == correction
-        return bool(same and config.load(folder / SETTINGS) == settings)
-    except (SemMapError, KeyError):
-        return False
-
-
 def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
     """Prepare the work folder; returns the file of the settings, for tasks."""
     if not how.resume:
@@ -301,33 +241,6 @@ def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
     file = claim.work / DRIVES / SETTINGS
     file.write_text(settings.to_yaml(), "utf-8")
     return file
-
-
-def _map_all(
-    sources: Sequence[Source],
-    claim: Claim,
-    bound: BoundDrives,
-    settings_file: Path,
-    how: HowMapped,
-    frame: LocalFrame,
-    executor: Executor,
-    progress: Progress,
-) -> dict[str, str]:
-    """Map every drive into the work folder; name -> reason of those that fail."""
-    origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
-    tasks = []
-    for source in sources:
-        arguments = (
-            asdict(source),
-            str(claim.work / DRIVES / source.name),
-            str(settings_file),
-            origin,
-            how.force,
-            str(bound.corrections.get(source.name, "")),
-        )
-        tasks.append(Task(source.name, "gnss_sem_map.runs.many_drives:map_one", arguments))
-    found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
-    return {task.name: reason.removeprefix(f"{task.name}: ") for task, reason in found if reason}
 
 
 def _write(
@@ -360,7 +273,8 @@ def _write(
             part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
             trajectory = Trajectory.load(part / "trajectory.parquet")
             run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
-        changes = _changes(folder, parts, passes, settings, stats)
+        with stats.stage("changes"):
+            changes = changes_in(folder, parts, passes, label_set)
         if changes is not None:
             write_changes(changes, frame, label_set, folder)
         about = {
@@ -377,33 +291,6 @@ def _write(
         }
         write_merged(folder, settings, about)
     return about
-
-
-def _changes(
-    folder: Path, parts: Sequence[Path], passes: Sequence[TwoPasses], settings: Settings, stats: RunStats
-) -> list[Change] | None:
-    """What changed from each drive to the next one that is bound to it; None where no two drives are bound."""
-    begun = {part.name: _begun(part) for part in parts}
-    bound = [
-        tuple(sorted((row.first, row.second), key=begun.__getitem__))
-        for row in passes
-        if row.bound and {row.first, row.second} <= begun.keys()
-    ]
-    if not bound:
-        return None
-    label_set, found = open_label_set(settings.classes), list[Change]()
-    with stats.stage("changes"):
-        for after in sorted({pair[1] for pair in bound}, key=begun.__getitem__):
-            before = max((pair[0] for pair in bound if pair[1] == after), key=begun.__getitem__)
-            first, second = (open_raw(folder / DRIVES / name, label_set) for name in (before, after))
-            found += [Change(before, after, thing) for thing in changes_between(first, second)]
-    return found
-
-
-def _begun(drive: Path) -> tuple[int, str]:
-    """When a drive began, ns; those of one moment are ordered by name."""
-    about = read_run(drive)
-    return int(about["epoch_ns"] or 0) + int(1e9 * about["scans_s"][0]), drive.name
 
 
 def _summary(drive: Path) -> dict[str, Any]:

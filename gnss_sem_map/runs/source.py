@@ -24,11 +24,13 @@ class Source:
     frames: str | None = None
     drive_format: str | None = None
     device: str = "auto"
+    called: str = ""
+    """The name of the drive, where its folder has another one now: it was given as a link."""
 
     @property
     def name(self) -> str:
         """The name of the drive: that of its folder, or of the link that was given."""
-        return Path(self.drive).name
+        return self.called or Path(self.drive).name
 
     @property
     def labels_from(self) -> str:

@@ -296,7 +296,7 @@ def test_a_run_that_is_killed_in_its_second_drive_is_resumed_there(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def stopped(*_: object) -> NoReturn:
+def stopped(*_: object, **__: object) -> NoReturn:
     raise KeyboardInterrupt
 
 

@@ -278,7 +278,8 @@ def _changes(changes: Sequence[Mapping[str, Any]]) -> str:
     )
     rows = [
         (row["change"], row["class"], row["kind"], f"{row['before']} and {row['after']}",
-         ", ".join(f"{axis:.1f}" for axis in row["centre_m"]), " x ".join(f"{axis:.1f}" for axis in row["size_m"]),
+         ",\u00a0".join(f"{axis:.1f}" for axis in row["centre_m"]),
+         "\u00a0x\u00a0".join(f"{axis:.1f}" for axis in row["size_m"]),
          row["voxels"], f"{row['seen_through']:g}")
         for row in changes
     ]  # fmt: skip

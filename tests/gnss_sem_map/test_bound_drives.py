@@ -18,11 +18,13 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.mapping.trajectory import locate
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.bound_drives import groups_of
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.scans.deskew import points_in_map
-from gnss_sem_map.simulation import simulate
+from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 pytestmark = pytest.mark.integration
 
@@ -204,3 +206,39 @@ def test_what_changed_is_in_the_truth_and_in_the_files(days: list[Path], both: P
         slack = 3e-6  # degrees: 0.3 m
         assert (places >= ring.min(axis=0) - slack).all()
         assert (places <= ring.max(axis=0) + slack).all()
+
+
+@pytest.mark.slow
+def test_a_drive_around_the_block_is_bound_to_its_first_lap(tmp_path: Path) -> None:
+    """With a quarter of the columns, and an image of a few pixels, which nobody looks at."""
+    lidar = Lidar(columns=520)
+    camera = Camera(width=62, height=19, focal_px=36.0, centre_u_px=30.5, centre_v_px=9.0)
+    drive = simulate(tmp_path, None, SEED, laps=2, lidar=lidar, camera=camera)
+    log, stats = open_drive(drive), RunStats()
+    found = locate(log, Settings(), stats)
+    (row,) = found.passes
+    assert (row.first, row.second) == (drive.name, drive.name)
+    assert row.places >= 10
+    assert row.bound > 0.9 * row.places
+    assert stats.counts["places bound"] == row.bound
+    assert row.after_m < 0.01
+    true, alone = truth_of(drive), found.alone
+    assert alone is not None
+    errors = [lap_errors(true, track) for track in (alone, found.trajectory)]
+    assert np.median(errors[1]) < 0.02
+    assert np.median(errors[1]) < 0.5 * np.median(errors[0])
+    assert locate(log, Settings(), RunStats(), bound=False).passes == ()
+
+
+def lap_errors(true: Trajectory, track: Trajectory) -> np.ndarray:
+    """How far from the truth the way is from where the drive was to where it is again, (k,) m."""
+    stamps = np.arange(true.start + 0.5, true.end - 0.5, 0.5)
+    places = true.at(stamps)[:, :3, 3]
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+    apart[np.abs(stamps[:, None] - stamps[None]) < 30.0] = np.inf
+    again = np.flatnonzero(apart.min(axis=1) < 5.0)
+    again = again[stamps[again] > np.median(stamps)]
+    first = apart[again].argmin(axis=1)
+    a, b = stamps[first], stamps[again]
+    way, true_way = track.at(b) - track.at(a), true.at(b) - true.at(a)
+    return np.asarray(np.linalg.norm((way - true_way)[:, :3, 3], axis=1))

@@ -32,6 +32,8 @@ BELIEVED = 1.5
 NEIGHBOURS = 12
 # Rounds of weights and of solutions; corrections stand still when they move less, m and rad.
 ROUNDS, STILL = 30, 1e-4
+# Covariances are computed at every so many anchors: they change slowly, and to compute all would take most of the time.
+EVERY_NTH = 4
 # Columns that are solved for at once.
 TOGETHER = 240
 
@@ -179,9 +181,11 @@ class _System:
     def pose_covariances(self, state: _State) -> Iterator[Array]:
         """Covariances (a, 6, 6) of the poses of each drive's anchors."""
         for drive, condensed in enumerate(self.drives):
-            columns = np.concatenate([self.columns_of(drive, anchor) for anchor in range(len(condensed))])
+            chosen = np.unique(np.append(np.arange(0, len(condensed), EVERY_NTH), len(condensed) - 1))
+            columns = np.concatenate([self.columns_of(drive, anchor) for anchor in chosen.tolist()])
             picked = (np.ones(len(columns)), (np.arange(len(columns)), columns))
-            yield self.variances(state, sparse.csr_array(picked, (len(columns), len(self.start))))
+            found = self.variances(state, sparse.csr_array(picked, (len(columns), len(self.start))))
+            yield _between(chosen, found, state.poses[drive])
 
     def _poses(self, x: Array) -> list[Array]:
         return [
@@ -191,6 +195,19 @@ class _System:
             ])
             for drive, condensed in enumerate(self.drives)
         ]  # fmt: skip
+
+
+def _between(chosen: NDArray[np.intp], covariances: Array, poses: Array) -> Array:
+    """Covariances of all poses (a, 4, 4) from those (c, 6, 6) of the chosen ones: linear in between, in map axes."""
+    axes = np.zeros((len(poses), 6, 6))
+    axes[:, :3, :3] = axes[:, 3:, 3:] = poses[:, :3, :3]
+    in_map = axes[chosen] @ covariances @ np.swapaxes(axes[chosen], 1, 2)
+    places = np.arange(len(poses))
+    i = np.clip(np.searchsorted(chosen, places, side="right") - 1, 0, max(len(chosen) - 2, 0))
+    after = np.minimum(i + 1, len(chosen) - 1)
+    u = ((places - chosen[i]) / np.maximum(chosen[after] - chosen[i], 1))[:, None, None]
+    found: Array = np.swapaxes(axes, 1, 2) @ ((1 - u) * in_map[i] + u * in_map[after]) @ axes
+    return found
 
 
 def _stacked(drives: Sequence[CondensedDrive], first: NDArray[np.intp]) -> tuple[sparse.csr_array, Array]:

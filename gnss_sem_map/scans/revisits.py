@@ -22,6 +22,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.local_maps import LocalMaps, normals, way_along
+from gnss_sem_map.scans.prefetch import prefetch, threads
 from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -32,6 +33,8 @@ LEVELS = ((4.0, 4.0, 0.1), (2.0, 2.0, 0.05), (1.0, 1.0, 0.01), (0.5, 0.5, 0.01),
 begin 2.5 m away come to less than 2 cm, and 9 of 10 that begin 4 m away."""
 JUDGED = 3
 """The level by whose residuals a match is judged: the last one leaves out what does not fit."""
+THREADS = min(threads(), 4)
+"""Each registers a pair, with two local maps in memory."""
 SAMPLED = 300
 """Points of a local map by which the distance of surfaces is told."""
 
@@ -152,40 +155,45 @@ class Revisits:
 
 def register_passes(passes: Sequence[Pass], settings: RevisitSettings) -> Revisits:
     """Register all places that were passed again."""
-    found, refused = list[_Found](), 0
-    for earlier, i, later, j in candidates(passes, settings):
+
+    def registered(pair: tuple[int, int, int, int]) -> _Found | None:
+        earlier, i, later, j = pair
         first, second = passes[earlier], passes[later]
         guess = registration.rigid(registration.inverse(first.T_map_imu[i]) @ second.T_map_imu[j])
         surfaces = second.maps.at(j)
         match = register(first.maps.at(i), surfaces, guess, settings)
         if match is None:
-            refused += 1
-        else:
-            anchors = int(first.anchors[i]), int(second.anchors[j])
-            found.append(_Found((earlier, later), anchors, *match, guess, _sample(surfaces)))
-    return _revisits(found, refused)
+            return None
+        anchors = int(first.anchors[i]), int(second.anchors[j])
+        return _Found((earlier, later), anchors, *match, guess, _sample(surfaces))
+
+    return _revisits([found for _, found in prefetch(registered, candidates(passes, settings), THREADS)])
 
 
 def register_to_base(
     base: BaseCloud, number: int, passes: Sequence[Pass], settings: RevisitSettings
 ) -> Revisits:
     """Register all places to a cloud that stands: it has one anchor, at the origin, and this number as a drive."""
-    found, refused = list[_Found](), 0
-    for later, drive in enumerate(passes):
-        for j, T in enumerate(drive.T_map_imu):
-            around = base.around(T)
-            if not around.size():
-                continue
-            surfaces = drive.maps.at(j)
-            match = register(around, surfaces, np.eye(4), settings)
-            if match is None:
-                refused += 1
-            else:
-                T_here, covariance = match
-                anchors = 0, int(drive.anchors[j])
-                at = registration.rigid(T @ T_here)
-                found.append(_Found((number, later), anchors, at, covariance, T, _sample(surfaces)))
-    return _revisits(found, refused)
+
+    def registered(place: tuple[int, int, small_gicp.PointCloud]) -> _Found | None:
+        later, j, around = place
+        surfaces = passes[later].maps.at(j)
+        match = register(around, surfaces, np.eye(4), settings)
+        if match is None:
+            return None
+        (T_here, covariance), T = match, passes[later].T_map_imu[j]
+        anchors = 0, int(passes[later].anchors[j])
+        return _Found(
+            (number, later), anchors, registration.rigid(T @ T_here), covariance, T, _sample(surfaces)
+        )
+
+    places = (
+        (later, j, around)
+        for later, drive in enumerate(passes)
+        for j, T in enumerate(drive.T_map_imu)
+        if (around := base.around(T)).size()
+    )
+    return _revisits([found for _, found in prefetch(registered, places, THREADS)])
 
 
 class _Found(NamedTuple):
@@ -197,7 +205,8 @@ class _Found(NamedTuple):
     sample: tuple[Array, Array]
 
 
-def _revisits(found: Sequence[_Found], refused: int) -> Revisits:
+def _revisits(results: Sequence[_Found | None]) -> Revisits:
+    found = [one for one in results if one is not None]
     pairs = AnchorPairs(
         np.array([one.drives for one in found], np.intp).reshape(-1, 2),
         np.array([one.anchors for one in found], np.intp).reshape(-1, 2),
@@ -205,7 +214,7 @@ def _revisits(found: Sequence[_Found], refused: int) -> Revisits:
         np.array([one.covariance for one in found]).reshape(-1, 6, 6),
     )
     guesses = np.array([one.guess for one in found]).reshape(-1, 4, 4)
-    return Revisits(pairs, guesses, [one.sample for one in found], refused)
+    return Revisits(pairs, guesses, [one.sample for one in found], len(results) - len(found))
 
 
 def _sample(surfaces: small_gicp.PointCloud) -> tuple[Array, Array]:

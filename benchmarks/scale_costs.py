@@ -56,7 +56,7 @@ def constants(measured: dict[str, Any]) -> dict[str, float]:
         "`refined/map.json`, kB per tile": 1e-3 * long["bytes"]["refined/map.json"] / long["tiles"],
         "peak memory, drive of 480 s, MB": memory["peak_mb_480_s"],
         "the same over 60 s": memory["peak_480_over_60"],
-        "smoothing, MB per hour of a drive": grows / (480 - 60) * 3600,
+        "smoothing and binding, MB per hour of a drive": grows / (480 - 60) * 3600,
     }
 
 
@@ -92,7 +92,7 @@ def limits(constant: dict[str, float]) -> dict[str, float]:
         / constant["tiles per km of street"],
         "km of one drive until its `run.json` is full": LARGEST_JSON
         / (1e3 * constant["`run.json`, kB per km"]),
-        "hours of one drive in 16 GB of memory": 16_000 / constant["smoothing, MB per hour of a drive"],
+        "hours of one drive in 16 GB of memory": 16_000 / constant["smoothing and binding, MB per hour of a drive"],
         "MB/s that a core reads while it maps": 1e-6 * per_core,
     }
 

@@ -92,7 +92,8 @@ def limits(constant: dict[str, float]) -> dict[str, float]:
         / constant["tiles per km of street"],
         "km of one drive until its `run.json` is full": LARGEST_JSON
         / (1e3 * constant["`run.json`, kB per km"]),
-        "hours of one drive in 16 GB of memory": 16_000 / constant["smoothing and binding, MB per hour of a drive"],
+        "hours of one drive in 16 GB of memory": 16_000
+        / constant["smoothing and binding, MB per hour of a drive"],
         "MB/s that a core reads while it maps": 1e-6 * per_core,
     }
 

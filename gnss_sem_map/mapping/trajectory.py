@@ -90,6 +90,7 @@ def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: Ru
     """The trajectory, bound to itself where it comes to a place again."""
     if found.solution is None or found.solution.condensed is None:
         return found
+    release_memory()  # of the graph
     located = LocatedDrive(log.name, log, found.trajectory, found.solution.condensed)
     together = bind_passes([located], settings.trajectory.revisits)
     count_passes(together, stats)

@@ -51,6 +51,7 @@ from gnss_sem_map.scans.local_maps import LocalMaps, normals
 from gnss_sem_map.scans.revisits import RevisitSettings, pass_of, register_passes
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
+from gnss_sem_map.simulation.oxts import Gnss
 from gnss_sem_map.voxels.voxel_map import keys_of
 
 Array = NDArray[np.float64]
@@ -271,7 +272,7 @@ def _seen_through(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> 
     return through if through >= max(settings.least_voxels, len(places) / 2) else 0
 
 
-def simulated(gnss: str, seeds: Sequence[int], work: Path) -> Figures:
+def simulated(gnss: Gnss, seeds: Sequence[int], work: Path) -> Figures:
     """Figures over all seeds."""
     rows: list[Figures] = []
     for seed in seeds:
@@ -288,11 +289,11 @@ def simulated(gnss: str, seeds: Sequence[int], work: Path) -> Figures:
     return summary(rows) | {"seeds": rows}
 
 
-def _drives(gnss: str, seed: int, work: Path) -> list[Path]:
+def _drives(gnss: Gnss, seed: int, work: Path) -> list[Path]:
     folder = work / f"{gnss}_{seed}"
     for session in (0, 1):
         if not (folder / f".{session}").exists():
-            simulate(folder, SECONDS, seed, session=session, gnss=gnss)  # type: ignore[arg-type]
+            simulate(folder, SECONDS, seed, session=session, gnss=gnss)
             (folder / f".{session}").touch()
     return sorted(folder.glob("*/*_sync"))
 

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 
 from factor_graphs.chi_square import quantile
@@ -160,9 +161,7 @@ class _System:
                 rows.append(np.repeat(6 * n + np.arange(6), 6))
                 columns.append(np.tile(place, 6))
                 values.append(J.ravel())
-        empty = np.empty(0)
-        triple = (np.concatenate([*part, empty]) for part in (values, rows, columns))
-        data, row, column = triple
+        data, row, column = (np.concatenate([*part, np.empty(0)]) for part in (values, rows, columns))
         return sparse.csr_array(
             (data, (row.astype(int), column.astype(int))), (6 * len(pairs), len(self.start))
         ), r
@@ -278,7 +277,8 @@ def _lacking(drives: Sequence[CondensedDrive], n: int, used: AnchorPairs, of_pos
 
     Drives that are bound share what theirs say of the place, so their information adds up.
     """
-    variances = np.array([drives[m].position_variances for m in _bound_to(n, used)])
+    (together,) = (group for group in components(len(drives), used.drives) if n in group)
+    variances = np.array([drives[m].position_variances for m in together])
     wrong = np.where(
         (variances > 0.0).all(axis=0), 1.0 / np.sum(1.0 / np.maximum(variances, 1e-12), axis=0), 0.0
     )
@@ -289,11 +289,8 @@ def _lacking(drives: Sequence[CondensedDrive], n: int, used: AnchorPairs, of_pos
     return more
 
 
-def _bound_to(drive: int, pairs: AnchorPairs) -> set[int]:
-    """The drives that are bound to one, itself included."""
-    found, before = {drive}, 0
-    while len(found) > before:
-        before = len(found)
-        touched = np.isin(pairs.drives, list(found)).any(axis=1)
-        found |= set(pairs.drives[touched].ravel().tolist())
-    return found
+def components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:
+    """The groups of so many drives that edges (e, 2) connect, directly or by others, each in ascending order."""
+    graph = sparse.coo_array((np.ones(len(edges)), tuple(edges.T)), (count, count))
+    groups, of_drive = connected_components(graph, directed=False)
+    return [np.flatnonzero(of_drive == group).tolist() for group in range(groups)]

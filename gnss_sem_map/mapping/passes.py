@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
-from factor_graphs.sessions import Bound, bind
+from factor_graphs.sessions import Bound, bind, components
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.base_cloud import BaseCloud
@@ -77,7 +75,7 @@ def bind_passes(
         condensed, names = [*condensed, CondensedDrive.fixed()], [*names, base.name]
     corrections: list[Correction | None] = [None] * len(names)
     table: list[TwoPasses] = []
-    for group in _components(len(names), revisits.pairs.drives):
+    for group in components(len(names), revisits.pairs.drives):
         inside = revisits.of(np.isin(revisits.pairs.drives[:, 0], group))
         if not len(inside.pairs) or len(group) == 1 < len(names):
             continue
@@ -89,13 +87,6 @@ def bind_passes(
             corrections[group[n]] = bound.corrections[n]
         table += _table([names[n] for n in group], inside, bound)
     return Together(corrections[: len(drives)], tuple(table), revisits.refused)
-
-
-def _components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:
-    """Drives that are connected by pairs, in their order."""
-    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), (count, count))
-    groups, of_drive = connected_components(graph, directed=False)
-    return [np.flatnonzero(of_drive == group).tolist() for group in range(groups)]
 
 
 def count_passes(together: Together, stats: RunStats) -> None:

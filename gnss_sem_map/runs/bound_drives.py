@@ -20,14 +20,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.sessions import components
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import SemMapError
@@ -112,14 +111,8 @@ def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
         for a in range(b)
         if np.isfinite(trees[a].query(thin[b], distance_upper_bound=NEAR_M)[0]).any()
     ]
-    return _components(names, edges)
-
-
-def _components(names: Sequence[str], edges: Sequence[tuple[int, int]]) -> list[list[str]]:
-    first, second = np.array(edges, np.intp).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(first)), (first, second)), (len(names), len(names)))
-    count, of_name = connected_components(graph, directed=False)
-    return [[names[n] for n in np.flatnonzero(of_name == group).tolist()] for group in range(count)]
+    groups = components(len(names), np.array(edges, np.intp).reshape(-1, 2))
+    return [[names[n] for n in group] for group in groups]
 
 
 def _located(

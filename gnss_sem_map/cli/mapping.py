@@ -138,6 +138,7 @@ def _run_many(
             origin=origin, workers=workers or default_workers(), scheduler=scheduler,
             write_labels=write_labels, align_to=align_to, progress=progress,
         )  # fmt: skip
+    warn(made.about["warnings"])
     print_many(made.about, out, as_json)
     if made.failed:
         raise typer.Exit(1)
@@ -166,6 +167,7 @@ def add(
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
     with progress_bars() as progress:
         made = add_drive(out, drive, how, progress=progress)
+    warn(made.about["warnings"])
     print_many(made.about, out, as_json)
 
 
@@ -179,6 +181,7 @@ def remove(
 
     with progress_bars() as progress:
         made = remove_drive(out, name, progress)
+    warn(made.about["warnings"])
     print_many(made.about, out, as_json)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.evaluation.changes import ChangedObject
@@ -19,7 +19,8 @@ from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
 
 DEGREE_DIGITS = 9
-GEOJSON, LAZ = "changes.geojson", "changes.laz"
+CHANGES = "changes"
+GEOJSON, LAZ = f"{CHANGES}.geojson", f"{CHANGES}.laz"
 APPEARED, VANISHED = 1, 2
 """`user_data` of a voxel."""
 MOVES_BY_ITSELF = "vehicle"
@@ -61,16 +62,19 @@ def write_changes(changes: Sequence[Change], frame: LocalFrame, label_set: Label
     _write_laz(changes, frame, label_set, folder / LAZ)
 
 
+def box_corners(centre: ArrayLike, size: ArrayLike, yaw: float) -> NDArray[np.float64]:
+    """Corners (8, 3) m of an upright box: the lower four counter-clockwise, then the upper four above them."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    flat = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    corners = np.column_stack([np.tile(flat, (2, 1)), np.repeat([-1, 1], 4)]) * np.asarray(size) / 2
+    turned = corners @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    return np.asarray(turned + np.asarray(centre))
+
+
 def _feature(change: Change, frame: LocalFrame, label_set: LabelSet) -> dict[str, Any]:
     thing = change.thing
-    (length, width, height), (c, s) = thing.size / 2, (np.cos(thing.yaw), np.sin(thing.yaw))
-    # counter-clockwise, and closed
-    corners = np.array(
-        [(-length, -width), (length, -width), (length, width), (-length, width), (-length, -width)]
-    )
-    turned = corners @ np.array([[c, s], [-s, c]])
-    at = np.column_stack([turned, np.full(len(turned), -height)]) + thing.centre
-    lat_deg, lon_deg, alt_m = frame.to_geodetic(at)
+    closed = box_corners(thing.centre, thing.size, thing.yaw)[[0, 1, 2, 3, 0]]
+    lat_deg, lon_deg, alt_m = frame.to_geodetic(closed)
     ring = np.column_stack([lon_deg, lat_deg]).round(DEGREE_DIGITS).tolist()
     return {
         "type": "Feature",

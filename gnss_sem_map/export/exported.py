@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ class Exported:
     tracks: Sequence[Trajectory] = ()
     """Of every drive; pictures show the map from them."""
     title: str | None = None
+    changes: Sequence[Mapping[str, Any]] = ()
+    """What changed between drives, as `Change.about` tells it."""
 
     @cached_property
     def extent(self) -> Extent:

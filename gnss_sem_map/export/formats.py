@@ -30,7 +30,7 @@ SMALL = 1_000_000
 FORMATS = (
     Format(
         "viewer", "viewer.html", "the map to turn and to ask, in any browser, offline",
-        lambda e, path: write_viewer(e.map, e.tracks, path, title=e.title or "Semantic map"),
+        lambda e, path: write_viewer(e.map, e.tracks, path, e.title or "Semantic map", changes=e.changes),
     ),
     Format(
         "laz", "map.laz",

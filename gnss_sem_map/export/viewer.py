@@ -11,7 +11,7 @@ import html
 import json
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.changes import box_corners
 from gnss_sem_map.export.exported import NO_VOXELS
 from gnss_sem_map.export.viewer_levels import Node, lowest_tile, visit_nodes
 from gnss_sem_map.files.atomic import adding_folder, replacing
@@ -47,11 +48,13 @@ def write_viewer(
     path: Path | str,
     title: str = "Semantic map",
     most_voxels: int = 3_000_000,
+    changes: Sequence[Mapping[str, Any]] = (),
 ) -> None:
     """Write the map as an HTML page that works from file://, some 2 MB per million voxels.
 
-    Classes, the tracks, removed and unlabelled voxels are layers to switch; colours show class, height, confidence
-    or where the class comes from; a click tells what a voxel is. Up to `most_voxels` the page holds the map. Above,
+    Classes, the tracks, removed and unlabelled voxels are layers to switch, and so are the boxes of `changes` (rows of
+    `Change.about`); colours show class, height, confidence or where the class comes from; a click tells what a voxel or
+    a box is. Up to `most_voxels` the page holds the map. Above,
     voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of the page's name (`viewer/`
     beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map is read tile by tile.
     Raises DataError for an empty map, when that folder exists, and when a file cannot be written.
@@ -64,7 +67,7 @@ def write_viewer(
     with adding_folder(path.with_suffix("")) as folder:
         levels = _Levels(folder, most_voxels, len(tiled_map.label_set.names))
         visit_nodes(tiled_map, levels.add, most_voxels)
-        page = _page(levels, tiled_map, tracks, path.stem, title)
+        page = _page(levels, tiled_map, tracks, changes, path.stem, title)
         with replacing(path) as file:
             file.write(page.encode("utf-8"))
 
@@ -132,11 +135,18 @@ def _encoded(node: Node) -> str:
     return base64.b64encode(packed).decode("ascii")
 
 
-def _page(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory], folder: str, title: str) -> str:
+def _page(
+    levels: _Levels,
+    tiled_map: TiledMap,
+    tracks: Sequence[Trajectory],
+    changes: Sequence[Mapping[str, Any]],
+    folder: str,
+    title: str,
+) -> str:
     nodes = levels.in_page
     if not nodes:
         raise DataError(NO_VOXELS)
-    meta = _meta(levels, tiled_map, tracks) | ({"folder": folder} if nodes[0].level else {})
+    meta = _meta(levels, tiled_map, tracks, changes) | ({"folder": folder} if nodes[0].level else {})
     assets = resources.files("gnss_sem_map.export") / "assets"
     return Template((assets / "viewer.html").read_text("utf-8")).substitute(
         title=html.escape(title),
@@ -147,7 +157,12 @@ def _page(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory], fo
     )
 
 
-def _meta(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory]) -> dict[str, Any]:
+def _meta(
+    levels: _Levels,
+    tiled_map: TiledMap,
+    tracks: Sequence[Trajectory],
+    changes: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
     """Metadata for the page; lengths are in voxels of the map from `origin`, the lowest corner of its tiles."""
     west, south = lowest_tile(tiled_map.tiles)
     origin = np.array([west << TILE_BITS, south << TILE_BITS, -Z_OFFSET])
@@ -175,6 +190,7 @@ def _meta(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory]) ->
             "distance": float(max(40.0, 0.9 * (high_corner - low_corner)[:2].max())),
         },
         "tracks": [line.round(2).tolist() for line in lines],
+        "changes": [_changed_box(change, tiled_map.voxel_size_m, origin) for change in changes],
         "classes": [
             {"name": name, "colour": colour, "count": count}
             for name, colour, count in zip(
@@ -184,6 +200,18 @@ def _meta(levels: _Levels, tiled_map: TiledMap, tracks: Sequence[Trajectory]) ->
                 strict=False,
             )
         ],
+    }
+
+
+def _changed_box(change: Mapping[str, Any], voxel_m: float, origin: NDArray[np.int64]) -> dict[str, Any]:
+    """The box of a changed object, its lower corners first, and what a click says of it."""
+    corners = box_corners(change["centre_m"], change["size_m"], np.radians(change["yaw_deg"]))
+    size = " x ".join(f"{side:.1f}" for side in change["size_m"])
+    return {
+        "layer": change["change"],
+        "corners": (corners / voxel_m - origin).round(2).tolist(),
+        "text": f"{change['class']} {change['change']} ({change['kind']}), {size} m, "
+        f"between {change['before']} and {change['after']}",
     }
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
+from factor_graphs.errors import EstimationError
 from factor_graphs.sessions import Bound, bind, components
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.run_stats import RunStats
@@ -52,17 +53,21 @@ class TwoPasses:
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """Drives that are bound: corrections of each, None where no pair holds one; `refused` places did not match."""
+    """Drives that are bound: corrections of each, None where no pair holds one; `refused` places did not match.
+
+    `warnings` name the drives that stay as they are because their equations have no solution.
+    """
 
     corrections: list[Correction | None]
     passes: tuple[TwoPasses, ...]
     refused: int
+    warnings: tuple[str, ...]
 
 
 def bind_passes(
     drives: Sequence[LocatedDrive], settings: RevisitSettings, base: BaseCloud | None = None
 ) -> Together:
-    """Find what the drives passed again, and bind those together that have a place in common; raises EstimationError.
+    """Find what the drives passed again, and bind those together that have a place in common.
 
     A `base` stands, and counts as one more drive. Of several drives, one that only passes its own places again is left
     to bind itself.
@@ -75,6 +80,7 @@ def bind_passes(
         condensed, names = [*condensed, CondensedDrive.fixed()], [*names, base.name]
     corrections: list[Correction | None] = [None] * len(names)
     table: list[TwoPasses] = []
+    warnings: list[str] = []
     for group in components(len(names), revisits.pairs.drives):
         inside = revisits.of(np.isin(revisits.pairs.drives[:, 0], group))
         if not len(inside.pairs) or len(group) == 1 < len(names):
@@ -82,17 +88,24 @@ def bind_passes(
         number = np.full(len(names), -1)
         number[group] = np.arange(len(group))
         inside = inside.numbered(number)
-        bound = bind([condensed[n] for n in group], inside.pairs)
+        try:
+            bound = bind([condensed[n] for n in group], inside.pairs)
+        except EstimationError as error:
+            warnings.append(
+                f"{', '.join(names[n] for n in group)}: not bound where they passed again; {error}"
+            )
+            continue
         for n in np.unique(inside.pairs.drives[bound.used]).tolist():
             corrections[group[n]] = bound.corrections[n]
         table += _table([names[n] for n in group], inside, bound)
-    return Together(corrections[: len(drives)], tuple(table), revisits.refused)
+    return Together(corrections[: len(drives)], tuple(table), revisits.refused, tuple(warnings))
 
 
 def count_passes(together: Together, stats: RunStats) -> None:
-    """Count what was passed again, and what of it was left out."""
+    """Count what was passed again, and what of it was left out; warn of what could not be bound."""
     stats.counts["places passed again"] += sum(row.places for row in together.passes) + together.refused
     stats.counts["places bound"] += sum(row.bound for row in together.passes)
+    stats.warnings.extend(together.warnings)
 
 
 def _table(names: Sequence[str], revisits: Revisits, bound: Bound) -> list[TwoPasses]:

@@ -58,11 +58,12 @@ CONDENSED, CORRECTION = "condensed.npz", "correction.npz"
 class BoundDrives:
     """Name -> file of the correction of each drive that is bound to others, and what binds them.
 
-    `failed`: name -> reason of drives that could not be located.
+    `warnings` name drives that could not be bound; `failed`: name -> reason of drives that could not be located.
     """
 
     corrections: Mapping[str, Path]
     passes: tuple[TwoPasses, ...] = ()
+    warnings: tuple[str, ...] = ()
     failed: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -91,13 +92,15 @@ def bind_drives(
     reasons = _located(wanted, settings_file, frame, work, executor, progress)
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
+    warnings: list[str] = []
     for group in groups:
         names = [name for name in group if name != BASE and not reasons[name]]
         found = _bound(names, settings, work, base if BASE in group else None)
         corrections |= found.corrections
         passes += found.passes
+        warnings += found.warnings
     failed = {name: reason for name, reason in reasons.items() if reason}
-    return BoundDrives(corrections, tuple(passes), failed)
+    return BoundDrives(corrections, tuple(passes), tuple(warnings), failed)
 
 
 def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
@@ -191,7 +194,7 @@ def _bound(
         if correction is not None:
             files[name] = work / BOUND / name / CORRECTION
             write_whole(files[name], _as_bytes(correction))
-    return BoundDrives(files, together.passes)
+    return BoundDrives(files, together.passes, together.warnings)
 
 
 def _read(folder: Path) -> LocatedDrive:

@@ -19,6 +19,7 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.export.changes import CHANGES
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.files.atomic import link_or_copy
@@ -163,6 +164,8 @@ class Run:
                     )
             refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
+                for file in self.folder.glob(f"{CHANGES}.*"):
+                    link_or_copy(file, folder / file.name)
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
                 for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
@@ -223,7 +226,8 @@ class Run:
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
         refined = tiles.open_map(self.folder / "refined", self.label_set)
-        exported = Exported(refined, tracks_of(self.folder), str(self.about["name"]))
+        about = self.about
+        exported = Exported(refined, tracks_of(self.folder), str(about["name"]), about.get("changes", ()))
         if to is None:
             return [self._amended(known[name], exported) for name in chosen]
         files = [Path(to) / known[name].file for name in chosen]

@@ -40,11 +40,10 @@ from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess
-from gnss_sem_map.mapping.passes import TwoPasses
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
+from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
@@ -129,7 +128,7 @@ def run_drives(
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
         labelled = [source for source in sources if source.name in done and write_labels]
         about = _write(
-            out, done, settings, frame, failed, claim, bound.passes, executor, progress, labelled, align_to
+            out, done, settings, frame, failed, claim, bound, executor, progress, labelled, align_to
         )
     return ManyDrives(out, about)
 
@@ -197,7 +196,7 @@ def _changed(
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
     new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
     return _write(
-        out, {**there, **new}, settings, frame, {}, claim, bound.passes, InProcess(), progress,
+        out, {**there, **new}, settings, frame, {}, claim, bound, InProcess(), progress,
         align_to=None if align_to is None else Path(align_to),
     )  # fmt: skip
 
@@ -250,7 +249,7 @@ def _write(
     frame: LocalFrame,
     failed: Mapping[str, str],
     claim: Claim,
-    passes: Sequence[TwoPasses],
+    bound: BoundDrives,
     executor: Executor,
     progress: Progress,
     labelled: Sequence[Source] = (),
@@ -274,7 +273,7 @@ def _write(
             trajectory = Trajectory.load(part / "trajectory.parquet")
             run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
         with stats.stage("changes"):
-            changes = changes_in(folder, parts, passes, label_set)
+            changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
             write_changes(changes, frame, label_set, folder)
         about = {
@@ -283,7 +282,8 @@ def _write(
             "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
             "aligned_to": None if align_to is None else str(align_to.resolve()),
-            "passes": [asdict(row) for row in passes]
+            "warnings": list(bound.warnings),
+            "passes": [asdict(row) for row in bound.passes]
             + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),
             "changes": [change.about(label_set) for change in changes or ()],

@@ -55,7 +55,7 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
 
 def write_merged(folder: Path, settings: Settings, about: dict[str, Any]) -> None:
     """Write the files of a run of several drives beside its maps and tracks, which are there already."""
-    write_map_files(folder, tracks_of(folder), str(about["name"]))
+    write_map_files(folder, tracks_of(folder), str(about["name"]), about.get("changes", ()))
     write_about(folder, settings, about, {})
 
 

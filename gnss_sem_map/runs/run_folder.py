@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, astuple, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -158,9 +158,11 @@ def write_again(
     write_about(folder, settings, about, {"sharpness": metrics.get("sharpness", {})})
 
 
-def write_map_files(folder: Path, tracks: Sequence[Trajectory], title: str) -> None:
+def write_map_files(
+    folder: Path, tracks: Sequence[Trajectory], title: str, changes: Sequence[Mapping[str, Any]] = ()
+) -> None:
     """Write the refined map of a run folder in all formats."""
-    write_exports(Exported(tiles.open_map(folder / REFINED), tracks, title), folder)
+    write_exports(Exported(tiles.open_map(folder / REFINED), tracks, title, changes), folder)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:

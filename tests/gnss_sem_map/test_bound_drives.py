@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import NoReturn
 
 import laspy
 import numpy as np
 import pytest
 from pyproj import CRS, Transformer
+from viewer_pages import part
 
+from factor_graphs.errors import EstimationError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
@@ -18,10 +21,12 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.files.run_json import read_run
+from gnss_sem_map.mapping import passes
 from gnss_sem_map.mapping.trajectory import locate
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs import finished_run
 from gnss_sem_map.runs.bound_drives import groups_of
+from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.scans.deskew import points_in_map
 from gnss_sem_map.simulation import Camera, Lidar, simulate
@@ -206,6 +211,37 @@ def test_what_changed_is_in_the_truth_and_in_the_files(days: list[Path], both: P
         slack = 3e-6  # degrees: 0.3 m
         assert (places >= ring.min(axis=0) - slack).all()
         assert (places <= ring.max(axis=0) + slack).all()
+
+
+def test_the_viewer_shows_what_changed_and_all_of_it_stays_when_the_map_is_refined_again(
+    both: Path, tmp_path: Path
+) -> None:
+    again = Run.open(both).refine(Settings(), tmp_path / "again").folder
+    for out in (both, again):
+        changes = read_run(out)["changes"]
+        meta = json.loads(part((out / "viewer.html").read_text("utf-8"), "meta"))
+        assert [box["layer"] for box in meta["changes"]] == [change["change"] for change in changes]
+        centres = np.array([np.mean(box["corners"], axis=0) for box in meta["changes"]])
+        places = (centres + meta["origin"]) * meta["voxel_m"]
+        np.testing.assert_allclose(places, [change["centre_m"] for change in changes], atol=0.02)
+    found, expected = products(again), products(both)
+    assert {name: found.get(name) for name in expected} == expected
+
+
+def test_drives_whose_equations_have_no_solution_stay_as_they_are_and_are_named(
+    days: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsolvable(*_: object) -> NoReturn:
+        raise EstimationError("the equations of the drives have no solution: singular")
+
+    monkeypatch.setattr(passes, "bind", unsolvable)
+    about = run_drives(days, tmp_path / "out", Settings(), HOW).about
+    names = ", ".join(drive.name for drive in days)
+    assert about["warnings"] == [
+        f"{names}: not bound where they passed again; the equations of the drives have no solution: singular"
+    ]
+    assert about["failed"] == {}
+    assert about["passes"] == about["changes"] == []
 
 
 @pytest.mark.slow

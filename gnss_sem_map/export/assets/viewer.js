@@ -12,9 +12,19 @@ const canvas = document.querySelector("canvas");
 const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
 const hash = new URLSearchParams(location.hash.slice(1));  // #colour=height&hide=building,vegetation
 const MOST_BEADS = 500000;
-const classes = meta.classes.length;  // then one entry for unlabelled and one for the track
+// Pairs of corners of a box, the lower four first.
+const EDGES = [0, 1, 2, 3].flatMap(i => [[i, (i + 1) % 4], [i + 4, (i + 1) % 4 + 4], [i, i + 4]]);
+const classes = meta.classes.length;  // then one entry for unlabelled, and those of lines
+const edges = ({ corners, text }) => EDGES.map(([i, j]) => ({ points: [corners[i], corners[j]], text }));
+const boxLayer = (name, colour, boxes) => ({ name, colour, count: boxes.length, lines: boxes.flatMap(edges) });
+const lineLayers = [
+  { name: "track", colour: [255, 214, 10], count: meta.tracks.length,
+    lines: meta.tracks.map(points => ({ points, text: "track" })) },
+  boxLayer("appeared", [80, 230, 255], meta.changes.filter(({ layer }) => layer === "appeared")),
+  boxLayer("vanished", [255, 80, 220], meta.changes.filter(({ layer }) => layer === "vanished")),
+];
 const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], count: meta.unlabelled },
-                { name: "track", colour: [255, 214, 10], count: meta.tracks.flat().length }];
+                ...lineLayers];
 const hidden = new Set((hash.get("hide") ?? (meta.classes.some(c => c.count) ? "unlabelled" : "")).split(","));
 const visible = layers.map(layer => !hidden.has(layer.name));
 let showRemoved = hash.has("removed"), mode = 0, frameAsked = false;
@@ -45,20 +55,20 @@ async function unpack(node, text) {
   upload(node, decoded(bytes, node.count), gl.SHORT, STRIDE);
 }
 
-// The tracks as beads; long ones have fewer.
-function trackNode(tracks) {
-  const corner = tracks[0][0], steps = (a, b) => Math.hypot(...a.map((v, k) => b[k] - v));
-  const pairs = tracks.flatMap(track => track.slice(1).map((point, i) => [track[i], point]));
-  const length = pairs.reduce((sum, [a, b]) => sum + steps(a, b), 0);
-  const apart = Math.max(TRACK_HALF, length / MOST_BEADS), beads = [];
-  for (const [a, b] of pairs) {
-    const n = Math.ceil(steps(a, b) / apart);
-    for (let s = 0; s < n; s++) beads.push(a.map((v, k) => v - corner[k] - 0.5 + (b[k] - v) * s / n));
+// Lines, each with its layer, as beads; long ones have fewer.
+function beadNode(lines) {
+  const corner = lines[0].points[0], apartBy = (a, b) => Math.hypot(...a.map((v, k) => b[k] - v));
+  const pairs = lines.flatMap(({ points, ...line }) => points.slice(1).map((b, i) => ({ a: points[i], b, line })));
+  const length = pairs.reduce((sum, { a, b }) => sum + apartBy(a, b), 0);
+  const apart = Math.max(LINE_HALF, length / MOST_BEADS), beads = [];
+  for (const { a, b, line } of pairs) {
+    const n = Math.ceil(apartBy(a, b) / apart);
+    for (let s = 0; s < n; s++) beads.push({ at: a.map((v, k) => v - corner[k] - 0.5 + (b[k] - v) * s / n), line });
   }
-  const node = { name: "track", corner, scale: 1, count: beads.length };
+  const node = { name: "lines", corner, scale: 1, count: beads.length, texts: beads.map(({ line }) => line.text) };
   const data = new ArrayBuffer(16 * beads.length), about = new Uint8Array(data);
-  new Float32Array(data).set(beads.flatMap(bead => [...bead, 0]));
-  beads.forEach((_, i) => { about.set([classes + 1, 0, 0, 0], 16 * i + 12); });
+  new Float32Array(data).set(beads.flatMap(({ at }) => [...at, 0]));
+  beads.forEach(({ line }, i) => { about.set([line.layer, 0, 0, 0], 16 * i + 12); });
   upload(node, data, gl.FLOAT, 16);
   return node;
 }
@@ -164,7 +174,7 @@ function draw() {
   const tangents = [canvas.width, canvas.height].map(pixels => pixels / (2 * focal));
   const view = { eye, axes: [right, up, forward], focal, tangents }, wanted = needed(scene.roots, view);
   scene.drawn = ranges(scene.roots, wanted, view);
-  if (scene.track) scene.drawn.push([scene.track, 0, scene.track.count]);
+  if (scene.lines) scene.drawn.push([scene.lines, 0, scene.lines.count]);
   const palette = layers.flatMap((layer, i) => [...layer.colour.map(c => c / 255), visible[i] ? 1 : 0]);
   const flat = colours => colours.flat().map(c => c / 255);
   gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -184,7 +194,7 @@ function draw() {
   gl.uniform3fv(cubes.at("origins"), flat(ORIGIN_COLOURS));
   gl.uniform2fv(cubes.at("heights"), meta.heights);
   gl.uniform1i(cubes.at("mode"), mode);
-  gl.uniform1i(cubes.at("track"), classes + 1);
+  gl.uniform1i(cubes.at("firstLine"), classes + 1);
   gl.uniform1i(cubes.at("removed"), showRemoved ? 1 : 0);
   let before = 0;
   for (const [i, [node, first, count]] of scene.drawn.entries()) {
@@ -216,7 +226,8 @@ function redraw() {
   if (!frameAsked) frameAsked = requestAnimationFrame(draw);
 }
 
-// What the picture shows at a pointer: the node, the place, class, confidence and origin; null for the sky.
+// What the picture shows at a pointer: the node, the number in it, the place, class, confidence and origin; null for the
+// sky.
 function voxelAt(event) {
   const scale = canvas.width / innerWidth, found = new Uint32Array(4);
   gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
@@ -226,11 +237,12 @@ function voxelAt(event) {
   if (!found[0]) return null;
   const number = found[0] - 1;
   const [node] = scene.drawn.find(([{ before, count }]) => number >= before && number < before + count);
-  const stride = node === scene.track ? 16 : STRIDE, bytes = new Uint8Array(stride);
+  const stride = node === scene.lines ? 16 : STRIDE, bytes = new Uint8Array(stride);
   gl.bindBuffer(gl.ARRAY_BUFFER, node.buffer);
   gl.getBufferSubData(gl.ARRAY_BUFFER, stride * (number - node.before), bytes);
-  const cell = node === scene.track ? new Float32Array(bytes.buffer, 0, 3) : new Int16Array(bytes.buffer, 0, 3);
-  return [node, [...cell].map((v, k) => (v + 0.5) * node.scale + node.corner[k]), ...bytes.subarray(stride - 4)];
+  const cell = node === scene.lines ? new Float32Array(bytes.buffer, 0, 3) : new Int16Array(bytes.buffer, 0, 3);
+  const place = [...cell].map((v, k) => (v + 0.5) * node.scale + node.corner[k]);
+  return [node, number - node.before, place, ...bytes.subarray(stride - 4)];
 }
 
 function pick(event) {
@@ -238,9 +250,9 @@ function pick(event) {
   document.getElementById("picked").textContent = found ? described(...found) : "";
 }
 
-function described(node, place, label, confidence, origin) {
+function described(node, number, place, label, confidence, origin) {
   const metres = place.map((v, k) => ((v + meta.origin[k]) * meta.voxel_m).toFixed(1));
-  const what = label > classes ? "track" : `${layers[label]?.name}, ${ORIGINS[origin]}`
+  const what = node === scene.lines ? node.texts[number] : `${layers[label]?.name}, ${ORIGINS[origin]}`
     + (label < classes ? `, probability ${(confidence / 255).toFixed(2)}` : "")
     + (node.level ? `, the most hit voxel in ${inMetres(node.scale)} m` : "");
   return `${what}\neast ${metres[0]} m, north ${metres[1]} m, up ${metres[2]} m`;
@@ -249,7 +261,7 @@ function described(node, place, label, confidence, origin) {
 function goTo(event) {
   const found = voxelAt(event);
   if (!found) return;
-  camera.target = found[1];
+  camera.target = found[2];
   zoom(1 / 3);
 }
 
@@ -327,7 +339,8 @@ async function main() {
   const nodes = nodesOf(meta.nodes), roots = [...nodes.values()].filter(({ level }) => level === meta.level);
   const texts = document.getElementById("voxels").textContent.split("\n");
   await Promise.all(roots.map((root, i) => unpack(root, texts[i])));
-  scene = { nodes, roots, drawn: [], views: 0, track: meta.tracks.length ? trackNode(meta.tracks) : null,
+  const lines = lineLayers.flatMap((layer, i) => layer.lines.map(line => ({ ...line, layer: classes + 1 + i })));
+  scene = { nodes, roots, drawn: [], views: 0, lines: lines.length ? beadNode(lines) : null,
             nothing: gl.createVertexArray(), cubes: program(VERTEX, FRAGMENT), lighting: program(SCREEN, LIGHTING) };
   layers.forEach((layer, i) => {
     if (layer.count) addLayer(layer.name, layer.colour, layer.count, visible[i], on => { visible[i] = on; });

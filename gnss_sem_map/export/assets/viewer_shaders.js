@@ -2,7 +2,7 @@
 // The two passes of the viewer. First, every voxel is a point sprite in which the fragment shader meets the exact
 // cube; then hollows are darkened (eye-dome lighting). Lengths are in voxels, x east, y north, z up.
 
-const NEAR = 1, FAR = 2e7, TRACK_HALF = 0.3, REMOVED = 4;
+const NEAR = 1, FAR = 2e7, LINE_HALF = 0.3, REMOVED = 4;
 
 const VERTEX = `#version 300 es
 precision highp float;
@@ -13,10 +13,10 @@ uniform vec3 corner;                  // of the node, from the eye
 uniform vec2 size;
 uniform float focal, largest, scale, eyeHeight;
 uniform uint before;                  // voxels of the nodes that were drawn before
-uniform vec4 palette[66];             // rgb and whether it is shown
+uniform vec4 palette[68];             // rgb and whether it is shown
 uniform vec3 ramp[5], origins[6];
 uniform vec2 heights;
-uniform int mode, track;
+uniform int mode, firstLine;
 uniform bool removed;
 flat out vec3 centre, colour;
 flat out float extent, ahead, pixels;
@@ -28,10 +28,10 @@ vec3 ramped(float t) {
 }
 void main() {
   vec4 entry = palette[about.x];
-  bool bead = int(about.x) == track, unlabelled = int(about.x) == track - 1;
+  bool bead = int(about.x) >= firstLine, unlabelled = int(about.x) == firstLine - 1;
   centre = (cell + 0.5) * scale + corner;
   vec3 seen = centre * axes;
-  extent = bead ? ${TRACK_HALF} : 0.5 * scale;
+  extent = bead ? ${LINE_HALF} : 0.5 * scale;
   ahead = seen.z;
   number = before + uint(gl_VertexID) + 1u;
   bool gone = about.z == ${REMOVED}u;

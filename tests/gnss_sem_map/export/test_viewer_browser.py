@@ -53,6 +53,43 @@ def test_the_browser_shows_every_class_and_hides_what_is_switched_off(
     assert (browser.screenshot() != before).any()
 
 
+def changed(change: str, centre_m: tuple[float, float, float]) -> dict[str, Any]:
+    return {
+        "change": change, "class": "vehicle", "kind": "parked", "before": "monday", "after": "tuesday",
+        "centre_m": centre_m, "size_m": [4.0, 2.0, 1.5], "yaw_deg": 90.0,
+    }  # fmt: skip
+
+
+def test_what_changed_is_a_layer_of_boxes_that_say_what_they_are(
+    browser: Browser, street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    written(
+        tmp_path, street, track, changes=[changed("appeared", (30, 1, 3)), changed("vanished", (20, 1, 3))]
+    )
+    browser.open((tmp_path / "viewer.html").as_uri() + "#hide=track")
+    rows = "return [...document.querySelectorAll('#layers label')].map(l => l.textContent)"
+    assert {"appeared1", "vanished1"} <= set(browser.run(rows))
+    # from above, a box is its outline: in its middle is the road, and on its edge it says what it is
+    look_at(browser, (30, 1, 3), 30)
+    browser.run("camera.azimuth = 0; camera.elevation = 1.5707; draw();")
+    shown = browser.screenshot()
+    assert count(shown, np.array([80.0, 230, 255])) > 100
+    pick = "pick({ clientX: innerWidth / 2 + %d, clientY: innerHeight / 2 });"
+    pixels = browser.run("return 0.9 * innerHeight") / (30 - 0.75)
+    said = []
+    for east in (0, 1):
+        browser.run(pick % round(east * pixels))
+        said.append(browser.run("return document.getElementById('picked').textContent"))
+    assert said[0].startswith("road")
+    assert said[1].startswith(
+        "vehicle appeared (parked), 4.0 x 2.0 x 1.5 m, between monday and tuesday\neast 31.0 m"
+    )
+    browser.run(
+        "[...document.querySelectorAll('#layers label')].find(l => l.textContent === 'appeared1').click()"
+    )
+    assert count(browser.screenshot(), np.array([80.0, 230, 255])) == 0
+
+
 def test_the_browser_lets_nothing_run_that_a_name_smuggles_in(
     browser: Browser, street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from gtsam.symbol_shorthand import C, X
 from numpy.typing import NDArray
 
-from factor_graphs.covariances import eliminate
+from factor_graphs.elimination import by_sections, eliminate, split
 from factor_graphs.graph import from_values, relative_pose_factors
 from factor_graphs.problem import RELATIVE_LOSSES, Fit, Problem
 
@@ -56,7 +56,8 @@ def correct(
     linear.push_back(
         gtsam.JacobianFactor(C(0), np.diag(1 / stddevs), -moved / stddevs, gtsam.noiseModel.Unit.Create(4))
     )
-    (found,) = deque(eliminate(linear, len(problem.intervals.keyframes), last=(C(0),)), maxlen=1)
+    groups = by_sections(fit.graph, len(problem.intervals.keyframes), (C(0),))
+    (found,) = deque(eliminate(split(linear, groups), groups), maxlen=1)
     root = np.linalg.inv(found.R)
     step, sigma = root @ found.d, np.sqrt(np.sum(root**2, axis=1))
     better = Calibration(

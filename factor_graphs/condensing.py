@@ -5,22 +5,14 @@ motion of the whole drive is, in the tangents of its poses, however large it is.
 """
 
 import io
-from collections.abc import Iterator
+from collections import deque
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.covariances import (
-    PLACES,
-    SIZE,
-    TOGETHER,
-    factors_by_first_keyframe,
-    ordering_of,
-    split_key,
-    state_keys,
-)
+from factor_graphs.elimination import PLACES, SIZE, eliminate, split, split_key, state_keys
 from factor_graphs.graph import from_values
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.trajectory import Trajectory
@@ -111,7 +103,7 @@ def condense(problem: Problem, fit: Fit, position_variances: Array) -> Condensed
         len(problem.intervals.keyframes): len(anchors)
     }
     T, _, _ = from_values(fit.values, len(problem.intervals.keyframes))
-    rows = tuple(_rows(factor, place) for factor in _remaining(problem, fit, frozenset(anchors.tolist())))
+    rows = tuple(_rows(factor, place) for factor in _remaining(fit, np.setdiff1d(np.arange(len(T)), anchors)))
     return CondensedDrive(problem.intervals.keyframes[anchors], T[anchors], rows, position_variances)
 
 
@@ -132,23 +124,14 @@ def _anchors(problem: Problem) -> NDArray[np.intp]:
     return np.flatnonzero(wanted)
 
 
-def _remaining(problem: Problem, fit: Fit, anchors: frozenset[int]) -> Iterator[gtsam.GaussianFactor]:
-    """The factors between anchors that are left when all other keyframes are eliminated, some at a time."""
-    k, linear = len(problem.intervals.keyframes), fit.graph.linearize(fit.values)
-    waiting, under_way = factors_by_first_keyframe(linear, k), gtsam.GaussianFactorGraph()
-    for begin in range(0, k + 1, TOGETHER):
-        window = range(begin, min(begin + TOGETHER, k + 1))
-        for factor in (factor for i in window for factor in waiting.pop(i, [])):
-            under_way.push_back(factor)
-        keys = [key for i in window if i < k and i not in anchors for key in state_keys(i)]
-        _, left = under_way.eliminatePartialSequential(ordering_of(keys), gtsam.EliminateQR)
-        under_way = gtsam.GaussianFactorGraph()
-        for factor in (left.at(n) for n in range(left.size())):
-            indices = {split_key(key)[1] for key in list(factor.keys())}
-            if indices <= anchors | {k}:
-                yield factor
-            else:
-                under_way.push_back(factor)
+def _remaining(fit: Fit, others: NDArray[np.intp]) -> list[gtsam.GaussianFactor]:
+    """The factors between anchors that are left when all `others` are eliminated."""
+    groups = [state_keys(i) for i in others.tolist()]
+    *parts, between = split(fit.graph, groups)
+    left: list[gtsam.GaussianFactor] = []
+    deque(eliminate((part.linearize(fit.values) for part in parts), groups, left), maxlen=0)
+    linear = between.linearize(fit.values)
+    return [*(linear.at(n) for n in range(linear.size())), *left]
 
 
 def _rows(factor: gtsam.GaussianFactor, place: dict[int, int]) -> Rows:

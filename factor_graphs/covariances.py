@@ -6,86 +6,26 @@ keyframe, into conditionals R x = d - S y on later keyframes y, and the covarian
 cov(x) = R⁻¹ R⁻ᵀ + W cov(y) Wᵀ with W = R⁻¹ S (Kaess and Dellaert 2009).
 """
 
-from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections import Counter
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, M, V, X
+from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
+from factor_graphs.elimination import (
+    PLACES,
+    SIZE,
+    Conditional,
+    by_sections,
+    eliminate,
+    in_time,
+    split,
+    split_key,
+)
+
 Array = NDArray[np.float64]
-
-# Numbers of a keyframe: tangent of its pose, velocity, biases.
-SIZE = 15
-# A key of GTSAM holds its letter above so many bits of its index.
-INDEX_BITS = 56
-# Keyframes that are eliminated in one call; more take memory, fewer take time.
-TOGETHER = 20
-# Where pose, velocity and bias stand in the 15 numbers of a keyframe, mounting and wheels in those that all share.
-PLACES = {
-    ord("x"): slice(0, 6), ord("v"): slice(6, 9), ord("b"): slice(9, 15),
-    ord("m"): slice(0, 4), ord("w"): slice(4, 8),
-}  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Conditional:
-    """R x = d - S y: one variable x given later ones y; `keys` are theirs, in the order of the columns of R and S."""
-
-    keys: list[int]
-    R: Array
-    S: Array
-    d: Array
-
-
-def eliminate(graph: gtsam.GaussianFactorGraph, k: int, last: tuple[int, ...] = ()) -> Iterator[Conditional]:
-    """The graph of k keyframes as conditionals, X V B of each in order, then the keys in `last`.
-
-    GTSAM's own hold all rows that their elimination began with, 100 kB per keyframe. So it eliminates a few keyframes
-    at a time, from their factors and what the ones before them left, and only R, S and d are kept.
-    """
-    waiting, remaining = factors_by_first_keyframe(graph, k), gtsam.GaussianFactorGraph()
-    for begin in range(0, k + 1, TOGETHER):
-        window = range(begin, min(begin + TOGETHER, k + 1))
-        for factor in [factor for i in window for factor in waiting.pop(i, [])]:
-            remaining.push_back(factor)
-        keys = [key for i in window for key in (state_keys(i) if i < k else last)]
-        net, remaining = remaining.eliminatePartialSequential(ordering_of(keys), gtsam.EliminateQR)
-        for part in (net.at(n) for n in range(net.size())):
-            # GTSAM returns views into the conditional, which do not keep it alive
-            yield Conditional(list(part.keys()), part.R().copy(), part.S().copy(), part.d().copy())
-
-
-def factors_by_first_keyframe(
-    graph: gtsam.GaussianFactorGraph, k: int
-) -> dict[int, list[gtsam.GaussianFactor]]:
-    """The factors of a graph by the first keyframe that they bind; k where they bind none."""
-    found = defaultdict(list)
-    for factor in (graph.at(n) for n in range(graph.size())):
-        keyframes = [index for letter, index in map(split_key, factor.keys()) if letter in PLACES]
-        found[min(keyframes, default=k)].append(factor)
-    return found
-
-
-def state_keys(i: int) -> tuple[int, int, int]:
-    """Keys of pose, velocity and biases of keyframe i."""
-    return X(i), V(i), B(i)
-
-
-def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
-    """These keys, in this order."""
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
-
-
-def split_key(key: int) -> tuple[int, int]:
-    """Letter and index of a key."""
-    return key >> INDEX_BITS, key & (1 << INDEX_BITS) - 1
 
 
 class SumVariance:
@@ -134,32 +74,40 @@ def keyframe_covariances(
     eliminated last, as if they were one more keyframe. `sums` finds the variance of sums over keyframes on the way.
     """
     shared = tuple(key for key in (M(k), gtsam.symbol("w", k)) if values.exists(key))
-    net = list(eliminate(graph.linearize(values), k, shared))
-    covariances = np.empty((k, SIZE, SIZE))
-    # The joint covariance of a keyframe and of those it depends on. The IMU binds each keyframe to the next, so those
-    # of the one before it are among them, and memory does not grow with the drive.
-    known: list[int] = []
-    joint = np.empty((0, 0))
-    of_shared = np.empty((0, 0))
+    groups = by_sections(graph, k, shared) if sums is None else in_time(k, shared)
+    linear = (part.linearize(values) for part in split(graph, groups))
+    order = [split_key(keys[0])[1] for keys in groups]
+    given = {i: (one.R, *_by_keyframe(one)) for i, one in zip(order, eliminate(linear, groups), strict=True)}
+    # Of what a keyframe is given, its parent is eliminated first, and is given all the rest.
+    place = {i: n for n, i in enumerate(order)}
+    parents = {i: min(later, key=place.__getitem__) for i, (_, later, _) in given.items() if later}
+    children = Counter(parents.values())
+    covariances, of_shared = np.empty((k, SIZE, SIZE)), np.empty((0, 0))
+    # The joint covariance of a keyframe and of those it is given, as long as it has children to come: memory does not
+    # grow with the drive.
+    joints: dict[int, tuple[list[int], Array]] = {}
     if shared:
-        R, _, _ = _of_keyframe(k, net[3 * k :])
-        there = np.flatnonzero(R.diagonal())
-        root = np.linalg.inv(R[np.ix_(there, there)])
-        of_shared = root @ root.T
-        known, joint = [k], np.zeros((SIZE, SIZE))
-        joint[np.ix_(there, there)] = of_shared
-    for i in reversed(range(k)):
-        R, later, S = _of_keyframe(i, net[3 * i : 3 * i + 3])
+        there = np.concatenate([PLACES[split_key(key)[0]] for key in shared])
+        root, joint = np.linalg.inv(given.pop(order.pop())[0]), np.zeros((SIZE, SIZE))
+        of_shared = joint[np.ix_(there, there)] = root @ root.T
+        joints[k] = [k], joint
+    for i in reversed(order):
+        R, later, S = given.pop(i)
+        known, joint = joints[parents[i]] if later else ([], np.empty((0, 0)))
         own, _ = dtrtri(R)
         W, rows = own @ S, _rows(later, known)
         joint = joint[np.ix_(rows, rows)]
         cross = -W @ joint
         covariance = own @ own.T - cross @ W.T
         covariances[i] = (covariance + covariance.T) / 2
-        joint = np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
-        known = [i, *later]
+        joints[i] = [i, *later], np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
         if sums is not None:
-            sums.add(i, W, rows, joint, known)
+            sums.add(i, W, rows, joints[i][1], joints[i][0])
+        if later:
+            children[parents[i]] -= 1
+        for j in (i, parents.get(i, i)):
+            if not children[j]:
+                joints.pop(j, None)
     return covariances, of_shared
 
 
@@ -169,17 +117,12 @@ def _rows(keyframes: list[int], known: list[int]) -> NDArray[np.intp]:
     return (first[:, None] + np.arange(SIZE)).ravel()
 
 
-def _of_keyframe(i: int, parts: list[Conditional]) -> tuple[Array, list[int], Array]:
-    """Keyframe i given later ones: R (15, 15) upper triangular, those keyframes, and S (15, 15 each)."""
-    keys = [[split_key(key) for key in part.keys] for part in parts]
-    later = sorted({index for row in keys for _, index in row} - {i})
-    start = {index: SIZE * (1 + n) for n, index in enumerate(later)} | {i: 0}
-    columns = np.zeros((SIZE, SIZE * (1 + len(later))))
-    for part, row in zip(parts, keys, strict=True):
-        matrix, column, rows = np.hstack([part.R, part.S]), 0, PLACES[row[0][0]]
-        for letter, index in row:
-            place, first = PLACES[letter], start[index]
-            width = place.stop - place.start
-            columns[rows, first + place.start : first + place.stop] = matrix[:, column : column + width]
-            column += width
-    return columns[:, :SIZE], later, columns[:, SIZE:]
+def _by_keyframe(conditional: Conditional) -> tuple[list[int], Array]:
+    """The later keyframes that a conditional is given, and its S with 15 columns for each of them."""
+    keys = [split_key(key) for key in conditional.later]
+    later = sorted({index for _, index in keys})
+    first = {index: SIZE * n for n, index in enumerate(later)}
+    S = np.zeros((len(conditional.S), SIZE * len(later)))
+    columns = [first[index] + column for letter, index in keys for column in PLACES[letter]]
+    S[:, columns] = conditional.S
+    return later, S

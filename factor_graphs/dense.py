@@ -38,7 +38,7 @@ def densify(
         part, ends = intervals.part(first, last), slice(first, last + 1)
         rows = slice(intervals.bounds[first], intervals.bounds[last] + 1)
         T[rows], velocities[rows], covariances[rows] = _dense(
-            part, _part(keyframes, ends), biases[ends], noise[first:last], frame
+            part, keyframes[ends], biases[ends], noise[first:last], frame
         )
     for array in (T, velocities, covariances):
         array.setflags(write=False)
@@ -68,17 +68,6 @@ def _dense(
     v = v + u * (2 * square + 3 * u * cube) / spans[which]
     velocities = np.concatenate([v, keyframes.velocities[-1:]])
     return T, velocities, _covariances(keyframes, T, noise, which, u[:, 0])
-
-
-def _part(keyframes: Trajectory, rows: slice) -> Trajectory:
-    assert keyframes.velocities is not None
-    assert keyframes.covariances is not None
-    return Trajectory(
-        keyframes.stamps[rows],
-        keyframes.T_map_imu[rows],
-        keyframes.velocities[rows],
-        keyframes.covariances[rows],
-    )
 
 
 def _turn(intervals: ImuIntervals, R_keyframes: Array, rate: Array, frame: LocalFrame) -> tuple[Array, Array]:

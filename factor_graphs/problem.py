@@ -26,6 +26,7 @@ from factor_graphs.graph import (
     to_values,
 )
 from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
+from factor_graphs.levenberg_marquardt import minimise
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
@@ -238,7 +239,7 @@ def optimise(
         graph.push_back(between)
     for constraint in constraints:
         graph.push_back(constraint)
-    values, iterations = _minimise(graph, start, problem.settings.max_iterations, tolerance)
+    values, iterations = _minimise(problem, graph, start, tolerance)
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)
     return Fit(
@@ -268,37 +269,50 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
 
 
 def _minimise(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+    problem: Problem, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float
 ) -> tuple[gtsam.Values, int]:
-    """Levenberg-Marquardt; where its damping makes it crawl, undamped steps from where it was.
+    """Levenberg-Marquardt: our own where relative poses bind the keyframes, which are many then, else GTSAM's.
 
     By QR: Cholesky stalls and throws where a stiff IMU meets weak fixes, in short drives and outages. Where relative
-    poses bind the keyframes it does neither, and takes half of the memory, but stops elsewhere: in the demo 8 mm and
-    0.03 degrees away.
+    poses bind the keyframes it does neither, but stops elsewhere: in the demo 8 mm and 0.03 degrees away.
     """
+    limit = problem.settings.max_iterations
+    try:
+        if problem.is_bound:
+            values, iterations = minimise(graph, start, len(problem.intervals.keyframes), limit, tolerance)
+        else:
+            values, iterations = _minimise_whole(graph, start, limit, tolerance)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise EstimationError(f"the equations of the graph have no solution: {reason}") from error
+    if iterations < limit:
+        return values, iterations
+    raise EstimationError(
+        f"the optimiser stopped at its limit of {limit} iterations, cost {graph.error(values):.4g}; "
+        "check units, axes and lever arm of the log, or raise max_iterations"
+    )
+
+
+def _minimise_whole(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+) -> tuple[gtsam.Values, int]:
+    """GTSAM's optimiser; where its damping makes it crawl, undamped steps from where it was."""
     damped, undamped = gtsam.LevenbergMarquardtParams(), gtsam.GaussNewtonParams()
     damped.setMaxIterations(limit)
     damped.setRelativeErrorTol(tolerance)
     damped.setLinearSolverType("MULTIFRONTAL_QR")
     undamped.setLinearSolverType("MULTIFRONTAL_QR")
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, damped)
-    try:
-        values = optimiser.optimize()
-        if optimiser.iterations() < limit:
-            return values, optimiser.iterations()
-        newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), optimiser.error()
-        for iteration in range(limit, 2 * limit):
-            newton.iterate()
-            if abs(cost - newton.error()) <= tolerance * cost and newton.error() <= optimiser.error():
-                return newton.values(), iteration
-            cost = newton.error()
-    except RuntimeError as error:
-        reason = str(error).strip().splitlines()[0]
-        raise EstimationError(f"the equations of the graph have no solution: {reason}") from error
-    raise EstimationError(
-        f"the optimiser stopped at its limit of {limit} iterations, cost {optimiser.error():.4g}; "
-        "check units, axes and lever arm of the log, or raise max_iterations"
-    )
+    values = optimiser.optimize()
+    if optimiser.iterations() < limit:
+        return values, optimiser.iterations()
+    newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), optimiser.error()
+    for iteration in range(limit):
+        newton.iterate()
+        if abs(cost - newton.error()) <= tolerance * cost and newton.error() <= optimiser.error():
+            return newton.values(), iteration
+        cost = newton.error()
+    return values, limit
 
 
 def _squares(problem: Problem, values: gtsam.Values) -> Array:

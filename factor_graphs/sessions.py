@@ -19,7 +19,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from factor_graphs.chi_square import quantile
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
-from factor_graphs.covariances import SIZE
+from factor_graphs.elimination import SIZE
 from factor_graphs.errors import EstimationError
 
 Array = NDArray[np.float64]

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.covariances import SIZE, SumVariance, keyframe_covariances
+from factor_graphs.covariances import SumVariance, keyframe_covariances
+from factor_graphs.elimination import SIZE
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import BLOCK_S, CUT, DRIFT_S, LEFT, Slip
 from factor_graphs.vehicle import Vehicle, body_motion, where_seen

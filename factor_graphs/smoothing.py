@@ -33,6 +33,8 @@ NOTABLE_REJECTION = 0.01
 ANOTHER_UNIT = 2.0
 # The noise of the IMU is looked at again so often.
 NOISE_ROUNDS = 10
+# So far apart are the poses of a solution in short, s.
+IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
 UNKNOWN_HEADING = 0.35
 
@@ -72,6 +74,13 @@ class Solution:
     wheels: Wheels | None = None
     condensed: CondensedDrive | None = None
     notes: tuple[str, ...] = ()
+
+    def in_short(self) -> "Solution":
+        """The same with ten poses a second, enough for a plot, and without the covariances of the states."""
+        stamps = self.trajectory.stamps
+        rows = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], IN_SHORT_S))
+        rows = np.unique([*rows.tolist(), len(stamps) - 1])
+        return replace(self, trajectory=self.trajectory[rows], state_covariances=self.state_covariances[:0])
 
 
 def smooth(

@@ -73,6 +73,13 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> "Trajectory":
+        """Some of the poses, in order of time and at least one."""
+        velocities, covariances = (
+            None if each is None else each[rows] for each in (self.velocities, self.covariances)
+        )
+        return Trajectory(self.stamps[rows], self.T_map_imu[rows], velocities, covariances)
+
     @property
     def start(self) -> float:
         """First stamp, s."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.chi_square import quantile
-from factor_graphs.covariances import PLACES, SIZE, split_key
+from factor_graphs.elimination import PLACES, SIZE, split_key
 from factor_graphs.problem import Fit
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def _redundancy(fit: Fit, covariances: Array) -> float:
         rows, i = np.zeros((len(A), covariances.shape[1])), -1
         for letter, index in map(split_key, factor.keys()):
             place = PLACES[letter]
-            end = begin + place.stop - place.start
+            end = begin + len(place)
             if index < k:
                 rows[:, place], i = A[:, begin:end], index
             begin = end

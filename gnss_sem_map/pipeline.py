@@ -12,7 +12,7 @@ Maps are written into a folder, tile by tile. The other files of a run are writt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -48,7 +48,34 @@ from gnss_sem_map.segmentation.cached import CachedLabels
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter, probabilities_folder
 from gnss_sem_map.sensor_log import SensorLog
 
-__all__ = ["Mapped", "check_drive", "estimate_trajectory", "in_frame", "locate", "map_drive", "refine", "run"]
+__all__ = [
+    "Located",
+    "Mapped",
+    "check_drive",
+    "estimate_trajectory",
+    "in_frame",
+    "locate",
+    "map_drive",
+    "refine",
+    "run",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """A drive and its trajectory, in the frame of the map."""
+
+    log: SensorLog
+    trajectory: Trajectory
+    solution: Solution | None = None
+    """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
+    alone: Trajectory | None = None
+    """The trajectory before the drive was bound, to others or to itself; None where nothing binds it."""
+
+    def in_short(self) -> Located:
+        """What is needed to map it: no covariances, and nothing else that grows with the IMU stamps."""
+        solution = None if self.solution is None else self.solution.in_short()
+        return Located(self.log, replace(self.trajectory, covariances=None), solution)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +91,7 @@ class Mapped:
     untracked: int = 0
     """Objects that had too few points to be tracked."""
     solution: Solution | None = None
-    """Solution of the smoother, in the drive's own frame; None if the drive has poses."""
-    alone: Trajectory | None = None
-    """The trajectory before the drive was bound, to others or to itself; None where nothing binds it."""
+    """As `Located` has it."""
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
@@ -92,6 +117,7 @@ def run(
     labels_from: str = "",
     force: bool = False,
     correction: Correction | None = None,
+    write: Callable[[Located], None] | None = None,
 ) -> Mapped:
     """Trajectory of one drive; its raw map and evidence are written into `folder`.
 
@@ -99,7 +125,8 @@ def run(
     `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
     for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` `mapping.trajectory.locate`. With `force`, a
     red pre-flight does not stop the run. `correction`: how the trajectory moves in the frame `origin` because the drive
-    is bound to others; without one, the drive is bound to itself only.
+    is bound to others; without one, the drive is bound to itself only. `write` gets the trajectory before anything is
+    mapped, and what the map does not need of it is not held any longer.
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
@@ -109,17 +136,31 @@ def run(
     page, found, sharpness = _checked_and_located(
         log, segmenter, settings, stats, progress, force, match, bound=correction is None
     )
+    located = _in_map(log, found, origin, correction)
+    passes, from_lidar_odometry = found.passes, found.from_lidar_odometry
+    del found
+    if write is not None:
+        with stats.stage("export"):
+            write(located)
+        located = located.in_short()
+    drive = Drive(
+        located.log, located.trajectory, segmenter, settings, from_lidar_odometry=from_lidar_odometry
+    )
+    mapped = map_drive(
+        drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
+    )
+    return replace(mapped, solution=located.solution, passes=passes, sharpness=sharpness, preflight=page)
+
+
+def _in_map(
+    log: SensorLog, found: DriveTrajectory, origin: LocalFrame | None, correction: Correction | None
+) -> Located:
+    """The trajectory that was found, in the frame of the map, and as the drive is bound to others."""
     alone = None if found.alone is None else in_frame(log, found.alone, origin)[1]
     log, trajectory = in_frame(log, found.trajectory, origin)
     if correction is not None:
         alone, trajectory = trajectory, correction.of(trajectory)
-    drive = Drive(log, trajectory, segmenter, settings, from_lidar_odometry=found.from_lidar_odometry)
-    mapped = map_drive(
-        drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
-    )
-    return replace(
-        mapped, solution=found.solution, alone=alone, passes=found.passes, sharpness=sharpness, preflight=page
-    )
+    return Located(log, trajectory, found.solution, alone)
 
 
 def _checked_and_located(

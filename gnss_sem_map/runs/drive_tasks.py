@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,7 @@ def _map_one(
                 log, network, settings, part, claim.work,
                 origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),
                 labels_from=source.labels_from, force=force, correction=correction,
+                write=partial(run_folder.write_trajectory_files, part),
             )  # fmt: skip
             run_folder.write_drive(part, source, mapped, settings, digest)
 

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -87,7 +87,7 @@ def run(
                 mapped = pipeline.run(
                     log, network, settings, folder, claim.work, progress,
                     origin=origin, resume=resume, match=match, elsewhere=elsewhere, labels_from=source.labels_from,
-                    force=force,
+                    force=force, write=partial(run_folder.write_trajectory_files, folder),
                 )  # fmt: skip
                 refined = pipeline.refine(
                     folder, settings, mapped.stats, progress, executor=executor, work=claim.work

@@ -33,7 +33,7 @@ from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
-from gnss_sem_map.pipeline import Mapped
+from gnss_sem_map.pipeline import Located, Mapped
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import RunStats
@@ -85,7 +85,7 @@ def write_run(
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
     refined = replace(refined, report=with_objects(refined.report, mapped))
     with mapped.stats.stage("export"):
-        write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution, mapped.alone)
+        write_plot(folder, mapped.log, mapped.solution)
         write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
         if write_labels:
             write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
@@ -98,7 +98,7 @@ def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings
 
     `correction`: digest of that with which it is bound to others, empty without.
     """
-    write_trajectory_files(folder, mapped.log, mapped.trajectory, mapped.solution, mapped.alone)
+    write_plot(folder, mapped.log, mapped.solution)
     about = about_mapped(source, mapped) | {"correction": correction}
     write_about(folder, settings, about, metrics_of(mapped))
 
@@ -194,7 +194,8 @@ def write_trajectory_run(
 ) -> dict[str, Any]:
     """Write a run that stopped after its trajectory; returns the content of run.json."""
     with claimed_run(out, [drive]), new_folder(out) as folder:
-        write_trajectory_files(folder, log, found.trajectory, found.solution, found.alone)
+        write_trajectory_files(folder, Located(log, found.trajectory, found.solution, found.alone))
+        write_plot(folder, log, found.solution)
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
@@ -204,23 +205,22 @@ def write_trajectory_run(
     return about
 
 
-def write_trajectory_files(
-    folder: Path,
-    log: SensorLog,
-    trajectory: Trajectory,
-    solution: Solution | None,
-    alone: Trajectory | None = None,
-) -> None:
+def write_trajectory_files(folder: Path, located: Located) -> None:
     """Write a trajectory in every format, and that before it was bound, if it was."""
+    trajectory, frame = located.trajectory, located.log.frame
     trajectory.save(folder / "trajectory.parquet")
-    if alone is not None:
-        alone.save(folder / "trajectory_alone.parquet")
+    if located.alone is not None:
+        located.alone.save(folder / "trajectory_alone.parquet")
     write_tum(trajectory, folder / "trajectory.tum")
     if trajectory.covariances is not None:
         write_covariance_tum(trajectory, folder / "trajectory_covariance.tum")
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
-    if log.frame is not None:
-        write_geojson(trajectory, log.frame, folder / "trajectory.geojson")
+    if frame is not None:
+        write_geojson(trajectory, frame, folder / "trajectory.geojson")
+
+
+def write_plot(folder: Path, log: SensorLog, solution: Solution | None) -> None:
+    """Write a plot of the trajectory where it was smoothed."""
     if solution is not None and log.gnss is not None:
         write_trajectory_plot(solution, log.gnss, folder / "trajectory.png")
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from factor_graphs.covariances import (
     PLACES,
     SIZE,
-    TOGETHER,
     factors_by_first_keyframe,
     ordering_of,
     split_key,
@@ -29,6 +28,8 @@ Array = NDArray[np.float64]
 
 # Without relative poses anchors are so far apart, s.
 ANCHOR_S = 1.5
+# Keyframes that are eliminated in one call; more take memory, fewer take time.
+TOGETHER = 20
 # Standard deviations of what stands.
 FIXED_RAD, FIXED_M = 1e-7, 1e-3
 

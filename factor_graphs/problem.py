@@ -224,7 +224,7 @@ def optimise(
     constraints: Iterable[gtsam.NonlinearFactor] = (),
     tolerance: float = RELATIVE_TOLERANCE,
 ) -> Fit:
-    """The most probable states, given a loss for the fixes, until the cost changes by less than `tolerance` of itself.
+    """The most probable states, given a loss for the fixes: all but `tolerance` of the cost is gained.
 
     Raises EstimationError when they are not found.
     """
@@ -238,7 +238,9 @@ def optimise(
         graph.push_back(between)
     for constraint in constraints:
         graph.push_back(constraint)
-    values, iterations = _minimise(graph, start, problem.settings.max_iterations, tolerance)
+    limit = problem.settings.max_iterations
+    found = None if problem.is_bound else _undamped(graph, start, limit, tolerance)
+    values, iterations = found or _minimise(graph, start, limit, tolerance)
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)
     return Fit(
@@ -265,6 +267,33 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
     good, relative_good = squares < GATE, relative_squares < RELATIVE_GATE
     total = motion + squares[good].sum() + relative_squares[relative_good].sum()
     return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
+
+
+def _undamped(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+) -> tuple[gtsam.Values, int] | None:
+    """Gauss-Newton, until a step gains what the linear graph says that it gains; None where a step gains nothing.
+
+    Where the two agree to `tolerance` of the cost, the next step would hardly gain more than that: it need not be made
+    to see it. A step is also cheaper than a damped one. Not for a graph that relative poses bind: it has directions
+    in which a centimetre costs less than the tolerance.
+    """
+    undamped = gtsam.GaussNewtonParams()
+    undamped.setLinearSolverType("MULTIFRONTAL_QR")
+    newton = gtsam.GaussNewtonOptimizer(graph, start, undamped)
+    try:
+        for iteration in range(1, limit + 1):
+            before, cost = gtsam.Values(newton.values()), newton.error()
+            linear = newton.iterate()
+            if not newton.error() <= cost:
+                return None
+            step, none = before.localCoordinates(newton.values()), before.zeroVectors()
+            expected = linear.error(none) - linear.error(step)
+            if abs(cost - newton.error() - expected) <= tolerance * newton.error():
+                return newton.values(), iteration
+    except RuntimeError:  # a graph that only damping makes regular
+        return None
+    return None
 
 
 def _minimise(

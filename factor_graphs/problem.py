@@ -25,7 +25,7 @@ from factor_graphs.graph import (
     relative_pose_factors,
     to_values,
 )
-from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
+from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
@@ -169,12 +169,7 @@ def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
     if not len(others):
         return np.zeros(len(stamps), np.bool_)
     others = np.sort(others)
-    after = np.searchsorted(others, stamps)
-    before = others[np.maximum(after - 1, 0)]
-    distance = np.minimum(
-        np.abs(stamps - before), np.abs(stamps - others[np.minimum(after, len(others) - 1)])
-    )
-    return np.asarray(distance <= CARRIED_S)
+    return np.asarray(np.abs(others[nearest(others, stamps)] - stamps) <= CARRIED_S)
 
 
 def _usable(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[NDArray[np.bool_], list[str]]:

@@ -6,7 +6,6 @@ lines between fixes the optimiser stays in a wrong valley after a long outage.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
-from factor_graphs.intervals import ImuIntervals
+from factor_graphs.intervals import ImuIntervals, nearest
 from factor_graphs.measurements import GnssFixes
 
 Array = NDArray[np.float64]
@@ -116,7 +115,7 @@ def attitudes(
     turn = (intervals.angular_rate @ level[2]) * intervals.durations
     turned = np.concatenate([[0.0], np.cumsum(turn)])[intervals.bounds]
     speed = np.hypot(velocities[:, 0], velocities[:, 1])
-    age = np.abs(_nearest(fixes.stamps, intervals.keyframes) - intervals.keyframes)
+    age = np.abs(fixes.stamps[nearest(fixes.stamps, intervals.keyframes)] - intervals.keyframes)
     weight = np.where((speed > MIN_COURSE_SPEED) & (age < MAX_COURSE_AGE), np.minimum(speed, 10.0), 0.0)
     ahead = np.exp(1j * (np.arctan2(velocities[:, 1], velocities[:, 0]) - turned))
     if attitude is not None:
@@ -153,13 +152,6 @@ def _smooth(
     np.add.at(total.T, cell, np.column_stack([weights, weights * directions.real, weights * directions.imag]))
     total = gaussian_filter1d(total, window_s / step, axis=1, mode="constant", truncate=4.0)
     known = np.flatnonzero(total[0] > 1e-3 * total[0].max())
-    nearest = _nearest(known, np.arange(total.shape[1]))
-    smoothed: NDArray[np.complex128] = (total[1] + 1j * total[2])[nearest][cell]
+    used = known[nearest(known, np.arange(total.shape[1]))]
+    smoothed: NDArray[np.complex128] = (total[1] + 1j * total[2])[used][cell]
     return smoothed
-
-
-def _nearest(known: NDArray[Any], wanted: NDArray[Any]) -> NDArray[Any]:
-    """The value of `known`, sorted, nearest to each one wanted."""
-    right = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(np.abs(known[left] - wanted) <= np.abs(known[right] - wanted), known[left], known[right])

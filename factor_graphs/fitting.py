@@ -15,7 +15,7 @@ from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
-from factor_graphs.vehicle import Vehicle, body_motion, observe, with_mounting
+from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe, with_mounting
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
 
 Array = NDArray[np.float64]
@@ -104,63 +104,102 @@ def constrain(
     which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
     settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
-    wanted = settings.vehicle_constraint
-    if wanted == "auto" and problem.is_bound:
-        # the axle adds nothing that LiDAR odometry does not know better: on a drive of 480 s it changes no digit of
-        # the error, and takes 70 % more time
-        wanted = "off"
-    vehicle = None if wanted == "off" else observe(problem, fit, motion)
-    axle = vehicle if vehicle is not None and (wanted == "on" or not vehicle.doubt) else None
-    wheels, mounting = None, np.zeros(4)
-    if speeds is not None and settings.wheel_speed != "off":
-        shown = vehicle or observe(problem, fit, motion)
-        mounting = shown.mounting if axle is not None or not shown.doubt else mounting
-        wheels = observe_wheels(speeds, problem, fit, motion, mounting)
-    rolling = wheels if wheels is not None and (settings.wheel_speed == "on" or not wheels.doubt) else None
+    vehicle, wheels, mounting = _observed(problem, fit, motion, speeds)
+    axle = vehicle if vehicle and (settings.vehicle_constraint == "on" or not vehicle.doubt) else None
+    rolling = wheels if wheels and (settings.wheel_speed == "on" or not wheels.doubt) else None
+    settled = axle is None and rolling is None
+    tolerance = RELATIVE_TOLERANCE if settled else ROUGH
     factors: list[gtsam.NonlinearFactor] = []
     stood: NDArray[np.bool_] | None = None
     slip: tuple[Slip, Slip] | None = None
     known: tuple[Slip, Slip] | None = None
-    settled = axle is None and rolling is None
     for n in range(CONSTRAINT_ROUNDS):
-        stands = standing(problem.intervals, motion.velocity) & (settings.standing_stddev_mps is not None)
-        if rolling is not None:
-            stands &= ~rolling.readings.moving
+        stands = _standing(problem, motion, rolling)
         if settled and stood is not None and np.array_equal(stands, stood):
             break
-        stood = stands
-        factors = [*zero_velocity_factors(stands, settings.standing_stddev_mps or 1.0)]
-        if axle is not None:
-            fit = with_mounting(problem, fit, axle.mounting)
-            factors += non_holonomic_factors(fit.values, motion, axle.slip_stddevs(motion))
-        if rolling is not None:
-            fit = with_calibration(problem, fit, rolling.calibration)
-            factors += wheel_factors(fit.values, motion, mounting, rolling)
+        start, stood = _with_shared(problem, fit, axle, rolling), stands
+        factors = _constraints(problem, start, motion, stands, axle, rolling, mounting)
         if not factors:
             break
-        is_rough, start = axle is not None or rolling is not None, fit
-        fit = fit_noise(problem, fit, factors, ROUGH if is_rough else RELATIVE_TOLERANCE)
+        fit = fit_noise(problem, start, factors, tolerance)
         if axle is not None and known is not None and slip != known and _is_bent(fit, start):
             fit, slip, axle = start, known, replace(axle, slip=known)
-            vehicle = axle
             continue
         before, motion = motion, body_motion(problem, fit)
-        if is_rough:
+        if axle is not None or rolling is not None:
             settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
         if axle is not None:
             mounting, guessed = fit.values.atVector(M(key)), axle
-            axle = vehicle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
+            axle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
             if n > 0:  # held once, the axle is where it belongs
                 if slip is None:
                     known = guessed.slip
                     slip = found_slip(problem, fit, replace(guessed, mounting=mounting))
-                axle = vehicle = replace(axle, slip=slip)
+                axle = replace(axle, slip=slip)
             settled &= axle.slip == guessed.slip
         if speeds is not None and rolling is not None:
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
-    return fit, factors, vehicle, rolling or wheels
+    return fit, factors, axle or vehicle, rolling or wheels
+
+
+def _observed(
+    problem: Problem, fit: Fit, motion: BodyMotion, speeds: WheelSpeeds | None
+) -> tuple[Vehicle | None, Wheels | None, Array]:
+    """Vehicle and wheels as the solution shows them, None where they are not wanted, and the mounting (4,) of the IMU.
+
+    The axle adds nothing that LiDAR odometry does not know better: on a drive of 480 s it changes no digit of the
+    error, and takes 70 % more time. So `auto` does not want it there.
+    """
+    wanted = problem.settings.vehicle_constraint
+    with_axle = wanted == "on" or (wanted == "auto" and not problem.is_bound)
+    with_wheels = speeds is not None and problem.settings.wheel_speed != "off"
+    if not with_axle and not with_wheels:
+        return None, None, np.zeros(4)
+    shown = observe(problem, fit, motion)
+    mounting = np.zeros(4) if shown.doubt and wanted != "on" else shown.mounting
+    vehicle = shown if with_axle else None
+    if speeds is None or not with_wheels:
+        return vehicle, None, mounting
+    return vehicle, observe_wheels(speeds, problem, fit, motion, mounting), mounting
+
+
+def _standing(problem: Problem, motion: BodyMotion, rolling: Wheels | None) -> NDArray[np.bool_]:
+    """The keyframes (k,) at which the vehicle is held still."""
+    if problem.settings.standing_stddev_mps is None:
+        return np.zeros(len(motion.velocity), dtype=bool)
+    still = standing(problem.intervals, motion.velocity)
+    return still if rolling is None else still & ~rolling.readings.moving
+
+
+def _with_shared(problem: Problem, fit: Fit, axle: Vehicle | None, rolling: Wheels | None) -> Fit:
+    """The same solution with what all keyframes share among its values."""
+    if axle is not None:
+        fit = with_mounting(problem, fit, axle.mounting)
+    if rolling is not None:
+        fit = with_calibration(problem, fit, rolling.calibration)
+    return fit
+
+
+def _constraints(
+    problem: Problem,
+    fit: Fit,
+    motion: BodyMotion,
+    stands: NDArray[np.bool_],
+    axle: Vehicle | None,
+    rolling: Wheels | None,
+    mounting: Array,
+) -> list[gtsam.NonlinearFactor]:
+    """What holds where it stands, and of axle and wheels, linearised at a solution."""
+    factors: list[gtsam.NonlinearFactor] = [
+        *zero_velocity_factors(stands, problem.settings.standing_stddev_mps or 1.0)
+    ]
+    if axle is not None:
+        factors += non_holonomic_factors(fit.values, motion, axle.slip_stddevs(motion))
+    if rolling is not None:
+        factors += wheel_factors(fit.values, motion, mounting, rolling)
+    return factors
 
 
 def _is_bent(fit: Fit, start: Fit) -> bool:

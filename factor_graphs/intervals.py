@@ -1,6 +1,7 @@
 """The IMU between keyframes: where the keyframes are, and the steps that lead from one to the next."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +68,7 @@ class ImuIntervals:
 
     def keyframe_of(self, stamps: Array) -> NDArray[np.intp]:
         """Index of the keyframe nearest to each stamp."""
-        right = np.clip(np.searchsorted(self.keyframes, stamps), 1, len(self.keyframes) - 1)
-        left_is_nearer = stamps - self.keyframes[right - 1] < self.keyframes[right] - stamps
-        return right - left_is_nearer
+        return nearest(self.keyframes, stamps)
 
 
 def split(
@@ -97,6 +96,13 @@ def split(
     for first, last in gap_ends:
         blind |= (middle > first) & (middle < last)
     return ImuIntervals(keyframes, np.searchsorted(nodes, keyframes), nodes, force, rate, blind)
+
+
+def nearest(known: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.intp]:
+    """Index of the nearest of those `known`, sorted, to each one wanted; the earlier where both are as near."""
+    right = np.minimum(np.searchsorted(known, wanted), len(known) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(known[left] - wanted) <= np.abs(known[right] - wanted), left, right)
 
 
 def noise_as_sampled(imu: ImuSamples, noise: ImuNoise) -> ImuNoise:
@@ -137,8 +143,7 @@ def _distinct(stamps: Array, keep: Array | None = None) -> Array:
         apart[-1] = True
         distinct: Array = stamps[apart]
         return distinct
-    nearest = np.clip(np.searchsorted(keep, stamps), 1, len(keep) - 1)
-    distance = np.minimum(np.abs(stamps - keep[nearest - 1]), np.abs(stamps - keep[nearest]))
+    distance = np.abs(keep[nearest(keep, stamps)] - stamps)
     kept: Array = stamps[(distance == 0) | (distance > SAME_STAMP_S)]
     return kept
 

@@ -25,7 +25,7 @@ from factor_graphs.graph import (
     relative_pose_factors,
     to_values,
 )
-from factor_graphs.intervals import ImuIntervals, noise_as_sampled, split
+from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
 from factor_graphs.levenberg_marquardt import minimise
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
@@ -170,12 +170,7 @@ def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
     if not len(others):
         return np.zeros(len(stamps), np.bool_)
     others = np.sort(others)
-    after = np.searchsorted(others, stamps)
-    before = others[np.maximum(after - 1, 0)]
-    distance = np.minimum(
-        np.abs(stamps - before), np.abs(stamps - others[np.minimum(after, len(others) - 1)])
-    )
-    return np.asarray(distance <= CARRIED_S)
+    return np.asarray(np.abs(others[nearest(others, stamps)] - stamps) <= CARRIED_S)
 
 
 def _usable(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[NDArray[np.bool_], list[str]]:
@@ -225,7 +220,7 @@ def optimise(
     constraints: Iterable[gtsam.NonlinearFactor] = (),
     tolerance: float = RELATIVE_TOLERANCE,
 ) -> Fit:
-    """The most probable states, given a loss for the fixes, until the cost changes by less than `tolerance` of itself.
+    """The most probable states, given a loss for the fixes: all but `tolerance` of the cost is gained.
 
     Raises EstimationError when they are not found.
     """
@@ -268,6 +263,33 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
     return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
 
 
+def _undamped(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+) -> tuple[gtsam.Values, int] | None:
+    """Gauss-Newton, until a step gains what the linear graph says that it gains; None where a step gains nothing.
+
+    Where the two agree to `tolerance` of the cost, the next step would hardly gain more than that: it need not be made
+    to see it. A step is also cheaper than a damped one. Not for a graph that relative poses bind: it has directions
+    in which a centimetre costs less than the tolerance.
+    """
+    undamped = gtsam.GaussNewtonParams()
+    undamped.setLinearSolverType("MULTIFRONTAL_QR")
+    newton = gtsam.GaussNewtonOptimizer(graph, start, undamped)
+    try:
+        for iteration in range(1, limit + 1):
+            before, cost = gtsam.Values(newton.values()), newton.error()
+            linear = newton.iterate()
+            if not newton.error() <= cost:
+                return None
+            step, none = before.localCoordinates(newton.values()), before.zeroVectors()
+            expected = linear.error(none) - linear.error(step)
+            if abs(cost - newton.error() - expected) <= tolerance * newton.error():
+                return newton.values(), iteration
+    except RuntimeError:  # a graph that only damping makes regular
+        return None
+    return None
+
+
 def _minimise(
     problem: Problem, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float
 ) -> tuple[gtsam.Values, int]:
@@ -281,7 +303,8 @@ def _minimise(
         if problem.is_bound:
             values, iterations = minimise(graph, start, len(problem.intervals.keyframes), limit, tolerance)
         else:
-            values, iterations = _minimise_whole(graph, start, limit, tolerance)
+            found = _undamped(graph, start, limit, tolerance)
+            values, iterations = found or _minimise_whole(graph, start, limit, tolerance)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]
         raise EstimationError(f"the equations of the graph have no solution: {reason}") from error

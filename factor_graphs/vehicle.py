@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.graph import from_values
-from factor_graphs.intervals import ImuIntervals
+from factor_graphs.intervals import ImuIntervals, nearest
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
@@ -205,9 +205,8 @@ def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     good = stamps[problem.at[fit.weights > 0.5]]
     if len(good) < 2:
         return np.zeros(len(stamps), dtype=bool)
-    after = np.searchsorted(good, stamps).clip(max=len(good) - 1)
-    nearest = np.minimum(np.abs(good[after] - stamps), np.abs(good[np.maximum(after - 1, 0)] - stamps))
-    beside: NDArray[np.bool_] = nearest <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
+    distance = np.abs(good[nearest(good, stamps)] - stamps)
+    beside: NDArray[np.bool_] = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
 
 

@@ -57,7 +57,8 @@ def rewrite(
         _write_table(drive, log, partial, progress)
     else:
         _write_bag(drive, log, partial, layout, progress)
-    shutil.copytree(drive / TRUTH, partial / TRUTH)
+    if (drive / TRUTH).is_dir():
+        shutil.copytree(drive / TRUTH, partial / TRUTH)
     out.mkdir(parents=True, exist_ok=True)
     shutil.move(partial, target)
     return target
@@ -161,8 +162,9 @@ def _ns(log: SensorLog, stamp: float) -> int:
 
 
 def _imu_rows(drive: Path) -> tuple[NDArray[np.int64], Array]:
-    """Unix ns and oxts rows at 100 Hz."""
-    stamps, rows, _ = kitti_raw.oxts_rows(drive.with_name(drive.name.replace("_sync", "_extract")))
+    """Unix ns and oxts rows, at 100 Hz where the drive has its twin."""
+    twin = drive.with_name(drive.name.replace("_sync", "_extract"))
+    stamps, rows, _ = kitti_raw.oxts_rows(twin if twin.is_dir() else drive)
     return stamps, rows
 
 

@@ -81,7 +81,7 @@ class McapFile:
         """The message at a place, or its first bytes."""
         chunk, offset = place
         if self._codecs[chunk] in ("", "none"):
-            data = self._plain(chunk, offset, most)
+            data = self._plain(chunk, offset, None if self._codec else most)
         else:
             data = self._within(self._chunks.get(chunk), offset)
         if self._codec:

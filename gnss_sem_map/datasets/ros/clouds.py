@@ -121,8 +121,10 @@ def _rows(table: NDArray[Any], where: str) -> NDArray[np.float32]:
     fields: dict[str, Any] = dict(table.dtype.fields or {})
     first = int(fields["x"][1])
     if all(fields.get(name, ())[:2] == (np.dtype("<f4"), first + 4 * i) for i, name in enumerate(wanted)):
-        plain = np.lib.stride_tricks.as_strided(table["x"], (len(table), 4), (table.dtype.itemsize, 4))
-        return np.array(plain)  # one copy: a tenth of the time of four
+        four = np.dtype(
+            {"names": ["xyzi"], "formats": ["V16"], "offsets": [first], "itemsize": table.dtype.itemsize}
+        )
+        return table.view(four)["xyzi"].copy().view("<f4").reshape(-1, 4)  # 16 bytes at a time
     rows = np.zeros((len(table), 4), np.float32)
     for column, name in enumerate(wanted[:3]):
         rows[:, column] = table[name]

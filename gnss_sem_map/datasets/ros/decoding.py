@@ -28,7 +28,7 @@ def typestore(is_ros1: bool) -> Any:
 
 def decode(bag: Bag, messages: Messages, k: int) -> Any:
     """A message, as an object with the fields of its type; raises DataError for one that is damaged."""
-    data, store = bag.read(messages, k), typestore(bag.is_ros1)
+    data, store = memoryview(bag.read(messages, k)), typestore(bag.is_ros1)  # whose parts are no copies
     try:
         if bag.is_ros1:
             return store.deserialize_ros1(data, messages.kind)

@@ -9,7 +9,7 @@ import warnings
 
 import typer
 
-from gnss_sem_map.cli import evaluation, finished, mapping, segmentation, settings, simulation
+from gnss_sem_map.cli import evaluation, finished, inspection, mapping, segmentation, settings, simulation
 from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
 from gnss_sem_map.memory import collect_seldom, share_one_heap
 
@@ -28,6 +28,7 @@ COMMANDS = (
     evaluation.evaluate,
     evaluation.calibrate,
     evaluation.check,
+    inspection.inspect,
     simulation.simulate,
     simulation.demo,
     settings.config,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
+    from gnss_sem_map.datasets.ros.contents import Topic
     from gnss_sem_map.evaluation.preflight.findings import Preflight
     from gnss_sem_map.run_stats import Progress
     from gnss_sem_map.segmentation.cache import CacheReport
@@ -196,6 +197,23 @@ def print_preflight(name: str, page: Preflight, out: Path) -> None:
         for more in filter(None, (found.mistake, found.remedy)):
             console.print(f"       {more}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
+
+
+def print_topics(topics: Iterable[Topic]) -> None:
+    """The topics of a bag: a line each, and what is odd about a topic below it."""
+    typer.echo(
+        f"{'taken for':<13} {'messages':>9} {'Hz':>7} {'gaps':>5} {'longest s':>9}  topic (type, frame)"
+    )
+    for topic in topics:
+        rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
+        longest = f"{topic.longest_gap_s:.2f}" if topic.gaps else "-"
+        about = ", ".join(filter(None, (topic.kind, topic.frame)))
+        typer.echo(
+            f"{topic.taken_for or '-':<13} {topic.messages:>9} {rate:>7} {topic.gaps:>5} {longest:>9}"
+            f"  {topic.name} ({about})"
+        )
+        for note in topic.notes:
+            typer.echo(f"{'':<13} {note}")
 
 
 def _percent(share: float | None) -> str:

@@ -49,8 +49,8 @@ def run(
         list[str],
         typer.Argument(
             metavar="DRIVE...",
-            help="Folder of a drive: KITTI raw, KITTI odometry, or a CSV log; several become one map. @FILE stands for"
-            " the drives in a file, one per line.",
+            help="A drive: a folder of KITTI raw, KITTI odometry or a CSV log, or a ROS bag; several become one map."
+            " @FILE stands for the drives in a file, one per line.",
         ),
     ],
     out: Out,

@@ -14,14 +14,17 @@ if TYPE_CHECKING:
     from gnss_sem_map.sensor_log import SensorLog
 
 
-Drive = Annotated[Path, typer.Argument(help="Folder of the drive: KITTI raw, KITTI odometry, or a CSV log.")]
+Drive = Annotated[
+    Path, typer.Argument(help="The drive: a folder of KITTI raw, KITTI odometry or a CSV log, or a ROS bag.")
+]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write; an earlier run there is replaced.")]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file of settings (see `config`).")]
 Set = Annotated[
     list[str] | None, typer.Option("--set", help="One setting, as section.name=value; repeatable.")
 ]
 Format = Annotated[
-    str | None, typer.Option("--format", help="kitti-raw, kitti-odometry or table; default: detected.")
+    str | None,
+    typer.Option("--format", help="kitti-raw, kitti-odometry, table or rosbag; default: detected."),
 ]
 Frames = Annotated[
     str | None,

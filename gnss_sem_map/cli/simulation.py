@@ -40,14 +40,25 @@ def simulate(
             help="Positions of an inertial unit (0.35 m, drifting), or of a consumer's receiver (1 m)."
         ),
     ] = "unit",
+    layout: Annotated[
+        Literal["kitti-raw", "table", "rosbag1", "mcap"],
+        typer.Option(
+            help="KITTI raw, a CSV log, a ROS 1 bag, or a ROS 2 bag: the same drive, and the same map."
+        ),
+    ] = "kitti-raw",
 ) -> None:
-    """Write a simulated drive in KITTI raw format, with the exact truth beside it."""
+    """Write a simulated drive, with the exact truth beside it."""
     from gnss_sem_map.simulation import simulate as write_drive
+    from gnss_sem_map.simulation.layouts import write_in_layout
 
     with progress_bars() as progress:
-        drive = write_drive(
-            out, seconds, seed, lambda done, total: progress("simulate", done, total),
-            laps=laps, session=session, gnss=gnss,
+        drive = write_in_layout(
+            out, layout,
+            lambda folder: write_drive(
+                folder, seconds, seed, lambda done, total: progress("simulate", done, total),
+                laps=laps, session=session, gnss=gnss,
+            ),
+            lambda done, total: progress("write", done, total),
         )  # fmt: skip
     typer.echo(f"drive in {drive}")
 

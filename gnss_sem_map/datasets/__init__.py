@@ -1,7 +1,7 @@
 """Readers of drives: each reads one folder layout into a `SensorLog`.
 
 A reader is a module of this folder with `FORMAT` (its name), `SIGNS` (the content of such a drive, in words),
-`is_drive(folder)` and `read(folder, with_imu)`.
+`is_drive(path)` and `read(path, with_imu)`. Where a drive may be one file, `FILES` are the endings of its name.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pkgutil import iter_modules
 from typing import Any
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import inside, is_folder, shown
+from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
 from gnss_sem_map.sensor_log import SensorLog
 
 
@@ -25,7 +25,10 @@ def readers() -> dict[str, Any]:
 
 
 def detect_format(drive: Path) -> str:
-    """Name of the format of a drive, by its files; raises DataError for a folder that is no drive."""
+    """Name of the format of a drive, by its files; raises DataError for what is no drive."""
+    of_file = [name for name, reader in readers().items() if drive.suffix in getattr(reader, "FILES", ())]
+    if of_file and not drive.is_dir() and is_file(drive):
+        return of_file[0]
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
     fitting = [name for name, reader in readers().items() if reader.is_drive(drive)]

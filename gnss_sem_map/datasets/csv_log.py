@@ -21,8 +21,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from scipy.spatial.transform import Rotation
 
+from factor_graphs.alignment import AttitudePrior
 from factor_graphs.csv_log import (
     GNSS_COLUMNS,
     IMU_COLUMNS,
@@ -38,8 +40,10 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, LONGEST_SWEEP_S, check_unit, in_order
-from gnss_sem_map.errors import DataError, PointTimesError
+from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
+from gnss_sem_map.datasets.point_times import leave_out_of_sweep
+from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit, in_order
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
@@ -48,11 +52,6 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
-MOST_OUTSIDE = 0.1
-"""Largest share of a sweep's points without a valid time."""
-UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
-SWEEPS_S = (0.01, 0.6)
-"""Duration of most of a sweep: scanners have 2 to 50 revolutions per second."""
 Matrix4 = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
@@ -60,6 +59,27 @@ Matrix4 = tuple[
     tuple[float, float, float, float],
 ]
 IDENTITY: Matrix4 = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
+
+
+class InitialAttitude(BaseModel):
+    """Attitude of the IMU at its first stamp, as an inertial unit knows it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    quaternion_xyzw: tuple[float, float, float, float] = Field(description="imu to east, north, up.")
+    stddevs_rad: tuple[float, float, float] = Field(description="About the imu's x, y, z.")
+
+    @model_validator(mode="after")
+    def _is_attitude(self) -> InitialAttitude:
+        if abs(float(np.linalg.norm(self.quaternion_xyzw)) - 1) > 1e-3 or min(self.stddevs_rad) <= 0:
+            raise ValueError("expected a unit quaternion, and standard deviations above 0")
+        return self
+
+    @property
+    def prior(self) -> AttitudePrior:
+        """The same for the smoother."""
+        R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
+        return AttitudePrior(np.asarray(R), np.array(self.stddevs_rad))
 
 
 class LogFile(SensorConventions):
@@ -79,6 +99,10 @@ class LogFile(SensorConventions):
     image_size: tuple[int, int] | None = Field(None, description="Width and height of the images, px.")
     camera_time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
     imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
+    initial_attitude: InitialAttitude | None = Field(
+        None, description="Attitude at the first row of imu.csv; default: by the motion."
+    )
+    gnss_file: GnssFile | None = Field(None, description="A file of positions in place of gnss.csv.")
     lidar_is_compensated: bool = Field(
         False, description="Scans of four columns are already motion-compensated to their stamp."
     )
@@ -97,7 +121,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     about = _about(drive / "log.yaml")
     imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
-    gnss_rows, fix_skips = _fix_rows(drive / "gnss.csv")
+    gnss_rows, fix_skips = _fix_rows(drive, about, imu.stamps)
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
     gnss, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
     skips = [
@@ -119,6 +143,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         gnss=gnss,
         wheels=wheels,
         imu_noise=about.imu_noise,
+        initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
@@ -153,11 +178,21 @@ def _calibration(about: LogFile, path: Path) -> Calibration:
     )
 
 
-def _fix_rows(path: Path) -> tuple[Array, list[Skip]]:
+def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, list[Skip]]:
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
+    path, skips = drive / "gnss.csv", []
+    if about.gnss_file is None:
+        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S)
+    elif is_file(path):
+        raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
+    else:
+        path = drive / about.gnss_file.path
+        span_ns = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
+        found = read_gnss_file(about.gnss_file, drive, about.epoch_ns, (int(span_ns[0]), int(span_ns[1])))
+        given, skips = found.rows, found.skips
     with _as_data_error():
-        rows, invalid = fix_rows(_numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S), shown(path))
-    return rows, [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
+        rows, invalid = fix_rows(given, shown(path))
+    return rows, skips + [Skip("fix", shown(path), f"{n} rows: {why}", n) for why, n in invalid.items()]
 
 
 def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
@@ -254,44 +289,8 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.Sta
     rows = frames.read_points(path, 5, state)
     with np.errstate(invalid="ignore"):  # of signalling NaN
         after = rows[:, 4].astype(np.float64)
-    _leave_out_of_sweep(rows, after, shown(path))
+    leave_out_of_sweep(rows, after, shown(path))
     return Points(rows[:, :3], rows[:, 3], stamp + after)
-
-
-def _leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> None:
-    """Invalidate the points without a time in this sweep; raises DataError when they are too many."""
-    outside = ~(np.abs(after) <= LONGEST_SWEEP_S)
-    count = int(outside.sum())
-    if count > MOST_OUTSIDE * len(rows):
-        with np.errstate(invalid="ignore", over="ignore"):
-            largest = float(np.nanmax(np.abs(after), initial=0.0))
-        mistake = _mistake_of(after)
-        raise PointTimesError(
-            f"{where}: {count} of {len(rows)} point times are none, or up to {largest:.4g} s off the scan's stamp;"
-            f" expected seconds, at most {LONGEST_SWEEP_S:g}; {mistake}",
-            mistake,
-        )
-    if count:
-        rows[outside, :3], after[outside] = np.nan, 0.0
-    if np.ptp(after) > LONGEST_SWEEP_S:
-        raise DataError(
-            f"{where}: the sweep takes {np.ptp(after):.4g} s, expected at most {LONGEST_SWEEP_S:g}"
-        )
-
-
-def _mistake_of(after: Array) -> str:
-    """Probable unit or reference of point times that are not seconds after the stamp; robust to a few outliers."""
-    known = after[np.isfinite(after)]
-    if not len(known):
-        return "point times are not numbers"
-    low, middle, high = np.percentile(known, [5, 50, 95])
-    unit = next(
-        (unit for size, unit in UNITS.items() if SWEEPS_S[0] <= (high - low) / size <= SWEEPS_S[1]), None
-    )
-    # a float32 holds the time of day, or of the epoch, too coarsely to tell the points of a sweep apart
-    if abs(middle) > LONGEST_SWEEP_S and high - low <= max(LONGEST_SWEEP_S, 1e-5 * abs(middle)):
-        return "point times are absolute, or of another clock than the scan stamps"
-    return f"point times are in {unit}" if unit else "point times are no seconds of one sweep"
 
 
 def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:

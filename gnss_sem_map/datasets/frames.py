@@ -93,18 +93,18 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
                 )
         except OSError as error:
             raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None
-    _refuse_other_bytes(rows, path)
+    refuse_other_bytes(rows, shown(path))
     return rows
 
 
-def _refuse_other_bytes(rows: NDArray[np.float32], path: Path) -> None:
+def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:
     """Check the coordinates of a scan; points that were not measured (zero or not finite) are accepted."""
     sizes = np.abs(np.ascontiguousarray(rows[::EVERY, :3].T))  # axis by axis: a third of the time
     out = ((sizes > FARTHEST_M) & np.isfinite(sizes)) | ((sizes < NEAREST_M) & (sizes > 0))
     share = float(out.any(axis=0).mean())
     if share > NO_POINTS:
         raise DataError(
-            f"{shown(path)}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
+            f"{where}: no scan; {share:.0%} of its points lie beyond {FARTHEST_M:g} m or within"
             f" {NEAREST_M:g} m of zero, expected metres; are these other bytes, another count of columns, or mm?"
         )
 

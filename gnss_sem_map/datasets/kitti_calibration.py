@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
@@ -66,6 +67,18 @@ def transform(R: Array, t: Array, where: str) -> Array:
             f"{where}: {rotation_fault(T[:3, :3])}, expected a rotation to 1e-3 in a rigid transform; check the file"
         )
     return T
+
+
+def quaternion_of(T: Array) -> Array:
+    """The rotation of a transform, or the one that is nearest to it, as x y z w."""
+    return np.asarray(Rotation.from_matrix(T[:3, :3]).as_quat())
+
+
+def exact(T: Array) -> Array:
+    """The transform with the rotation of its quaternion: files have seven or nine digits of its matrix."""
+    found = T.copy()
+    found[:3, :3] = Rotation.from_quat(quaternion_of(T)).as_matrix()
+    return found
 
 
 def rotation_fault(R: Array) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
@@ -69,8 +70,8 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 
     Without `with_imu`, the thousands of files of its `_extract` twin are not read.
     """
-    calibration = _calibration(_date_folder(drive), has_images=is_folder(drive / "image_02"))
-    oxts_ns, oxts, skips = _oxts(drive)
+    calibration = _calibration(date_folder(drive), has_images=is_folder(drive / "image_02"))
+    oxts_ns, oxts, skips = oxts_rows(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, invalid = valid_fixes(stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]])
     if not is_fix.any():
@@ -108,19 +109,29 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     )
 
 
-def _date_folder(drive: Path) -> Path:
+def date_folder(drive: Path) -> Path:
     """The folder with the calibration: beside the drive, or, if `drive` is a link or `.`, beside its target."""
     has_calibration = is_file(drive.parent / IMU_TO_LIDAR)
     return drive.parent if has_calibration else drive.resolve().parent
 
 
 def _calibration(date: Path, has_images: bool) -> Calibration:
-    file = date / IMU_TO_LIDAR
-    imu_to_velo = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
-    T_lidar_imu = kitti_calibration.transform(imu_to_velo["R"], imu_to_velo["T"], f"{shown(file)}: R")
+    T_lidar_imu = kitti_calibration.exact(lidar_from_imu(date))
     T_imu_lidar = np.asarray(np.linalg.inv(T_lidar_imu), np.float64)
     if not has_images:
         return Calibration(T_imu_lidar)
+    T_camera_lidar, K, size = camera_from_lidar(date)
+    return Calibration(
+        T_imu_lidar=T_imu_lidar,
+        T_camera_lidar=kitti_calibration.exact(T_camera_lidar),
+        K=K,
+        image_size=size,
+        camera_time_offset_s=CAMERA_TIME_OFFSET_S,
+    )
+
+
+def camera_from_lidar(date: Path) -> tuple[Array, Array, tuple[int, int]]:
+    """T_camera_lidar (4, 4) of the rectified colour camera, K and (width, height), by the calibration of a date."""
     of_lidar, of_cameras = date / "calib_velo_to_cam.txt", date / "calib_cam_to_cam.txt"
     velo_to_cam = kitti_calibration.read_rows(of_lidar, {"R": 9, "T": 3})
     cameras = kitti_calibration.read_rows(of_cameras, {"R_rect_00": 9, "P_rect_02": 12, "S_rect_02": 2})
@@ -131,13 +142,15 @@ def _calibration(date: Path, has_images: bool) -> Calibration:
         cameras["R_rect_00"], np.zeros(3), f"{shown(of_cameras)}: R_rect_00"
     )
     T_camera0_lidar = kitti_calibration.transform(velo_to_cam["R"], velo_to_cam["T"], f"{shown(of_lidar)}: R")
-    return Calibration(
-        T_imu_lidar=T_imu_lidar,
-        T_camera_lidar=T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar,
-        K=K,
-        image_size=kitti_calibration.image_size(cameras["S_rect_02"], f"{shown(of_cameras)}: S_rect_02"),
-        camera_time_offset_s=CAMERA_TIME_OFFSET_S,
-    )
+    size = kitti_calibration.image_size(cameras["S_rect_02"], f"{shown(of_cameras)}: S_rect_02")
+    return T_camera_camera0 @ T_camera0_rectified @ T_camera0_lidar, K, size
+
+
+def lidar_from_imu(date: Path) -> Array:
+    """T_lidar_imu (4, 4), as the calibration of a date has it."""
+    file = date / IMU_TO_LIDAR
+    rows = kitti_calibration.read_rows(file, {"R": 9, "T": 3})
+    return kitti_calibration.transform(rows["R"], rows["T"], f"{shown(file)}: R")
 
 
 def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
@@ -173,7 +186,7 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
     return np.asarray((stamps_ns - epoch_ns) * 1e-9, np.float64)
 
 
-def _oxts(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
+def oxts_rows(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows of the navigation unit, sorted, without repeated stamps; and the skipped rows."""
     found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
     stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
@@ -230,7 +243,7 @@ def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[A
     for place in (drive, drive.resolve()):
         twin = place.parent / place.name.replace("_sync", "_extract")
         if "_sync" in place.name and is_folder(twin / "oxts" / "data"):
-            twin_ns, rows, skips = _oxts(twin)
+            twin_ns, rows, skips = oxts_rows(twin)
             return _seconds(twin_ns, epoch_ns), rows, skips
     return stamps, oxts, []
 
@@ -244,10 +257,13 @@ def _reference_poses(positions: Array, oxts: Array) -> Array:
 
 
 def _attitudes(oxts: Array) -> Array:
-    """R_map_imu (k, 3, 3) by the navigation unit. Yaw is 0 towards east, counter-clockwise."""
-    from scipy.spatial.transform import Rotation
+    """R_map_imu (k, 3, 3) by the navigation unit."""
+    return np.asarray(Rotation.from_quat(quaternions(oxts)).as_matrix())
 
-    return np.asarray(Rotation.from_euler("ZYX", oxts[:, [YAW, PITCH, ROLL]]).as_matrix())
+
+def quaternions(oxts: Array) -> Array:
+    """Attitudes by the navigation unit (k, 4), x y z w. Yaw is 0 towards east, counter-clockwise."""
+    return np.asarray(Rotation.from_euler("ZYX", oxts[:, [YAW, PITCH, ROLL]]).as_quat())
 
 
 def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
@@ -269,20 +285,29 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
         if fault is not None:
             skips.append(Skip("scan", shown(path), fault))
         else:
-            read = partial(_read_sweep, path, begun, ended, frames.state_of(path))
+            read = partial(_read_sweep, path, stamp, begun, ended, frames.state_of(path))
             scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
     return in_order("scan", scans, skips), skips
 
 
-def _read_sweep(path: Path, start: float, end: float, state: frames.State | None) -> Points:
-    """A sweep with the stamp of every point, from its azimuth: rear, left, front, right, rear."""
+def _read_sweep(path: Path, stamp: float, start: float, end: float, state: frames.State | None) -> Points:
+    rows = frames.read_points(path, state=state)
+    stamps = seconds_after(rows, stamp, start, end).astype(np.float64)
+    stamps += stamp
+    return Points(rows[:, :3], rows[:, 3], stamps)
+
+
+def seconds_after(rows: NDArray[np.float32], stamp: float, start: float, end: float) -> NDArray[np.float32]:
+    """When the points (n, 4) were measured, s after its stamp, by their azimuth: rear, left, front, right, rear.
+
+    As float32, to 4 ns: the same as in the fields of other formats.
+    """
     from gnss_sem_map.scans.angles import azimuths_deg  # compiled: only those who read scans need it
 
-    rows = frames.read_points(path, state=state)
-    stamps = azimuths_deg(rows)
-    stamps *= (start - end) / 360
-    stamps += (start + end) / 2
-    return Points(rows[:, :3], rows[:, 3], stamps)
+    after = azimuths_deg(rows)
+    after *= (start - end) / 360
+    after += (start + end) / 2 - stamp
+    return after.astype(np.float32)
 
 
 def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:

@@ -40,18 +40,24 @@ def read_picture(
     Raises DataError for a damaged one, one of another (width, height), and where `needs_colour` one of other than three
     channels of 8 bits.
     """
-    content = read_bytes(path, MOST_FILE_BYTES)
-    with _opened(path, content) as picture:
-        _check_size(path, picture.size, size)
+    return decoded_picture(shown(path), read_bytes(path, MOST_FILE_BYTES), size, needs_colour)
+
+
+def decoded_picture(
+    where: str, content: bytes, size: tuple[int, int] | None = None, needs_colour: bool = False
+) -> NDArray[np.uint8]:
+    """RGB pixels (h, w, 3) of the content of a PNG or JPEG; `where` is its name in errors. See `read_picture`."""
+    with _opened(where, content) as picture:
+        _check_size(where, picture.size, size)
         if needs_colour and (picture.mode not in ("RGB", "P") or _depth(content) > 8):
-            raise DataError(f"{shown(path)}: found {_described(picture, content)}, expected 8-bit colour")
+            raise DataError(f"{where}: found {_described(picture, content)}, expected 8-bit colour")
         return np.array(picture.convert("RGB"))
 
 
 def read_ids(path: Path) -> NDArray[np.uint8]:
     """The values (h, w) of an 8-bit grey PNG; raises DataError for anything else."""
     content = read_bytes(path, MOST_FILE_BYTES)
-    with _opened(path, content) as picture:
+    with _opened(shown(path), content) as picture:
         if not content.startswith(PNG) or picture.mode != "L" or _depth(content) != 8:
             raise DataError(
                 f"{shown(path)}: found {_described(picture, content)}, expected an 8-bit grey PNG of class ids,"
@@ -61,11 +67,11 @@ def read_ids(path: Path) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def _opened(path: Path, content: bytes) -> Iterator[ImageFile.ImageFile]:
+def _opened(where: str, content: bytes) -> Iterator[ImageFile.ImageFile]:
     """Open a picture with a valid header and valid checksums; raises DataError, also while it is decoded."""
     kind = "PNG" if content.startswith(PNG) else "JPEG" if content.startswith(JPEG) else None
     if kind is None:
-        raise DataError(f"{shown(path)}: damaged image; expected PNG or JPEG")
+        raise DataError(f"{where}: damaged image; expected PNG or JPEG")
     try:
         with Image.open(io.BytesIO(content), formats=(kind,)) as picture:
             width, height = picture.size
@@ -78,7 +84,7 @@ def _opened(path: Path, content: bytes) -> Iterator[ImageFile.ImageFile]:
         raise
     except FAULTS as error:
         reason = " ".join(str(error).split())[:100]
-        raise DataError(f"{shown(path)}: damaged image ({reason}); expected PNG or JPEG") from None
+        raise DataError(f"{where}: damaged image ({reason}); expected PNG or JPEG") from None
 
 
 def _depth(content: bytes) -> int:
@@ -91,10 +97,10 @@ def _described(picture: ImageFile.ImageFile, content: bytes) -> str:
     return f"uint{_depth(content)} {shape}{' by a palette' if picture.mode == 'P' else ''}"
 
 
-def _check_size(path: Path, found: tuple[int, int], size: tuple[int, int] | None) -> None:
+def _check_size(where: str, found: tuple[int, int], size: tuple[int, int] | None) -> None:
     if size is not None and found != size:
         raise ImageSizeError(
-            f"{shown(path)}: found {found[0]} x {found[1]} pixels, expected {size[0]} x {size[1]} as in the"
+            f"{where}: found {found[0]} x {found[1]} pixels, expected {size[0]} x {size[1]} as in the"
             " calibration; is this the right camera, and the rectified image?",
             found,
         )

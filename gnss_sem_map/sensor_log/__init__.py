@@ -7,6 +7,7 @@ stamp, or by the frame number in the file name, never by their position in a lis
 from __future__ import annotations
 
 import bisect
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -199,9 +200,9 @@ class SensorLog:
 
     @property
     def folders(self) -> set[Path]:
-        """Folders of the files of scans and images."""
-        files = {*map(file_of, self.scans), *map(file_of, self.images)}
-        return {file.parent for file in files if file is not None}
+        """Folders of the files of scans and images; of a bag, which holds many of them, its files."""
+        counts = Counter(file for items in (self.scans, self.images) for file in map(file_of, items))
+        return {file.parent if count == 1 else file for file, count in counts.items() if file is not None}
 
     def between(self, frames: str | None) -> SensorLog:
         """The same log with the scans A to B - 1 alone: `frames` is "A:B", "A:" or ":B". Raises ConfigError."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from gnss_sem_map.evaluation.preflight.dead_reckoning import agreement, windows_of
+from gnss_sem_map.evaluation.preflight.dead_reckoning import WINDOW_S, Complex, Windows, agreement, windows_of
 from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral, way_of
 from gnss_sem_map.evaluation.preflight.response import turn_gain
 from gnss_sem_map.evaluation.preflight.track import Track
@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 FARTHEST_S, COARSE_S, FINE_S = 3.0, 0.1, 0.02
 # Twice the logarithm of the likelihood must gain so much: four standard deviations of one unknown.
 FOUR_SIGMA = 16.0
+# GPS time is so many seconds ahead of UTC (since 2017); what is off by as much has one in place of the other.
+LEAP_S, LEAP_STEP_S = 18.0, 0.2
+# Twice the logarithm of the likelihood, above all lags near zero, by which that is believed: ten standard deviations.
+SURE_LEAP = 100.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,39 @@ class Lag:
 NO_LAG = Lag(0.0, 0.0, False)
 
 
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Fixes against the IMU, for any lag between the two."""
+
+    stamps: Array
+    windows: Windows | None
+    ways: list[Complex]
+    turned: SmoothedIntegral
+    track: Track
+
+    def likelihoods(self, lags: Array) -> Array:
+        """Logarithms, up to a constant: normal errors of the ways, and Laplace's of the turns."""
+        rests, free, turns, intervals = np.array([self._misfits(lag) for lag in lags]).T
+        # as many independent errors as where the fit is best, for all: elsewhere the lag itself makes them alike
+        at_best = int(np.argmin(rests * turns))
+        return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
+
+    def _misfits(self, lag: float) -> tuple[float, float, float, int]:
+        """Of the ways, and how many independent errors that is; of the courses, likewise."""
+        windows = self.windows
+        found = (
+            [agreement(windows, self.stamps, way, lag) for way in self.ways] if windows is not None else []
+        )
+        best = min(found, key=lambda one: one.rest, default=None)
+        gain = turn_gain(self.turned, self.track, lag)
+        return (
+            max(best.rest, 1e-9) if best is not None else 1.0,
+            best.independent if best is not None else 0.0,
+            max(gain.misfit, 1e-6) if gain is not None else 1.0,
+            gain.intervals if gain is not None else 0,
+        )
+
+
 def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j) -> Lag:
     """The lag that fits best, whatever the axes in the plane: z of the IMU is up, its rate in rad/s.
 
@@ -47,37 +84,45 @@ def lag_of(imu: ImuSamples, fixes: GnssFixes, track: Track, lever: complex = 0j)
     """
     start, end = float(imu.stamps[0]), float(imu.stamps[-1])
     farthest = min(FARTHEST_S, (end - start) / 4)
-    windows = windows_of(fixes, start + farthest, end - farthest)
     turned = SmoothedIntegral.of(imu.stamps, imu.angular_rate[:, 2])
     backwards = ImuSamples(imu.stamps, imu.specific_force, -imu.angular_rate)
     ways = [way_of(unit, lever, mirrored=hand) for unit in (imu, backwards) for hand in (False, True)]
 
-    def misfits(lag: float) -> tuple[float, float, float, int]:
-        """Of the ways, and how many independent errors that is; of the courses, likewise."""
-        found = [agreement(windows, imu.stamps, way, lag) for way in ways] if windows is not None else []
-        best = min(found, key=lambda one: one.rest, default=None)
-        gain = turn_gain(turned, track, lag)
-        return (
-            max(best.rest, 1e-9) if best is not None else 1.0,
-            best.independent if best is not None else 0.0,
-            max(gain.misfit, 1e-6) if gain is not None else 1.0,
-            gain.intervals if gain is not None else 0,
-        )
+    def compared(within: float) -> _Comparison:
+        windows = windows_of(fixes, start + within, end - within)
+        return _Comparison(imu.stamps, windows, ways, turned, track)
 
-    def likelihoods(lags: Array) -> Array:
-        """Logarithms, up to a constant: normal errors of the ways, and Laplace's of the turns."""
-        rests, free, turns, intervals = np.array([misfits(lag) for lag in lags]).T
-        # as many independent errors as where the fit is best, for all: elsewhere the lag itself makes them alike
-        at_best = int(np.argmin(rests * turns))
-        return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
+    if end - start >= 2 * (LEAP_S + FARTHEST_S) + WINDOW_S:
+        leap = _leap_of(compared(LEAP_S + FARTHEST_S))
+        if leap is not None:
+            return leap
+    return _near_lag(compared(farthest), farthest)
 
+
+def _near_lag(compared: _Comparison, farthest: float) -> Lag:
+    """The lag up to `farthest` s that fits best."""
     count = round(farthest / COARSE_S)
     coarse = np.linspace(-count, count, 2 * count + 1) * COARSE_S
-    scores = likelihoods(coarse)
+    scores = compared.likelihoods(coarse)
     best = float(coarse[int(np.argmax(scores))])
     fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)
-    around = likelihoods(fine)
+    around = compared.likelihoods(fine)
     found = float(fine[int(np.argmax(around))])
     beside = scores[np.abs(np.abs(coarse - found) - 0.5) < COARSE_S]
     observable = len(beside) > 0 and 2 * (scores.max() - beside.max()) > FOUR_SIGMA
     return Lag(found, float(2 * (around.max() - around[-1])), bool(observable))
+
+
+def _leap_of(compared: _Comparison) -> Lag | None:
+    """The lag where one clock has GPS time and the other UTC; None where one near zero fits about as well."""
+    count = round(FARTHEST_S / LEAP_STEP_S)
+    around = np.arange(-count, count + 1) * LEAP_STEP_S
+    lags = np.concatenate([leap + around for leap in (0.0, LEAP_S, -LEAP_S)])
+    scores = compared.likelihoods(lags)
+    best = int(np.argmax(scores))
+    gain = 2 * float(scores[best] - scores[: len(around)].max())
+    if best < len(around) or gain < SURE_LEAP:
+        return None
+    fine = lags[best] + np.arange(-10, 11) * FINE_S
+    found = float(fine[int(np.argmax(compared.likelihoods(fine)))])
+    return Lag(found, gain, observable=True)

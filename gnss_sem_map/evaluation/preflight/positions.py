@@ -11,6 +11,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes
 from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.evaluation.preflight import poses
+from gnss_sem_map.evaluation.preflight.clocks import FARTHEST_S, LEAP_S
 from gnss_sem_map.evaluation.preflight.diagnosis import Diagnosis
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.fixes import Fixes
@@ -161,6 +162,14 @@ def _is_of_accuracy(reason: str) -> bool:
     return any(word in reason for word in ("accuracy", "stddev", "standard deviation", "std_"))
 
 
+def _time_system(lag_s: float) -> str:
+    """What a lag near the leap seconds tells."""
+    if abs(abs(lag_s) - LEAP_S) > FARTHEST_S:
+        return ""
+    given, expected = ("GPS time", "UTC") if lag_s < 0 else ("UTC", "GPS time")
+    return f": they are {given} where {expected} is expected"
+
+
 def _clock(diagnosis: Diagnosis) -> Finding:
     lag, track = diagnosis.lag, diagnosis.track
     if not lag.is_certain or abs(lag.seconds) < NOTABLE_LAG_S:
@@ -181,6 +190,6 @@ def _clock(diagnosis: Diagnosis) -> Finding:
     return level(
         "GNSS clock",
         f"fixes agree best with the IMU {lag.seconds:+.2f} s after their stamps, at up to {fast:.0f} m/s",
-        f"the stamps of the GNSS are {abs(lag.seconds):.2f} s {late}{antenna}",
+        f"the stamps of the GNSS are {abs(lag.seconds):.2f} s {late}{antenna}{_time_system(lag.seconds)}",
         f"set gnss_time_offset_s: {lag.seconds:.2f}",
     )

@@ -167,3 +167,15 @@ def test_poses_of_a_camera_look_aside() -> None:
     T = poses().T_map_imu.copy()
     T[:, :3, :3] = T[:, :3, :3] @ np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     assert any("other axes" in line for line in wrong(findings(given(T))))
+
+
+@pytest.mark.parametrize("shift_s", [18.0, -18.0])
+@pytest.mark.parametrize("seed", [0, 6])
+def test_gps_time_in_place_of_utc_is_found(seed: int, shift_s: float) -> None:
+    log = drive(seed, 120.0, ImuNoise())
+    fixes = GnssFixes(fixes_of(log).stamps + shift_s, fixes_of(log).positions, fixes_of(log).stddevs)
+    [told] = [text for text in wrong(findings(replace(log, gnss=fixes))) if text.startswith("GNSS clock")]
+    assert ("they are GPS time where UTC" if shift_s > 0 else "they are UTC where GPS time") in told
+    offset = float(told.rpartition("gnss_time_offset_s: ")[2])
+    assert abs(offset + shift_s) < 0.25
+    assert not [text for text in wrong(findings(log)) if text.startswith("GNSS clock")]

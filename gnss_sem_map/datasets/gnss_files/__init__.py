@@ -1,0 +1,122 @@
+"""Positions of a receiver in a file of its own: RTKLIB .pos, NMEA, SBET.
+
+`GnssFile` says what the file does not: its clock, and how good its positions are. Positions become rows like those of
+gnss.csv, and errors of the clock are found where they leave no fix within the drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from gnss_sem_map.datasets.gnss_files import nmea, rtklib, sbet
+from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.time_systems import LEAP_S, gps_minus_utc_s
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.sensor_log import Skip
+
+Array = NDArray[np.float64]
+
+READERS = {
+    ".pos": rtklib.read, ".nmea": nmea.read, ".nma": nmea.read, ".ubx": nmea.read, ".txt": nmea.read,
+    ".log": nmea.read, ".sbet": sbet.read, ".out": sbet.read,
+}  # fmt: skip
+LONGEST_OFFSET_S = 14 * 3600
+
+
+class GnssFile(BaseModel):
+    """A file of positions, and what it does not say."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    path: str = Field(
+        description="Beside the file that names it: .pos (RTKLIB), .nmea, or .sbet or .out (SBET)."
+    )
+    time: Literal["utc", "gps"] | None = Field(
+        None, description="Time system of its stamps; default: as the file says; NMEA utc, SBET gps."
+    )
+    utc_offset_s: float = Field(
+        0.0, ge=-LONGEST_OFFSET_S, le=LONGEST_OFFSET_S,
+        description="Its clock is ahead by so much: 7200 where it shows the summer time of Berlin.",
+    )  # fmt: skip
+    accuracy: str | None = Field(None, description="SBET: the file of its errors (smrmsg).")
+    stddevs_m: tuple[float, float, float] | None = Field(
+        None, description="East, north, up, m; default: by the file's deviations and quality flags."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FileFixes:
+    """Rows of a file of positions on the clock of a log."""
+
+    rows: Array
+    """(n, 7) stamp s, latitude and longitude °, height m, standard deviations east, north, up m."""
+    stamps_ns: NDArray[np.int64]
+    """(n,) Unix time, ns."""
+    skips: list[Skip]
+
+
+def read_gnss_file(
+    about: GnssFile, folder: Path, epoch_ns: int | None, drive_ns: tuple[int, int] | None
+) -> FileFixes:
+    """The positions of a file, with stamps from `epoch_ns` on, or from the first one on.
+
+    `drive_ns`: first and last moment of the drive, Unix ns, where another sensor tells; it also tells the week of an
+    SBET and the day of an NMEA without dates. Raises DataError for a file that is none of these, or not of the drive.
+    """
+    path = _inside(folder, about.path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError(
+            f"{shown(path)}: found the ending {path.suffix!r}, expected one of {', '.join(READERS)}"
+        )
+    accuracy = None if about.accuracy is None else _inside(folder, about.accuracy)
+    found = reader(path, None if drive_ns is None else drive_ns[0], accuracy, about.stddevs_m is not None)
+    stamps_ns = _on_unix_clock(found, about)
+    if drive_ns is not None:
+        _check_overlap(path, stamps_ns, drive_ns)
+    stddevs = found.stddevs if about.stddevs_m is None else np.tile(about.stddevs_m, (len(stamps_ns), 1))
+    zero = int(stamps_ns[0]) if epoch_ns is None else epoch_ns
+    rows = np.column_stack([(stamps_ns - zero) * 1e-9, found.geodetic, stddevs])
+    return FileFixes(rows, stamps_ns, found.skips)
+
+
+def _inside(folder: Path, name: str) -> Path:
+    """A file in a folder; raises DataError for one that is elsewhere or missing."""
+    path = folder / name
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise DataError(
+            f"{shown(folder)}: found the GNSS file {name[:100]!r}, expected a path within this folder"
+        )
+    if not is_file(path):
+        raise DataError(f"{shown(path)}: no such file; expected positions of the receiver")
+    return path
+
+
+def _on_unix_clock(found: Positions, about: GnssFile) -> NDArray[np.int64]:
+    stamps = found.stamps_ns - round(about.utc_offset_s * 1e9)
+    if (about.time or found.time) == "gps":
+        return np.asarray(stamps - gps_minus_utc_s(stamps) * 1_000_000_000)
+    return stamps
+
+
+def _check_overlap(path: Path, stamps_ns: NDArray[np.int64], drive_ns: tuple[int, int]) -> None:
+    """Raise DataError when no fix lies within the drive, with the offset of a clock that would explain it."""
+    first, last = int(stamps_ns.min()), int(stamps_ns.max())
+    if first <= drive_ns[1] and last >= drive_ns[0]:
+        return
+    late_s = ((first + last) - (drive_ns[0] + drive_ns[1])) / 2e9
+    hours = round(late_s / 1800) * 1800
+    near = min((hours, hours - LEAP_S, hours + LEAP_S), key=lambda s: abs(late_s - s))
+    slack_s = (last - first + drive_ns[1] - drive_ns[0]) / 2e9
+    fits = hours and abs(hours) <= LONGEST_OFFSET_S and abs(late_s - near) <= slack_s
+    raise DataError(
+        f"{shown(path)}: no fix lies within the drive: the fixes are {late_s:.0f} s after it (middle to middle);"
+        + (f" is it local time? set utc_offset_s: {hours}" if fits else " is it the file of this drive?")
+    )

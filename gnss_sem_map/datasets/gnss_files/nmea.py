@@ -1,0 +1,146 @@
+"""NMEA 0183: positions of GGA, dates of RMC or ZDA, standard deviations of GST; parsed by `pynmeagps`.
+
+GGA's height is above the geoid; with the geoid's own height, which it also tells, it is above the ellipsoid.
+"""
+
+from __future__ import annotations
+
+import datetime
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, nearest
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import read_lines, shown
+from gnss_sem_map.sensor_log import Skip
+
+STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0.3, 0.5)}
+"""Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
+no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
+USED = ("GGA", "RMC", "ZDA", "GST")
+
+
+def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
+    """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none."""
+    del accuracy, has_stddevs
+    if find_spec("pynmeagps") is None:
+        raise DataError(
+            f"{shown(path)}: NMEA needs the extra [ros]: pip install -c constraints.txt -e '.[ros]'"
+        )
+    now: int | None = None  # by the last sentence with a date
+    deviations: dict[int, tuple[float, float, float]] = {}
+    fixes: list[tuple[int, bool, list[float]]] = []
+    lost: dict[str, int] = {}
+    for line in read_lines(path):
+        sentence, why = _sentence(line)
+        if sentence is None:
+            if why:
+                lost[why] = lost.get(why, 0) + 1
+            continue
+        if sentence.msgID in ("RMC", "ZDA"):
+            now = _moment_ns(sentence) or now
+            continue
+        clock = _clock_ns(sentence.time)
+        if sentence.msgID == "GST" and clock is not None:
+            deviations[clock] = (sentence.stdLong, sentence.stdLat, sentence.stdAlt)
+        elif sentence.msgID == "GGA":
+            why = _fault(sentence, clock)
+            if why:
+                lost[why] = lost.get(why, 0) + 1
+            elif clock is not None:
+                stamp = clock if now is None else clock + round((now - clock) / DAY_NS) * DAY_NS
+                fixes.append((stamp, now is not None, _position(sentence)))
+    skips = [Skip("fix", shown(path), f"{count} sentences: {why}", count) for why, count in lost.items()]
+    if not fixes:
+        raise DataError(
+            f"{shown(path)}: found no GGA sentence with a fix"
+            + (f" ({'; '.join(skip.reason for skip in skips)})" if skips else "; expected NMEA 0183")
+        )
+    return _joined(path, fixes, deviations, near_ns, skips)
+
+
+def _joined(
+    path: Path,
+    fixes: list[tuple[int, bool, list[float]]],
+    deviations: dict[int, tuple[float, float, float]],
+    near_ns: int | None,
+    skips: list[Skip],
+) -> Positions:
+    dated = np.array([is_dated for _, is_dated, _ in fixes])
+    stamps = np.array([stamp for stamp, _, _ in fixes], np.int64)
+    if dated.any() and not dated.all():
+        skips.append(Skip("fix", shown(path), "before the first date (RMC or ZDA)", int((~dated).sum())))
+        fixes = [fix for fix in fixes if fix[1]]
+        stamps = stamps[dated]
+    elif not dated.any():
+        if near_ns is None:
+            raise DataError(f"{shown(path)}: has no date, expected RMC or ZDA sentences beside GGA")
+        midnights = np.concatenate([[0], np.cumsum(np.diff(stamps) < -DAY_NS // 2)])
+        stamps = nearest(stamps + midnights * DAY_NS, DAY_NS, near_ns)
+    table = np.array([values for _, _, values in fixes])
+    given = [deviations.get(int(stamp % DAY_NS)) for stamp in stamps]
+    stddevs = np.array([
+        one if one is not None and all(isinstance(v, float) and v > 0 for v in one) else by_quality
+        for one, by_quality in zip(given, table[:, 3:].tolist(), strict=True)
+    ])  # fmt: skip
+    return Positions(stamps, table[:, :3], stddevs, "utc", skips)
+
+
+def _sentence(line: str) -> tuple[Any | None, str]:
+    """A sentence that is used, or why a line that looks like one is not."""
+    from pynmeagps import NMEAReader, exceptions
+
+    start = line.find("$")
+    if start < 0 or line[start + 3 : start + 6] not in USED:
+        return None, ""
+    try:
+        return NMEAReader.parse(line[start:].strip() + "\r\n"), ""
+    except (
+        exceptions.NMEAParseError,
+        exceptions.NMEAMessageError,
+        exceptions.NMEATypeError,
+        ValueError,
+    ) as error:
+        return None, "wrong checksum" if "checksum" in str(error) else "damaged"
+
+
+def _moment_ns(sentence: Any) -> int | None:
+    """Date and time of a sentence, ns since 1970; None where the receiver does not know them yet."""
+    date, clock = sentence.date if sentence.msgID == "RMC" else _date(sentence), _clock_ns(sentence.time)
+    if not isinstance(date, datetime.date) or clock is None:
+        return None
+    return int(np.datetime64(date, "D").astype("datetime64[ns]").astype(np.int64)) + clock
+
+
+def _date(zda: Any) -> datetime.date | None:
+    try:
+        return datetime.date(int(zda.year), int(zda.month), int(zda.day))
+    except (ValueError, TypeError):
+        return None
+
+
+def _clock_ns(time: Any) -> int | None:
+    """ns since midnight."""
+    if not isinstance(time, datetime.time):
+        return None
+    seconds = (time.hour * 60 + time.minute) * 60 + time.second
+    return seconds * 1_000_000_000 + time.microsecond * 1000
+
+
+def _fault(gga: Any, clock: int | None) -> str:
+    """Why a GGA is no fix; empty if it is one."""
+    if clock is None or gga.quality not in STDDEVS_M or not isinstance(gga.lat, float):
+        return f"no fix (quality {gga.quality})"
+    if not isinstance(gga.alt, float) or not isinstance(gga.sep, float):
+        return "no height, or none of the geoid: the height above the ellipsoid is unknown"
+    return ""
+
+
+def _position(gga: Any) -> list[float]:
+    across, up = STDDEVS_M[gga.quality]
+    dilution = max(gga.HDOP, 1.0) if isinstance(gga.HDOP, float) and gga.quality in (1, 2, 3) else 1.0
+    return [gga.lat, gga.lon, gga.alt + gga.sep, across * dilution, across * dilution, up * dilution]

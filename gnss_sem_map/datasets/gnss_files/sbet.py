@@ -1,0 +1,71 @@
+"""SBET, the smoothed best estimate of trajectory of an inertial unit: 17 doubles per row, in SI units and radians.
+
+Its errors are in a file of their own (smrmsg), ten doubles per row: time, then the RMS of north, east and down.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.datasets.gnss_files.positions import Positions
+from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, WEEK_NS, nearest
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import read_bytes, shown
+
+COLUMNS, ACCURACY_COLUMNS = 17, 10
+STEP_S = 0.1
+"""Of a row in so many seconds: neighbouring ones share their errors, and are no measurements of their own."""
+WEEK_S = 7 * 86_400.0
+
+
+def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
+    """Positions at 10 Hz; raises DataError for a file that is no SBET, or whose accuracy or week is unknown."""
+    rows = _rows(path, COLUMNS)
+    seconds, lat, lon, height = rows[:, :4].T
+    if not ((np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi) & (np.abs(height) < 1e5)).all():
+        raise DataError(
+            f"{shown(path)}: found no latitudes in radians, expected rows of {COLUMNS} doubles (SBET)"
+        )
+    if accuracy is None and not has_stddevs:
+        raise DataError(
+            f"{shown(path)}: an SBET does not tell its accuracy; set `accuracy:` to its smrmsg file, or `stddevs_m:`"
+        )
+    if near_ns is None:
+        raise DataError(
+            f"{shown(path)}: an SBET does not tell its week, and no other sensor of this log does"
+        )
+    kept = np.flatnonzero(np.diff(np.floor((seconds - seconds[0]) / STEP_S + 1e-6), prepend=-1.0) > 0)
+    stamps = GPS_EPOCH_NS + np.round(seconds[kept] * 1e9).astype(np.int64)
+    stddevs = np.ones((len(kept), 3)) if accuracy is None else _stddevs(accuracy, seconds[kept])
+    geodetic = np.column_stack([np.degrees(lat), np.degrees(lon), height])[kept]
+    return Positions(nearest(stamps, WEEK_NS, near_ns), geodetic, stddevs, "gps", [])
+
+
+def _rows(path: Path, columns: int) -> NDArray[np.float64]:
+    content = read_bytes(path)
+    if not content or len(content) % (8 * columns):
+        raise DataError(
+            f"{shown(path)}: found {len(content)} bytes, expected rows of {columns} doubles; is it truncated?"
+        )
+    rows = np.frombuffer(content, "<f8").reshape(-1, columns)
+    steps = np.diff(rows[:, 0])
+    with np.errstate(invalid="ignore"):
+        is_clock = (
+            np.isfinite(rows[:, 0]).all() and (rows[:, 0] >= 0).all() and (rows[:, 0] < 2 * WEEK_S).all()
+        )
+    if not is_clock or not (steps > 0).all():
+        raise DataError(
+            f"{shown(path)}: its first column is no rising time of a week, s; is it an SBET, or smrmsg?"
+        )
+    return rows
+
+
+def _stddevs(path: Path, seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """East, north, up (n, 3), m, at times of the week."""
+    rows = _rows(path, ACCURACY_COLUMNS)
+    if seconds[0] < rows[0, 0] - STEP_S * 20 or seconds[-1] > rows[-1, 0] + STEP_S * 20:
+        raise DataError(f"{shown(path)}: does not cover the time of the SBET; is it of another drive?")
+    return np.column_stack([np.interp(seconds, rows[:, 0], rows[:, column]) for column in (2, 1, 3)])

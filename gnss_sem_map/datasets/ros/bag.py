@@ -1,0 +1,140 @@
+"""A bag: one file, or a folder of the files that it was split into, of ROS 1 or ROS 2 (MCAP or sqlite3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.datasets.ros.mcap_file import McapFile
+from gnss_sem_map.datasets.ros.ros1_file import Ros1File
+from gnss_sem_map.datasets.ros.sqlite_file import SqliteFile
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
+
+Ints = NDArray[np.int64]
+BagFile = McapFile | Ros1File | SqliteFile
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+METADATA = "metadata.yaml"
+WHOLE_FILE = ".zstd"
+"""Ending of the files of a bag that was compressed file by file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Messages:
+    """Where the messages of a topic are, in the order of their arrival."""
+
+    topic: str
+    kind: str
+    """Type of the messages, as ROS 2 writes it: sensor_msgs/msg/Imu."""
+    received_ns: Ints
+    """(n,) Unix time of arrival."""
+    places: NDArray[np.int64]
+    """(n, 3): number of the file, and the place in it."""
+
+    def __len__(self) -> int:
+        return len(self.received_ns)
+
+
+class Bag:
+    """All messages of a bag by topic; they are read when they are asked for, by any thread."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        names = bag_files(path)
+        if not names:
+            raise DataError(
+                f"{shown(path)}: found no {', '.join(SUFFIXES)} file, expected a bag of ROS 1 or ROS 2"
+            )
+        suffixes = sorted({name.suffix for name in names})
+        if len(suffixes) > 1:
+            raise DataError(
+                f"{shown(path)}: found files of {' and '.join(suffixes)} in one folder, expected the parts of one bag"
+            )
+        if find_spec("rosbags") is None:
+            raise DataError(
+                f"{shown(path)}: ROS bags need the extra [ros]: pip install -c constraints.txt -e '.[ros]'"
+            )
+        self.is_ros1 = suffixes == [".bag"]
+        codec = "" if self.is_ros1 else _message_codec(path)
+        self._files: list[BagFile] = [_opened(name, codec) for name in names]
+        self.kinds = self._kinds()
+
+    def messages(self, topic: str) -> Messages:
+        """The messages of a topic in the order of their arrival; raises DataError when there is no such topic."""
+        if topic not in self.kinds:
+            raise DataError(
+                f"{shown(self.path)}: found no topic {topic[:100]!r}; it has {', '.join(sorted(self.kinds))[:500]}"
+            )
+        times, places = [], []
+        for number, file in enumerate(self._files):
+            received, where = file.index(topic)
+            times.append(received)
+            places.append(np.column_stack([np.full(len(where), number, np.int64), where]))
+        joined = np.concatenate(times)
+        order = np.argsort(joined, kind="stable")
+        return Messages(topic, self.kinds[topic], joined[order], np.concatenate(places)[order])
+
+    def read(self, messages: Messages, k: int, most: int | None = None) -> bytes:
+        """A message of a topic, by its position in time, or its first `most` bytes; raises DataError."""
+        file, *place = messages.places[k].tolist()
+        one: BagFile = self._files[file]
+        return one.read((place[0], place[1]), most)
+
+    def each(self, messages: Messages) -> Iterator[bytes]:
+        """All messages of a topic, one after the other."""
+        return (self.read(messages, k) for k in range(len(messages)))
+
+    def file_of(self, messages: Messages, k: int) -> Path:
+        """The file that holds a message."""
+        return self._files[int(messages.places[k, 0])].path
+
+    def _kinds(self) -> dict[str, str]:
+        kinds: dict[str, str] = {}
+        for file in self._files:
+            for topic, kind in file.topics.items():
+                if kinds.setdefault(topic, kind) != kind:
+                    raise DataError(
+                        f"{shown(file.path)}: {topic} is of {kind}, in another part of the bag of {kinds[topic]}"
+                    )
+        return kinds
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The files of a bag, sorted by name; none for what is no bag."""
+    if path.suffix in SUFFIXES and not path.is_dir():
+        return [path] if is_file(path) else []
+    if not is_folder(path):
+        return []
+    found = inside(path)
+    packed = [one.name for one in found if one.suffix == WHOLE_FILE and Path(one.stem).suffix in SUFFIXES]
+    if packed:
+        raise DataError(
+            f"{shown(path)}: is compressed as whole files ({shown(packed[0])}), which cannot be read in parts; expand"
+            f" it once: zstd -d --rm {shown(packed[0])}, and remove compression_mode from {METADATA}"
+        )
+    return [one for one in found if one.suffix in SUFFIXES and is_file(one)]
+
+
+def _message_codec(path: Path) -> str:
+    """How single messages are compressed, as the metadata of a ROS 2 bag say; empty: not at all."""
+    if not path.is_dir() or not is_file(path / METADATA):
+        return ""
+    about: Any = read_yaml(path / METADATA)
+    about = about.get("rosbag2_bagfile_information") if isinstance(about, dict) else None
+    if not isinstance(about, dict) or str(about.get("compression_mode") or "").lower() != "message":
+        return ""
+    return str(about.get("compression_format") or "")
+
+
+def _opened(path: Path, codec: str) -> BagFile:
+    if path.suffix == ".bag":
+        return Ros1File(path)
+    return McapFile(path, codec) if path.suffix == ".mcap" else SqliteFile(path, codec)

@@ -1,0 +1,124 @@
+"""Calibration of the rig: by rig.yaml, else by the static transforms and the CameraInfo of the bag."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, Rig, matrix
+from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.sensor_log import Calibration, Skip
+
+Array = NDArray[np.float64]
+
+
+def calibration_of(bag: Bag, rig: Rig) -> tuple[Calibration, list[Skip]]:
+    """Poses of the sensors and the camera's intrinsics; raises DataError for one that is nowhere."""
+    assert rig.imu is not None
+    assert rig.gnss is not None
+    transforms = read_static_transforms(bag)
+    imu = rig.imu.frame or _frame_in(bag, rig.imu.topic)
+    antenna, skips = _antenna(bag, rig.gnss, imu, transforms)
+    if not rig.lidars:
+        return Calibration(np.eye(4), p_imu_antenna=antenna), skips
+    [lidar] = rig.lidars.values()
+    frame = lidar.frame or _frame_in(bag, lidar.topic)
+    T_imu_lidar = matrix(lidar.T_imu_lidar)
+    if T_imu_lidar is None:
+        T_imu_lidar = _found(bag, transforms, imu, frame, "T_imu_lidar")
+    if not rig.cameras:
+        return Calibration(T_imu_lidar, p_imu_antenna=antenna), skips
+    [camera] = rig.cameras.values()
+    K, size, T_shift = _intrinsics(bag, camera)
+    T_camera_lidar = matrix(camera.T_camera_lidar)
+    if T_camera_lidar is None:
+        T_camera_lidar = _found(
+            bag, transforms, camera.frame or _frame_in(bag, camera.topic), frame, "T_camera_lidar"
+        )
+        T_camera_lidar = T_camera_lidar if T_shift is None else np.asarray(T_shift @ T_camera_lidar)
+    return Calibration(T_imu_lidar, T_camera_lidar, K, size, antenna, camera.time_offset_s), skips
+
+
+def _frame_in(bag: Bag, topic: str) -> str:
+    """The frame that a topic's first message names."""
+    messages = bag.messages(topic)
+    if len(messages) == 0:
+        raise DataError(f"{topic}: has no messages, so its frame is unknown; set its `frame:` in rig.yaml")
+    return str(decode(bag, messages, 0).header.frame_id).strip("/")
+
+
+def _found(bag: Bag, transforms: StaticTransforms, target: str, source: str, name: str) -> Array:
+    T = np.eye(4) if target == source else transforms.between(target, source)
+    if T is None:
+        frames = ", ".join(transforms.frames)[:300] or "none"
+        raise DataError(
+            f"{shown(bag.path)}: no static transform leads from {source!r} to {target!r} (frames in /tf_static:"
+            f" {frames}); set {name} in rig.yaml, or `frame:` where a frame has another name"
+        )
+    return T
+
+
+def _antenna(bag: Bag, gnss: GnssTopic, imu: str, transforms: StaticTransforms) -> tuple[Array, list[Skip]]:
+    """The antenna in the imu frame (3,) m: zero, and said so, where nobody knows it."""
+    if gnss.p_imu_antenna is not None:
+        return np.array(gnss.p_imu_antenna, np.float64), []
+    frame = gnss.frame or (None if gnss.topic is None else _frame_in(bag, gnss.topic))
+    T = None if frame is None else np.eye(4) if frame == imu else transforms.between(imu, frame)
+    if T is None:
+        reason = (
+            f"no transform from {frame!r} to {imu!r}: the lever arm is taken as 0 0 0; set gnss.p_imu_antenna"
+        )
+        return np.zeros(3), [Skip("lever arm", shown(bag.path.name), reason)]
+    return np.array(T[:3, 3]), []
+
+
+def _intrinsics(bag: Bag, camera: CameraTopic) -> tuple[Array, tuple[int, int], Array | None]:
+    """K, (width, height), and what comes after the pose of the camera's frame, where its projection has a shift."""
+    if camera.K is not None and camera.image_size is not None:
+        return np.array(camera.K, np.float64), camera.image_size, None
+    info = _info(bag, camera)
+    K, P, D = (np.asarray(_any(info, name), np.float64) for name in ("k", "p", "d"))
+    K, P = K.reshape(3, 3), P.reshape(3, 4)
+    size = camera.image_size or (int(info.width), int(info.height))
+    if not K.any() and not P.any():
+        raise DataError(
+            f"{camera.info}: its CameraInfo is all zero: the camera was not calibrated; set K and image_size of the"
+            " camera in rig.yaml, or leave it out (cameras: {})"
+        )
+    is_rectified = "rect" in camera.topic.lower() if camera.rectified is None else camera.rectified
+    if np.any(D) and not is_rectified:
+        raise DataError(
+            f"{camera.topic}: its lens has distortion {D.tolist()[:5]}, and its images are not rectified; take the"
+            " rectified topic (image_proc writes image_rect_color), or set `rectified: true` if they are"
+        )
+    if camera.K is not None:
+        return np.array(camera.K, np.float64), size, None
+    if not P.any():
+        return K, size, None
+    shift = None
+    if P[:, 3].any():
+        shift = np.eye(4)
+        shift[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+    return P[:, :3].copy(), size, shift
+
+
+def _info(bag: Bag, camera: CameraTopic) -> Any:
+    if camera.info is None:
+        raise DataError(
+            f"{camera.topic}: no CameraInfo topic beside it; set `info:`, or K and image_size of the camera in rig.yaml"
+        )
+    messages = bag.messages(camera.info)
+    if len(messages) == 0:
+        raise DataError(f"{camera.info}: has no messages; set K and image_size of the camera in rig.yaml")
+    return decode(bag, messages, 0)
+
+
+def _any(info: Any, name: str) -> Any:
+    """A field of CameraInfo: capital letters in ROS 1, small ones in ROS 2."""
+    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())

@@ -1,0 +1,172 @@
+"""What is in a bag, and what each topic would be taken for: the rig.yaml that `inspect` suggests."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gnss_sem_map.datasets.ros import clouds, pictures, roles
+from gnss_sem_map.datasets.ros.bag import Bag, Messages
+from gnss_sem_map.datasets.ros.decoding import decode, header_ns
+from gnss_sem_map.datasets.ros.static_tf import TOPIC as TF_STATIC
+from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
+from gnss_sem_map.errors import DataError
+
+GAP_STEPS = 3.0
+"""A step of more than so many usual ones is a gap."""
+LOOKED_AT = 50
+"""Messages of a topic whose headers are compared with their arrival."""
+LATE_S = 1.0
+TAKEN_FOR = {kind: sensor for sensor, kinds in roles.KINDS.items() for kind in kinds}
+TAKEN_FOR |= {roles.INFO: "calibration", "tf2_msgs/msg/TFMessage": "transforms"}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    kind: str
+    messages: int
+    rate_hz: float | None
+    """By the usual step between arrivals; None for less than two messages."""
+    gaps: int
+    longest_gap_s: float
+    taken_for: str
+    """A sensor; empty: it is not used."""
+    frame: str
+    notes: tuple[str, ...]
+    """What will stop a run, or needs a line in rig.yaml."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The same for JSON."""
+        return asdict(self)
+
+
+def contents_of(bag: Bag) -> tuple[Topic, ...]:
+    """All topics, sorted by what they are taken for, then by name; raises DataError for a damaged bag."""
+    transforms, found = read_static_transforms(bag), []
+    for name, kind in bag.kinds.items():
+        taken = TAKEN_FOR.get(kind, "")
+        messages = bag.messages(name)
+        steps = np.diff(messages.received_ns) * 1e-9
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        gaps = steps[steps > GAP_STEPS * usual] if len(steps) > 2 else steps[:0]
+        is_sensor = taken in roles.KINDS and len(messages) > 0
+        frame, notes = _looked_into(bag, messages, taken, transforms) if is_sensor else ("", [])
+        found.append(
+            Topic(
+                name, kind, len(messages), 1.0 / usual if usual > 0 else None,
+                len(gaps), float(gaps.max(initial=0.0)), taken, frame, tuple(notes),
+            )
+        )  # fmt: skip
+    order = [*roles.KINDS, "calibration", "transforms", ""]
+    return tuple(sorted(found, key=lambda topic: (order.index(topic.taken_for), topic.name)))
+
+
+def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
+    """A rig.yaml with every topic that may be a sensor: where there are several of one kind, the others are to go."""
+    transforms = read_static_transforms(bag)
+    of = {
+        sensor: [topic for topic in topics if topic.taken_for == sensor and topic.messages]
+        for sensor in roles.KINDS
+    }
+    parts = [
+        "# Which topic of the bag is which sensor. Keep one LiDAR and one camera; the frames are those of /tf_static.",
+        "# What is not here is as its default: see docs/your_own_log.md.",
+    ]
+    for key, sensor in (("imu", "IMU"), ("gnss", "receiver")):
+        for k, topic in enumerate(of[sensor]):
+            lines = _yaml({key: {"topic": topic.name} | _stamps(topic)})
+            if sensor == "receiver" and not _has_lever_arm(topic, of["IMU"], transforms):
+                lines += "  p_imu_antenna: [0.0, 0.0, 0.0]  # antenna ahead, left, above of the IMU, m: measure it\n"
+            parts += _noted(topic, lines if k == 0 else _commented(lines))
+        if not of[sensor]:
+            parts.append(
+                f"# {key}: {{topic: ...}}  # found none"
+                + ("" if key == "imu" else "; or a file: see the guide")
+            )
+    for key, sensor in (("lidars", "LiDAR"), ("cameras", "camera")):
+        parts.append(f"{key}:" if of[sensor] else f"{key}: {{}}")
+        for topic in of[sensor]:
+            about: dict[str, Any] = {"topic": topic.name} | _stamps(topic)
+            if sensor == "camera":
+                about["info"] = roles.info_beside(bag, topic.name)
+            parts += _noted(topic, _yaml({_name(topic): about}), indent="  ")
+    return "\n".join(parts) + "\n"
+
+
+def _looked_into(
+    bag: Bag, messages: Messages, taken: str, transforms: StaticTransforms
+) -> tuple[str, list[str]]:
+    """Frame of a topic's first message, and what is odd about the topic."""
+    try:
+        first = decode(bag, messages, 0)
+        frame, notes = str(first.header.frame_id).strip("/"), _stamp_notes(bag, messages)
+    except DataError as error:
+        return "", [str(error)]
+    if taken == "LiDAR" and clouds.time_field(clouds.fields_of(first), None) is None:
+        notes.append(f"no time per point among {', '.join(clouds.fields_of(first))}: set point_times")
+    if taken == "receiver" and first.position_covariance_type == roles.UNKNOWN_COVARIANCE:
+        notes.append("its covariance is unknown: set stddevs_m")
+    if taken == "camera" and messages.kind == pictures.RAW and first.encoding not in pictures.CHANNELS:
+        notes.append(f"encoding {first.encoding} is not read: rgb8, bgr8 or mono8")
+    if taken in ("LiDAR", "camera") and frame not in transforms.frames:
+        notes.append(f"its frame {frame!r} is not in {TF_STATIC}: set frame or the pose")
+    return frame, notes
+
+
+def _stamp_notes(bag: Bag, messages: Messages) -> list[str]:
+    some = np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist()
+    late = np.array([messages.received_ns[k] - header_ns(bag, messages, k) for k in some]) * 1e-9
+    zero = sum(header_ns(bag, messages, k) == 0 for k in some)
+    if zero:
+        return [f"{zero} of {len(some)} header stamps are zero: set stamps: received"]
+    if np.ptp(late) > LATE_S:
+        return [f"header stamps jump by {np.ptp(late):.1f} s against the arrivals"]
+    if abs(float(np.median(late))) > LATE_S:
+        return [f"header stamps are {np.median(late):.1f} s before the arrivals: is it another clock?"]
+    return []
+
+
+def _stamps(topic: Topic) -> dict[str, str]:
+    return {"stamps": "received"} if any("stamps: received" in note for note in topic.notes) else {}
+
+
+def _has_lever_arm(topic: Topic, imus: list[Topic], transforms: StaticTransforms) -> bool:
+    if not imus:
+        return False
+    return topic.frame == imus[0].frame or transforms.between(imus[0].frame, topic.frame) is not None
+
+
+def _name(topic: Topic) -> str:
+    """A name for a sensor: the words of its topic but for those that all have."""
+    usual = (
+        "points",
+        "image",
+        "raw",
+        "rect",
+        "color",
+        "compressed",
+        "image_raw",
+        "image_rect",
+        "image_rect_color",
+    )
+    words = [word for word in topic.name.strip("/").split("/") if word not in usual]
+    return "_".join(words) or topic.taken_for.lower()
+
+
+def _noted(topic: Topic, lines: str, indent: str = "") -> list[str]:
+    notes = [f"{indent}# {note}" for note in topic.notes]
+    return notes + [indent + line for line in lines.rstrip("\n").split("\n")]
+
+
+def _commented(lines: str) -> str:
+    return "\n".join(f"# {line}" for line in lines.rstrip("\n").split("\n"))
+
+
+def _yaml(content: dict[str, Any]) -> str:
+    return str(yaml.safe_dump(content, sort_keys=False, allow_unicode=True))

@@ -1,0 +1,151 @@
+"""An MCAP file of ROS 2: where its messages are, by the indexes at the end of the file and of each chunk.
+
+Record layouts: the MCAP specification, https://mcap.dev/spec. `rosbags` reads the summary; messages are read by
+their place, so that one of them costs the same in a file of any length.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.datasets.ros.chunks import Chunks
+from gnss_sem_map.datasets.ros.codecs import MOST_BYTES, expand
+from gnss_sem_map.datasets.ros.open_file import OpenFile
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import shown
+
+Ints = NDArray[np.int64]
+
+MESSAGE_INDEX, MESSAGE = 0x07, 0x05
+RECORD = struct.Struct("<BQ")
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Op code and length of the record; channel, sequence, log time and publish time of the message."""
+CHUNK_HEAD_BYTES = 9 + 40
+"""Of a chunk record before its compression's name and its data."""
+FIRST_READ = 4096
+
+
+class McapFile:
+    """Messages of the topics of one file; raises DataError when its index is missing or damaged."""
+
+    def __init__(self, path: Path, codec: str = "") -> None:
+        from rosbags.rosbag2 import Reader, ReaderError
+
+        self.path, self._codec = path, codec
+        self._file = OpenFile(path)
+        reader = Reader(path)
+        try:
+            reader.open()
+        except (ReaderError, struct.error, TypeError, ValueError, KeyError, AssertionError, OSError) as error:
+            raise DataError(
+                f"{shown(path)}: truncated, damaged or not closed ({_line(error)}); repair it: mcap recover"
+                f" {shown(path.name)} -o repaired.mcap"
+            ) from None
+        try:
+            self.topics = {one.topic: one.msgtype for one in reader.connections}
+            channels = {one.id: one.topic for one in reader.connections}
+            summary = reader.storage.chunks  # type: ignore[attr-defined]  # of McapReader
+            expected = sum(one.msgcount for one in reader.connections)
+            self._starts = np.array([chunk.chunk_start_offset for chunk in summary], np.int64)
+            self._sizes = np.array(
+                [(chunk.compressed_size, chunk.uncompressed_size) for chunk in summary], np.int64
+            ).reshape(-1, 2)
+            self._codecs = [chunk.compression for chunk in summary]
+            self._spans = np.array(
+                [
+                    (chunk.chunk_start_offset + chunk.chunk_length, chunk.message_index_length)
+                    for chunk in summary
+                ],
+                np.int64,
+            ).reshape(-1, 2)
+        finally:
+            reader.close()
+        self._chunks = Chunks(self._expanded)
+        self._index = self._read_indexes(channels)
+        indexed = sum(len(times) for times, _ in self._index.values())
+        if indexed < expected:
+            raise DataError(
+                f"{shown(path)}: not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
+                f" recover {shown(path.name)} -o repaired.mcap"
+            )
+
+    def index(self, topic: str) -> tuple[Ints, Ints]:
+        """Arrival (n,), ns, and place (n, 2) of the messages of a topic, in the order of the file."""
+        return self._index.get(topic, (np.empty(0, np.int64), np.empty((0, 2), np.int64)))
+
+    def read(self, place: tuple[int, int], most: int | None = None) -> bytes:
+        """The message at a place, or its first bytes."""
+        chunk, offset = place
+        if self._codecs[chunk] in ("", "none"):
+            data = self._plain(chunk, offset, None if self._codec else most)
+        else:
+            data = self._within(self._chunks.get(chunk), offset)
+        if self._codec:
+            return expand(data, self._codec, shown(self.path), most or MOST_BYTES)
+        return data if most is None else data[:most]
+
+    def _read_indexes(self, channels: dict[int, str]) -> dict[str, tuple[Ints, Ints]]:
+        found: dict[str, list[tuple[int, NDArray[np.uint64]]]] = {}
+        for number, (start, length) in enumerate(self._spans.tolist()):
+            records = self._file.read(start, length)
+            at = 0
+            while at + RECORD.size <= len(records):
+                op, size = RECORD.unpack_from(records, at)
+                at += RECORD.size
+                if op == MESSAGE_INDEX and 6 <= size <= len(records) - at and (size - 6) % 16 == 0:
+                    channel = int.from_bytes(records[at : at + 2], "little")
+                    pairs = np.frombuffer(records, "<u8", (size - 6) // 8, at + 6).reshape(-1, 2)
+                    if channel in channels:
+                        found.setdefault(channels[channel], []).append((number, pairs))
+                at += size
+        return {topic: _joined(parts) for topic, parts in found.items()}
+
+    def _plain(self, chunk: int, offset: int, most: int | None) -> bytes:
+        """A message of a chunk that is not compressed: nothing else of it is read."""
+        start = int(self._starts[chunk]) + CHUNK_HEAD_BYTES + len(self._codecs[chunk]) + offset
+        first = self._file.read_up_to(start, FIRST_READ)
+        size = self._size_of(first, int(self._sizes[chunk, 0]) - offset)
+        wanted = size if most is None else min(most, size)
+        if wanted <= len(first) - MESSAGE_HEAD.size:
+            return first[MESSAGE_HEAD.size : MESSAGE_HEAD.size + wanted]
+        return self._file.read(start + MESSAGE_HEAD.size, wanted)
+
+    def _within(self, content: bytes, offset: int) -> bytes:
+        size = self._size_of(content[offset : offset + MESSAGE_HEAD.size], len(content) - offset)
+        return content[offset + MESSAGE_HEAD.size : offset + MESSAGE_HEAD.size + size]
+
+    def _size_of(self, head: bytes, left: int) -> int:
+        """Bytes of the message whose record begins so; `left` are those from there to the end of its chunk."""
+        op, size = RECORD.unpack_from(head) if len(head) >= MESSAGE_HEAD.size else (0, 0)
+        size -= MESSAGE_HEAD.size - RECORD.size
+        if op != MESSAGE or not 0 <= size <= left - MESSAGE_HEAD.size:
+            raise DataError(
+                f"{shown(self.path)}: damaged; found no message where the index says; mcap recover"
+            )
+        return int(size)
+
+    def _expanded(self, chunk: int) -> bytes:
+        compressed, plain = self._sizes[chunk].tolist()
+        start = int(self._starts[chunk]) + CHUNK_HEAD_BYTES + len(self._codecs[chunk])
+        where = f"{shown(self.path)}: chunk {chunk}"
+        content = expand(self._file.read(start, compressed), self._codecs[chunk], where)
+        if len(content) != plain:
+            raise DataError(f"{where}: damaged; found {len(content)} bytes, expected {plain}")
+        return content
+
+
+def _joined(parts: list[tuple[int, NDArray[np.uint64]]]) -> tuple[Ints, Ints]:
+    times = np.concatenate([pairs[:, 0] for _, pairs in parts]).astype(np.int64)
+    places = [
+        np.column_stack([np.full(len(pairs), number), pairs[:, 1].astype(np.int64)])
+        for number, pairs in parts
+    ]
+    return times, np.concatenate(places)
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__

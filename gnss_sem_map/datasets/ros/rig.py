@@ -1,0 +1,135 @@
+"""rig.yaml: which topic of a bag is which sensor, and what the bag does not say of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from factor_graphs.measurements import ImuNoise
+from gnss_sem_map.datasets.gnss_files import GnssFile
+from gnss_sem_map.datasets.ros.stamps import Clock
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.sensor_log import is_rigid
+from gnss_sem_map.sensor_log.conventions import SensorConventions
+
+NAME = "rig.yaml"
+
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Pose = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class _Topic(_Section):
+    topic: str = Field(description="Name of the topic.")
+    frame: str | None = Field(None, description="Frame of the sensor; default: the frame_id in its messages.")
+    stamps: Clock = Field("header", description="When a message was measured: its header, or its arrival.")
+
+
+class ImuTopic(_Topic):
+    """The IMU; its frame is the body frame."""
+
+    noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
+    attitude: bool = Field(
+        False,
+        description="The orientation in the first message, with its covariance, is the attitude in east, north, up.",
+    )
+
+
+class GnssTopic(_Section):
+    """The receiver: a topic of NavSatFix, or a file."""
+
+    topic: str | None = Field(None, description="Name of the topic.")
+    file: GnssFile | None = Field(None, description="A file in place of a topic.")
+    frame: str | None = Field(
+        None, description="Frame of the antenna; default: the frame_id in its messages."
+    )
+    stamps: Clock = Field("header", description="When a fix was measured: its header, or its arrival.")
+    stddevs_m: tuple[float, float, float] | None = Field(
+        None,
+        description="East, north, up, m, of fixes whose covariance is unknown; default: these are left out.",
+    )
+    p_imu_antenna: tuple[float, float, float] | None = Field(
+        None, description="Antenna in the imu frame, m; default: by the static transforms."
+    )
+
+
+class LidarTopic(_Topic):
+    """A LiDAR."""
+
+    T_imu_lidar: Pose | None = Field(None, description="LiDAR to IMU; default: by the static transforms.")
+    point_times: str | None = Field(
+        None,
+        description="Field of the points' times, or `compensated`; default: time, t, offset_time or timestamp.",
+    )
+
+    _rigid = field_validator("T_imu_lidar")(lambda value: _checked(value))
+
+
+class CameraTopic(_Topic):
+    """A camera; its images are rectified."""
+
+    info: str | None = Field(None, description="Topic of its CameraInfo.")
+    K: Annotated[list[Row3], Field(min_length=3, max_length=3)] | None = Field(
+        None, description="Intrinsics of the rectified camera, px; default: by the CameraInfo."
+    )
+    image_size: tuple[int, int] | None = Field(None, description="Width and height, px; default: CameraInfo.")
+    rectified: bool | None = Field(
+        None, description="Whether the images are rectified; default: if their topic's name has `rect` in it."
+    )
+    T_camera_lidar: Pose | None = Field(
+        None, description="LiDAR to camera; default: by the static transforms."
+    )
+    time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
+
+    _rigid = field_validator("T_camera_lidar")(lambda value: _checked(value))
+
+
+class Rig(SensorConventions):
+    """Content of rig.yaml; axes, units and clocks are those of `SensorConventions`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    imu: ImuTopic | None = Field(None, description="The IMU.")
+    gnss: GnssTopic | None = Field(None, description="The receiver.")
+    lidars: dict[str, LidarTopic] = Field({}, description="LiDARs by name.")
+    cameras: dict[str, CameraTopic] = Field({}, description="Cameras by name.")
+
+
+def rig_file(bag: Path) -> Path | None:
+    """The rig.yaml of a bag: in its folder, else beside it, or beside the target of a link; None if there is none."""
+    places = [bag / NAME] if bag.is_dir() else []
+    places += [bag.absolute().parent / NAME, bag.resolve().parent / NAME]
+    return next((place for place in places if is_file(place)), None)
+
+
+def read_rig(path: Path) -> Rig:
+    """Read a rig.yaml; raises DataError for unknown keys and values out of range."""
+    try:
+        return Rig.model_validate(read_yaml(path) or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise DataError(
+            f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; see docs/your_own_log.md"
+        ) from None
+
+
+def matrix(pose: Pose | None) -> NDArray[np.float64] | None:
+    """A pose of rig.yaml (4, 4)."""
+    return None if pose is None else np.array(pose, np.float64)
+
+
+def _checked(pose: Pose | None) -> Pose | None:
+    if pose is not None and not is_rigid(np.array(pose, np.float64)):
+        raise ValueError("found no rigid transform, expected 4 x 4, rotation orthonormal to 1e-3")
+    return pose

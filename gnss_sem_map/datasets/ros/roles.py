@@ -1,0 +1,120 @@
+"""Which topic is which sensor: by the types of the topics, where rig.yaml does not say it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from gnss_sem_map.datasets.ros import clouds, pictures
+from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import shown
+
+IMU, GNSS, INFO = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo"
+UNKNOWN_COVARIANCE = 0
+"""NavSatFix.position_covariance_type."""
+KINDS = {
+    "IMU": (IMU,),
+    "receiver": (GNSS,),
+    "LiDAR": (clouds.KIND,),
+    "camera": (pictures.RAW, pictures.COMPRESSED),
+}
+
+
+def completed(bag: Bag, rig: Rig) -> Rig:
+    """The rig with the sensors that it does not name: a topic is taken where there is one of its type.
+
+    A rig that names LiDARs or cameras names all that are used. Raises DataError for topics that are not there or of
+    another type, and for several of one kind, which the log cannot hold.
+    """
+    update: dict[str, object] = {}
+    if rig.imu is None:
+        topic = _only(bag, "IMU", "imu: {topic: ...}")
+        update["imu"] = None if topic is None else ImuTopic(topic=topic)
+    if rig.gnss is None or (rig.gnss.topic is None and rig.gnss.file is None):
+        topic = _only(bag, "receiver", "gnss: {topic: ...}")
+        known = {} if rig.gnss is None else rig.gnss.model_dump()
+        update["gnss"] = None if topic is None else GnssTopic(**known | {"topic": topic})
+    if "lidars" not in rig.model_fields_set:
+        topic = _only(bag, "LiDAR", "lidars: {NAME: {topic: ...}}")
+        update["lidars"] = {} if topic is None else {"lidar": LidarTopic(topic=topic)}
+    if "cameras" not in rig.model_fields_set:
+        topic = _only(bag, "camera", "cameras: {NAME: {topic: ...}}")
+        update["cameras"] = (
+            {} if topic is None else {"camera": CameraTopic(topic=topic, info=info_beside(bag, topic))}
+        )
+    whole = rig.model_copy(update=update)
+    _check(bag, whole)
+    return whole
+
+
+def of_kind(bag: Bag, sensor: str) -> list[str]:
+    """The topics whose type is that of a sensor, sorted; of an image that is there twice the raw one."""
+    found = sorted(topic for topic, kind in bag.kinds.items() if kind in KINDS[sensor])
+    return [
+        topic
+        for topic in found
+        if topic.removesuffix("/compressed") not in found or not topic.endswith("/compressed")
+    ]
+
+
+def info_beside(bag: Bag, topic: str) -> str | None:
+    """The CameraInfo of an image topic: the one in the nearest namespace, or the only one; None if there is none."""
+    infos = sorted(name for name, kind in bag.kinds.items() if kind == INFO)
+    space = topic
+    while "/" in space:
+        space = space.rpartition("/")[0]
+        beside = [name for name in infos if name == f"{space}/camera_info"]
+        if beside:
+            return beside[0]
+    return infos[0] if len(infos) == 1 else None
+
+
+def nothing_taken(bag: Bag, rig: Rig) -> DataError:
+    """The error that there is no IMU or no receiver."""
+    what = "IMU (sensor_msgs/Imu)" if rig.imu is None else "receiver (sensor_msgs/NavSatFix)"
+    found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
+    return DataError(
+        f"{shown(bag.path)}: found no topic of an {what}; it has {found}; set it, or a file of positions (gnss.file),"
+        " in rig.yaml"
+    )
+
+
+def _only(bag: Bag, sensor: str, key: str) -> str | None:
+    found = of_kind(bag, sensor)
+    if len(found) > 1:
+        raise DataError(
+            f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
+            f" rig.yaml, {key}; `gnss-sem-map inspect` writes one to edit"
+        )
+    return found[0] if found else None
+
+
+def _check(bag: Bag, rig: Rig) -> None:
+    for sensors, plural in ((rig.lidars, "LiDARs"), (rig.cameras, "cameras")):
+        if len(sensors) > 1:
+            raise DataError(
+                f"rig.yaml: names {len(sensors)} {plural}: {', '.join(sensors)}; one is used as yet; leave the"
+                " others out"
+            )
+    named: list[tuple[str, str, str | None]] = [
+        *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
+        *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),
+        *((f"lidars.{name}", "LiDAR", one.topic) for name, one in rig.lidars.items()),
+        *((f"cameras.{name}", "camera", one.topic) for name, one in rig.cameras.items()),
+    ]
+    for place, sensor, topic in named:
+        if topic is not None:
+            _check_kind(bag, place, topic, KINDS[sensor])
+    for name, camera in rig.cameras.items():
+        if camera.info is not None:
+            _check_kind(bag, f"cameras.{name}.info", camera.info, (INFO,))
+
+
+def _check_kind(bag: Bag, place: str, topic: str, kinds: Iterable[str]) -> None:
+    kind = bag.messages(topic).kind
+    if kind not in kinds:
+        raise DataError(
+            f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)}; `gnss-sem-map inspect` lists the"
+            " topics"
+        )

@@ -1,0 +1,243 @@
+"""ROS 1 bags and ROS 2 bags (MCAP or sqlite3), as one file or as the folder of files that they were split into.
+
+rig.yaml, in the folder of the bag or beside it, says which topic is which sensor; `gnss-sem-map inspect` writes it.
+Without it, a topic is taken where there is but one of its type. Clouds and images are read when they are needed, by
+their place in the bag: memory does not grow with it, and nothing is copied. Frame numbers count the messages of a
+topic from 0. Stamp zero is that of the first fix.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.errors import MeasurementError
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.measurements import ImuSamples, clean_gnss, clean_imu
+from factor_graphs.valid_fixes import valid_fixes
+from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.ros import clouds, pictures, roles
+from gnss_sem_map.datasets.ros.bag import SUFFIXES, Bag, Messages, bag_files
+from gnss_sem_map.datasets.ros.calibration import calibration_of
+from gnss_sem_map.datasets.ros.decoding import decode, header_ns
+from gnss_sem_map.datasets.ros.rig import (
+    CameraTopic,
+    GnssTopic,
+    ImuTopic,
+    LidarTopic,
+    Rig,
+    read_rig,
+    rig_file,
+)
+from gnss_sem_map.datasets.ros.stamps import Clock, stamps_of
+from gnss_sem_map.datasets.stamps import in_order
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.conventions import SensorConventions
+
+Array = NDArray[np.float64]
+
+FORMAT, SIGNS = "rosbag", "a ROS bag (.bag, .mcap, .db3)"
+FILES = SUFFIXES
+"""Endings of drives that are one file."""
+NO_FIX = -1
+"""NavSatStatus.status."""
+
+
+def is_drive(drive: Path) -> bool:
+    """Whether a path looks like a bag."""
+    return bool(bag_files(drive))
+
+
+def read(drive: Path, with_imu: bool = True) -> SensorLog:
+    """Open a bag; raises DataError for a bag that is damaged, and for sensors that are missing or not unique.
+
+    Without `with_imu`, only the first and last message of the IMU are read.
+    """
+    bag, file = Bag(drive), rig_file(drive)
+    rig = roles.completed(bag, Rig() if file is None else read_rig(file))
+    if rig.imu is None or rig.gnss is None:
+        raise roles.nothing_taken(bag, rig)
+    imu = bag.messages(rig.imu.topic)
+    fixes, fix_ns, gnss_skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
+    epoch_ns = int(fix_ns[0])
+    stamps = fixes[:, 0]
+    valid, invalid = valid_fixes(stamps, fixes[:, 1:4], fixes[:, 4:7])
+    if not valid.any():
+        raise DataError(
+            f"{shown(drive)}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
+        )
+    fixes = fixes[valid]
+    frame = LocalFrame(*(float(v) for v in fixes[0, 1:4]))
+    gnss, repairs = clean_gnss(fixes[:, 0], frame.to_map(*fixes[:, 1:4].T), fixes[:, 4:7])
+    gnss_skips += [Skip("fix", shown(drive), f"{n} fixes: {why}", n) for why, n in invalid.items()]
+    if repairs.dropped:
+        gnss_skips.append(Skip("samples", shown(drive), str(repairs)))
+    samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
+    calibration, calibration_skips = calibration_of(bag, rig)
+    scans, scan_skips = _scans(bag, rig, epoch_ns)
+    images, image_skips = _images(bag, rig, epoch_ns, calibration.image_size)
+    return SensorLog(
+        name=shown(drive.name or drive.resolve().name),
+        epoch_ns=epoch_ns,
+        calibration=calibration,
+        scans=scans,
+        images=images,
+        frame=frame,
+        imu=samples,
+        gnss=gnss,
+        imu_noise=rig.imu.noise,
+        initial_attitude=attitude,
+        conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
+        skips=(*gnss_skips, *imu_skips, *calibration_skips, *scan_skips, *image_skips),
+    )
+
+
+def _fixes(
+    bag: Bag, about: GnssTopic, folder: Path, imu: Messages, clock: Clock
+) -> tuple[Array, NDArray[np.int64], list[Skip]]:
+    """Rows (n, 7) of stamp s, degrees, m and standard deviations m; their Unix times; and the skipped fixes."""
+    if about.file is not None:
+        drive_ns = _span_ns(bag, imu, clock)
+        found = read_gnss_file(about.file, folder, None, drive_ns)
+        return found.rows, found.stamps_ns, found.skips
+    assert about.topic is not None
+    messages = bag.messages(about.topic)
+    said, believed, skips = stamps_of(bag, messages, about.stamps)
+    rows, stamps, lost = [], [], {"no fix": 0, "its covariance is unknown": 0}
+    for k in np.flatnonzero(believed).tolist():
+        fix = decode(bag, messages, k)
+        stddevs: Array | tuple[float, float, float] | None = about.stddevs_m
+        if fix.position_covariance_type != roles.UNKNOWN_COVARIANCE:
+            with np.errstate(invalid="ignore"):  # a variance below zero: no valid fix
+                stddevs = np.sqrt(np.asarray(fix.position_covariance, np.float64)[[0, 4, 8]])
+        if fix.status.status == NO_FIX:
+            lost["no fix"] += 1
+        elif stddevs is None:
+            lost["its covariance is unknown"] += 1
+        else:
+            rows.append([fix.latitude, fix.longitude, fix.altitude, *stddevs])
+            stamps.append(int(said[k]))
+    told = {why: count for why, count in lost.items() if count}
+    if not rows:
+        raise DataError(
+            f"{messages.topic}: not one of {len(messages)} messages is a fix"
+            f" ({', '.join(f'{count}: {why}' for why, count in told.items()) or 'no messages'});"
+            " where only covariances are unknown, set gnss.stddevs_m in rig.yaml"
+        )
+    skips += [Skip("fix", messages.topic, f"{count} messages: {why}", count) for why, count in told.items()]
+    ns = np.array(stamps, np.int64)
+    return np.column_stack([(ns - ns[0]) * 1e-9, np.array(rows)]), ns, skips
+
+
+def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:
+    """First and last moment of a topic, Unix ns."""
+    if len(messages) == 0:
+        return None
+    if clock == "received":
+        return int(messages.received_ns[0]), int(messages.received_ns[-1])
+    return header_ns(bag, messages, 0), header_ns(bag, messages, len(messages) - 1)
+
+
+def _imu(
+    bag: Bag, about: ImuTopic, messages: Messages, epoch_ns: int, with_all: bool
+) -> tuple[ImuSamples, AttitudePrior | None, list[Skip]]:
+    said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
+    rows, attitude = [], None
+    for k in np.flatnonzero(believed).tolist():
+        one = decode(bag, messages, k)
+        force, rate = one.linear_acceleration, one.angular_velocity
+        rows.append([force.x, force.y, force.z, rate.x, rate.y, rate.z])
+        if about.attitude and len(rows) == 1:
+            attitude = _attitude(one, messages.topic)
+    table = np.array(rows, np.float64).reshape(-1, 6)
+    try:
+        samples, repairs = clean_imu((said[believed] - epoch_ns) * 1e-9, table[:, :3], table[:, 3:])
+    except MeasurementError as error:
+        raise DataError(f"{messages.topic}: {error}") from None
+    if repairs.dropped:
+        skips.append(Skip("samples", messages.topic, str(repairs)))
+    return samples, attitude, skips
+
+
+def _ends(messages: Messages) -> tuple[NDArray[np.int64], NDArray[np.bool_], list[Skip]]:
+    """The first and the last message of a topic, for those who have a trajectory already."""
+    is_end = np.zeros(len(messages), np.bool_)
+    is_end[:1] = is_end[-1:] = True
+    return messages.received_ns, is_end, []
+
+
+def _attitude(message: object, topic: str) -> AttitudePrior:
+    """The orientation of the first message: body to east, north, up (REP 145), with its covariance."""
+    q, variances = message.orientation, np.asarray(message.orientation_covariance)[[0, 4, 8]]  # type: ignore[attr-defined]
+    quaternion = np.array([q.x, q.y, q.z, q.w])
+    if not (variances > 0).all() or not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise DataError(
+            f"{topic}: found orientation {quaternion.tolist()} with variances {variances.tolist()}, expected a unit"
+            " quaternion and variances above 0; set imu.attitude: false in rig.yaml"
+        )
+    return AttitudePrior(np.asarray(Rotation.from_quat(quaternion).as_matrix()), np.sqrt(variances))
+
+
+def _scans(bag: Bag, rig: Rig, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
+    if not rig.lidars:
+        return (), []
+    [about] = rig.lidars.values()
+    messages = bag.messages(about.topic)
+    said, believed, skips = stamps_of(bag, messages, about.stamps)
+    _check_times(bag, messages, about)
+    scans = []
+    for k in np.flatnonzero(believed).tolist():
+        ns, stamp = int(said[k]), (int(said[k]) - epoch_ns) * 1e-9
+        read_it = partial(
+            _read_scan, bag.file_of(messages, k), bag, messages, k, stamp, ns, about.point_times
+        )
+        scans.append(Scan(f"{k:010d}", k, stamp, read_it))
+    return in_order("scan", scans, skips), skips
+
+
+def _check_times(bag: Bag, messages: Messages, about: LidarTopic) -> None:
+    """Raise DataError when the clouds have no times of points, before hours are spent."""
+    if len(messages) == 0 or about.point_times == clouds.COMPENSATED:
+        return
+    names = clouds.fields_of(decode(bag, messages, 0))
+    if clouds.time_field(names, about.point_times) is None:
+        raise clouds.no_times(messages.topic, names)
+
+
+def _read_scan(
+    _file: Path, bag: Bag, messages: Messages, k: int, stamp: float, stamp_ns: int, times: str | None
+) -> Points:
+    return clouds.read_cloud(bag, messages, k, stamp, stamp_ns, times)
+
+
+def _images(
+    bag: Bag, rig: Rig, epoch_ns: int, size: tuple[int, int] | None
+) -> tuple[tuple[Image, ...], list[Skip]]:
+    if not rig.cameras:
+        return (), []
+    about: CameraTopic
+    [about] = rig.cameras.values()
+    messages = bag.messages(about.topic)
+    said, believed, skips = stamps_of(bag, messages, about.stamps)
+    images = [
+        Image(
+            k,
+            (int(said[k]) - epoch_ns) * 1e-9,
+            partial(_read_image, bag.file_of(messages, k), bag, messages, k, size),
+        )
+        for k in np.flatnonzero(believed).tolist()
+    ]
+    return in_order("image", images, skips), skips
+
+
+def _read_image(
+    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None
+) -> NDArray[np.uint8]:
+    return pictures.read_image(bag, messages, k, size)

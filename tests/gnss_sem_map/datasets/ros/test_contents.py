@@ -1,0 +1,92 @@
+"""What `inspect` says of a bag, and the rig.yaml that it suggests, which `run` takes where nothing is to choose."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ros
+from ros import START_NS, sweep
+from typer.testing import CliRunner
+
+from gnss_sem_map.cli.app import app
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.contents import Topic, contents_of, suggested_rig
+from gnss_sem_map.errors import DataError
+
+
+def topics_of(bag: Path) -> dict[str, Topic]:
+    return {topic.name: topic for topic in contents_of(Bag(bag))}
+
+
+def test_topics_have_rates_gaps_and_a_sensor(tmp_path: Path) -> None:
+    rig = ros.drive()
+    for k in range(100):
+        rig.imu(START_NS + 4_500_000_000 + k * 10_000_000)
+    found = topics_of(ros.write(tmp_path / "drive", rig))
+    imu = found["/imu"]
+    assert (imu.taken_for, imu.messages, imu.gaps, imu.frame, imu.notes) == ("IMU", 301, 1, "imu", ())
+    assert imu.rate_hz == pytest.approx(100.0)
+    assert imu.longest_gap_s == pytest.approx(2.5)
+    assert {name: topic.taken_for for name, topic in found.items()} == {
+        "/imu": "IMU", "/fix": "receiver", "/points": "LiDAR", "/tf_static": "transforms",
+    }  # fmt: skip
+
+
+def test_what_would_stop_a_run_is_noted(tmp_path: Path) -> None:
+    rig = ros.drive(frames=False)
+    rig.messages = [one for one in rig.messages if one[0] == "/imu"]
+    rig.cloud(START_NS, sweep(np.zeros(4), name="ring"))
+    rig.fix(START_NS, kind=0)
+    rig.image(START_NS, np.zeros((4, 6), np.uint8), "bayer_rggb8")
+    for k in range(5):
+        rig.imu(START_NS + k, 0, topic="/imu_without_clock")
+    found = topics_of(ros.write(tmp_path / "drive", rig))
+    assert "no time per point among x, y, z, intensity, ring" in found["/points"].notes[0]
+    assert "its frame 'lidar' is not in /tf_static" in found["/points"].notes[1]
+    assert found["/fix"].notes == ("its covariance is unknown: set stddevs_m",)
+    assert "encoding bayer_rggb8 is not read" in found["/image_rect"].notes[0]
+    assert found["/imu_without_clock"].notes == ("5 of 5 header stamps are zero: set stamps: received",)
+
+
+def test_the_suggested_rig_reads_the_bag(tmp_path: Path) -> None:
+    path = ros.write(tmp_path / "drive", ros.drive())
+    before, bag = open_drive(path), Bag(path)
+    (tmp_path / "rig.yaml").write_text(suggested_rig(bag, contents_of(bag)))
+    after = open_drive(path)
+    assert (len(after.scans), after.epoch_ns) == (len(before.scans), before.epoch_ns)
+    np.testing.assert_array_equal(after.calibration.p_imu_antenna, before.calibration.p_imu_antenna)
+
+
+def test_the_suggested_rig_has_all_that_may_be_a_sensor(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.cloud(START_NS, sweep(np.zeros(4)), topic="/rear/points")
+    path = ros.write(tmp_path / "drive", rig)
+    bag = Bag(path)
+    text = suggested_rig(bag, contents_of(bag))
+    (path / "rig.yaml").write_text(text)
+    with pytest.raises(DataError, match="names 2 LiDARs: lidar, rear"):
+        open_drive(path)
+    (path / "rig.yaml").write_text(text.replace("  rear:\n    topic: /rear/points\n", ""))
+    assert len(open_drive(path).scans) == 10
+
+
+def test_the_command_writes_a_rig_once(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "drive", ros.drive())
+    first = CliRunner().invoke(app, ["inspect", str(bag)])
+    assert first.exit_code == 0
+    assert "LiDAR                10" in first.output
+    file = tmp_path / "rig.yaml"
+    file.write_text("mine: true\n")
+    again = json.loads(CliRunner().invoke(app, ["inspect", str(bag), "--json"]).output)
+    assert (again["rig"], again["written"]) == (str(file), False)
+    assert file.read_text() == "mine: true\n"
+    assert {topic["name"] for topic in again["topics"]} == {"/imu", "/fix", "/points", "/tf_static"}
+
+
+def test_a_folder_without_a_bag_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"found no \.bag, \.mcap, \.db3 file, expected a bag"):
+        Bag(tmp_path)

@@ -43,7 +43,7 @@ class CondensedDrive:
     """The anchors of a drive, and what its graph says of corrections to them.
 
     `stamps` (a,) s; `T_map_imu` (a, 4, 4); `rows`: the equations of the corrections; `position_variances` (3,) m² east,
-    north, up: how much the fixes may all be wrong together beside that, for an inertial unit whose positions drift.
+    north, up: how much all of them may be wrong together beside that, for an inertial unit whose positions drift.
     """
 
     stamps: Array

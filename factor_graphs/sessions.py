@@ -1,9 +1,12 @@
 """One graph over condensed drives: places that were passed twice are bound, and what does not fit is left out.
 
 The corrections x minimise |A x - b|² over the rows of all drives, plus the whitened residuals of the pairs, with
-truncated loss (Gauss-Newton; the pairs alone are not linear). A wrong pair has to pass three tests: it is as near to
-what the drives themselves say as their covariance allows; it agrees with the other pairs; and another one beside it
-says the same.
+truncated loss (Gauss-Newton; the pairs alone are not linear). Fixes of an inertial unit drift, so those of a drive are
+all wrong together: its anchors are at T Exp(x), moved by a shift c, which is unknown but for its standard deviation. So
+drives that are bound weigh by what each knows of the place, and not by how many fixes it has.
+
+A wrong pair has to pass three tests: it is as near to what the drives themselves say as their covariance allows; it
+agrees with the other pairs; and another one beside it says the same.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,6 +38,8 @@ NEIGHBOURS = 12
 ROUNDS, STILL = 30, 1e-4
 # Covariances are computed at every so many anchors: they change slowly, and to compute all would take most of the time.
 EVERY_NTH = 4
+# Stands for the standard deviation of what does not shift, m.
+NONE_M = 1e-6
 # Columns that are solved for at once.
 TOGETHER = 240
 
@@ -87,17 +92,15 @@ def bind(drives: Sequence[CondensedDrive], pairs: AnchorPairs) -> Bound:
             break
         used = supported
     corrections = [
-        Correction(drive.stamps, drive.T_map_imu, T, of_poses + _lacking(drives, n, pairs[used], of_poses, T))
-        for n, (drive, T, of_poses) in enumerate(
-            zip(drives, found.poses, system.pose_covariances(found), strict=True)
-        )
+        Correction(drive.stamps, drive.T_map_imu, T, covariances)
+        for drive, T, covariances in zip(drives, found.poses, system.pose_covariances(found), strict=True)
     ]
     return Bound(corrections, used, expected, squares)
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Corrections x, the poses with them, and the factors of the normal equations that they solve."""
+    """Corrections x, shifts being the last, the poses with them, and the factors of the normal equations they solve."""
 
     x: Array
     poses: list[Array]
@@ -106,7 +109,7 @@ class _State:
 
 
 class _System:
-    """The equations of all drives, stacked; columns that no equation speaks of are left out."""
+    """The equations of all drives, stacked; columns that no equation speaks of are left out, but for the shifts."""
 
     def __init__(self, drives: Sequence[CondensedDrive]) -> None:
         self.drives = drives
@@ -117,13 +120,17 @@ class _System:
         self._column = np.full(A.shape[1], -1)
         self._column[there] = np.arange(len(there))
         spoken_of = by_column[:, there]
-        self._H, self._g = (spoken_of.T @ spoken_of).tocsc(), spoken_of.T @ b
-        self.start = np.zeros(len(there))
+        # without a variance there is no shift: the prior keeps it at zero
+        variances = np.concatenate([drive.position_variances for drive in drives])
+        shifts = sparse.diags(1.0 / np.maximum(variances, NONE_M**2))
+        self._H = sparse.block_diag([spoken_of.T @ spoken_of, shifts], format="csc")
+        self._g = np.append(spoken_of.T @ b, np.zeros(len(variances)))
+        self.start = np.zeros(len(self._g))
 
     def columns_of(self, drive: int, anchor: int) -> NDArray[np.intp]:
-        """Where the pose of an anchor stands among the corrections."""
-        first = self._first[drive] + SIZE * anchor
-        return self._column[first : first + 6]
+        """Where the pose of an anchor stands among the corrections, (6,), and the shift of its drive, (3,)."""
+        first, shift = self._first[drive] + SIZE * anchor, len(self._g) + 3 * (drive - len(self.drives))
+        return np.append(self._column[first : first + 6], shift + np.arange(3))
 
     def solve(self, pairs: AnchorPairs, weights: Array, x: Array) -> _State:
         """One step of Gauss-Newton from the corrections x."""
@@ -157,10 +164,13 @@ class _System:
             off = gtsam.Pose3.Logmap(gtsam.Pose3(pairs.T[n]).inverse() * first.inverse() * second)
             r[n] = whiten @ off
             own = -whiten @ second.between(first).AdjointMap()
-            for J, place in ((own, self.columns_of(a, i)), (whiten, self.columns_of(b, j))):
-                rows.append(np.repeat(6 * n + np.arange(6), 6))
+            for J, T, place in (
+                (own, first, self.columns_of(a, i)),
+                (whiten, second, self.columns_of(b, j)),
+            ):
+                rows.append(np.repeat(6 * n + np.arange(6), 9))
                 columns.append(np.tile(place, 6))
-                values.append(J.ravel())
+                values.append((J @ _tangent(T.rotation().matrix())).ravel())
         data, row, column = (np.concatenate([*part, np.empty(0)]) for part in (values, rows, columns))
         return sparse.csr_array(
             (data, (row.astype(int), column.astype(int))), (6 * len(pairs), len(self.start))
@@ -181,19 +191,28 @@ class _System:
         """Covariances (a, 6, 6) of the poses of each drive's anchors."""
         for drive, condensed in enumerate(self.drives):
             chosen = np.unique(np.append(np.arange(0, len(condensed), EVERY_NTH), len(condensed) - 1))
-            columns = np.concatenate([self.columns_of(drive, anchor) for anchor in chosen.tolist()])
-            picked = (np.ones(len(columns)), (np.arange(len(columns)), columns))
-            found = self.variances(state, sparse.csr_array(picked, (len(columns), len(self.start))))
-            yield _between(chosen, found, state.poses[drive])
+            columns = np.concatenate([np.tile(self.columns_of(drive, n), 6) for n in chosen.tolist()])
+            values = np.concatenate([_tangent(state.poses[drive][n][:3, :3]).ravel() for n in chosen])
+            rows = np.repeat(np.arange(6 * len(chosen)), 9)
+            J = sparse.csr_array((values, (rows, columns)), (6 * len(chosen), len(self.start)))
+            yield _between(chosen, self.variances(state, J), state.poses[drive])
 
     def _poses(self, x: Array) -> list[Array]:
-        return [
-            np.array([
-                T @ gtsam.Pose3.Expmap(x[self.columns_of(drive, anchor)]).matrix()
-                for anchor, T in enumerate(condensed.T_map_imu)
-            ])
-            for drive, condensed in enumerate(self.drives)
-        ]  # fmt: skip
+        found = []
+        for drive, condensed in enumerate(self.drives):
+            of_anchors = [x[self.columns_of(drive, anchor)] for anchor in range(len(condensed))]
+            moved = np.array([gtsam.Pose3.Expmap(of_anchor[:6]).matrix() for of_anchor in of_anchors])
+            poses = condensed.T_map_imu @ moved
+            poses[:, :3, 3] += of_anchors[0][6:]
+            found.append(poses)
+        return found
+
+
+def _tangent(R: Array) -> Array:
+    """The tangent of a pose of this rotation (3, 3) from its correction and the shift of its drive, (6, 9)."""
+    found = np.zeros((6, 9))
+    found[:, :6], found[3:, 6:] = np.eye(6), R.T
+    return found
 
 
 def _between(chosen: NDArray[np.intp], covariances: Array, poses: Array) -> Array:
@@ -230,11 +249,11 @@ def _expected(system: _System, pairs: AnchorPairs, alone: _State) -> Array:
     S = BELIEVED**2 * system.variances(alone, J) + np.eye(6)
     for n, (of_drives, of_anchors) in enumerate(zip(pairs.drives, pairs.anchors, strict=True)):
         (a, b), j = of_drives.tolist(), int(of_anchors[1])
-        if a != b:  # the fixes of each may all be wrong together
+        if a != b:  # how wrong an inertial unit may be is believed as it is
             whiten = np.linalg.inv(np.linalg.cholesky(pairs.covariances[n]))[:, 3:]
             R = alone.poses[b][j][:3, :3]
             both = system.drives[a].position_variances + system.drives[b].position_variances
-            S[n] += whiten @ (R.T * both) @ R @ whiten.T
+            S[n] -= (BELIEVED**2 - 1.0) * whiten @ (R.T * both) @ R @ whiten.T
     found: Array = np.einsum("pi,pi->p", r, np.linalg.solve(S, r[..., None])[..., 0])
     return found
 
@@ -270,23 +289,6 @@ def _supported(pairs: AnchorPairs, fits: Mask) -> Mask:
         beside[n] = False
         supported[n] = beside.any()
     return supported
-
-
-def _lacking(drives: Sequence[CondensedDrive], n: int, used: AnchorPairs, of_poses: Array, T: Array) -> Array:
-    """What the covariances (a, 6, 6) of a drive lack, because its fixes drift together: see `smoothing`.
-
-    Drives that are bound share what theirs say of the place, so their information adds up.
-    """
-    (together,) = (group for group in components(len(drives), used.drives) if n in group)
-    variances = np.array([drives[m].position_variances for m in together])
-    wrong = np.where(
-        (variances > 0.0).all(axis=0), 1.0 / np.sum(1.0 / np.maximum(variances, 1e-12), axis=0), 0.0
-    )
-    R = T[:, :3, :3]
-    in_map = np.einsum("kij,kjl,kil->ki", R, of_poses[:, 3:, 3:], R)
-    more = np.zeros_like(of_poses)
-    more[:, 3:, 3:] = np.swapaxes(R, 1, 2) * np.maximum(wrong - in_map.min(axis=0), 0.0) @ R
-    return more
 
 
 def components(count: int, edges: NDArray[np.intp]) -> list[list[int]]:

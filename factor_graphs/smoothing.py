@@ -129,7 +129,8 @@ def smooth(
     found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
     if not condensed:
         return found
-    return replace(found, condensed=condense(problem, fit, _drift(fixes[problem.used])))
+    lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])
+    return replace(found, condensed=condense(problem, fit, lacking))
 
 
 def _solution(
@@ -147,9 +148,8 @@ def _solution(
         vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:4])
     if wheels is not None and wheels.held:
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
-    of_poses = covariances[:, :6, :6]
-    if are_drifting(fixes[problem.used]):
-        of_poses = _no_better_than(fixes[problem.used], of_poses, T[:, :3, :3])
+    R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
+    of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
     noise = problem.noise.scaled(fit.inflation)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
@@ -179,22 +179,18 @@ def _solution(
     )
 
 
-def _no_better_than(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
-    """Pose covariances (k, 6, 6) of a track that is nowhere better placed than by one fix.
+def _lacking(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
+    """Variance (3,) m² by which all poses, of covariances (k, 6, 6), may be wrong together beside them.
 
-    Fixes that drift together are wrong together: the more of them, the better the shape, not the place. What the best
-    placed keyframe lacks in variance of a fix is added to all of them, so their differences stay as sure as they are.
+    Fixes that drift together are wrong together: the more of them, the better the shape, not the place. So the track is
+    nowhere better placed than by one fix. What its best placed keyframe lacks in variance of a fix, all of them lack:
+    so their differences stay as sure as they are.
     """
+    if not are_drifting(fixes):
+        return np.zeros(3)
     in_map = np.einsum("kij,kjl,kil->ki", R_map_imu, covariances[:, 3:, 3:], R_map_imu)
-    lacking = np.maximum(_drift(fixes) - in_map.min(axis=0), 0.0)
-    placed = covariances.copy()
-    placed[:, 3:, 3:] += np.swapaxes(R_map_imu, 1, 2) * lacking @ R_map_imu
-    return placed
-
-
-def _drift(fixes: GnssFixes) -> Array:
-    """Variance (3,) m² by which all fixes of a drive may be wrong together."""
-    return np.median(fixes.stddevs, axis=0) ** 2 if are_drifting(fixes) else np.zeros(3)
+    lacking: Array = np.maximum(np.median(fixes.stddevs, axis=0) ** 2 - in_map.min(axis=0), 0.0)
+    return lacking
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:

@@ -166,7 +166,8 @@ def lit(
     """
     height, width = picture.depth.shape
     image = np.zeros((height // supersampling, width // supersampling, 3), np.float32)
-    log_depth = np.log(np.minimum(picture.depth, np.float32(FAR)))
+    log_depth = np.minimum(picture.depth, np.float32(FAR))
+    np.log(log_depth, out=log_depth)
     _light(
         picture.depth, log_depth, picture.cube, picture.face, rgb, sky, np.float32(distance), hollow, image
     )

@@ -169,10 +169,11 @@ def _meta(
     every = 1 + sum(map(len, tracks)) // MOST_POSES
     lines = [track.positions[::every] / tiled_map.voxel_size_m - origin for track in tracks]
     level = levels.in_page[0].level
-    cells = np.concatenate([_indices(node) for node in levels.in_page])
-    framed = cells[_framed(levels.in_page, tiled_map.label_set)]
-    low, high = np.percentile(cells[:, 2], [2, 98])
-    low_corner, high_corner = np.percentile(framed, [2, 98], axis=0)
+    framed = _framed(levels.in_page, tiled_map.label_set)
+    low, high = np.percentile(_indices(levels.in_page, axis=2), [2, 98])
+    low_corner, high_corner = np.transpose(
+        [np.percentile(_indices(levels.in_page, axis)[framed], [2, 98]) for axis in range(3)]
+    )
     count = int(levels.counts.sum()) + levels.removed
     about = f"{count:,} voxels of {tiled_map.voxel_size_m:g} m"
     return {
@@ -215,10 +216,15 @@ def _changed_box(change: Mapping[str, Any], voxel_m: float, origin: NDArray[np.i
     }
 
 
-def _indices(node: Node) -> NDArray[np.int64]:
-    """Places (v, 3) of the voxels of a node, in voxels of the map from the origin."""
-    corner = np.array([*node.corner, 0]) << TILE_BITS
-    return (corner + node.cells) << node.level
+def _indices(nodes: list[Node], axis: int) -> NDArray[np.int32]:
+    """Places (v,) of the voxels of nodes along an axis, in voxels of the map from the origin."""
+    corners = [([*node.corner, 0][axis] << TILE_BITS) for node in nodes]
+    return np.concatenate(
+        [
+            (np.int32(corner) + node.cells[:, axis].astype(np.int32)) << node.level
+            for corner, node in zip(corners, nodes, strict=True)
+        ]
+    )
 
 
 def _framed(nodes: list[Node], label_set: LabelSet) -> NDArray[np.bool_]:

@@ -96,6 +96,7 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
     try:
         for chunk in map_chunks(drive, numbers, waiting, progress):
             store.write(chunk)
+            del chunk  # the next one needs its memory
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
 

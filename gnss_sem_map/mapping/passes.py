@@ -78,6 +78,7 @@ def bind_passes(
     if base is not None:
         revisits += register_to_base(base, len(drives), passes, settings)
         condensed, names = [*condensed, CondensedDrive.fixed()], [*names, base.name]
+    del passes  # with the local maps that they keep
     corrections: list[Correction | None] = [None] * len(names)
     table: list[TwoPasses] = []
     warnings: list[str] = []

@@ -77,7 +77,7 @@ def way_along(trajectory: Trajectory, stamps: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def normals(cloud: small_gicp.PointCloud) -> Array:
-    """Unit normals (n, 3) of the planes of a cloud's points: the axis of least variance."""
-    covariances = np.asarray(cloud.covs())[:, :3, :3]
-    return np.asarray(np.linalg.eigh(covariances)[1][:, :, 0])
+def normals(cloud: small_gicp.PointCloud, every: int = 1) -> Array:
+    """Unit normals (n, 3) of the planes of every so many of a cloud's points: the axis of least variance."""
+    covariances = np.asarray(cloud.covs())[::every, :3, :3]
+    return np.linalg.eigh(covariances)[1][:, :, 0].copy()  # a view would keep all three axes

@@ -218,8 +218,8 @@ def _revisits(results: Sequence[_Found | None]) -> Revisits:
 
 
 def _sample(surfaces: small_gicp.PointCloud) -> tuple[Array, Array]:
-    some = slice(None, None, max(surfaces.size() // SAMPLED, 1))
-    return np.asarray(surfaces.points())[some, :3].copy(), normals(surfaces)[some]
+    every = max(surfaces.size() // SAMPLED, 1)
+    return np.asarray(surfaces.points())[::every, :3].copy(), normals(surfaces, every)
 
 
 def register(

@@ -21,6 +21,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import tile_files
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
 from gnss_sem_map.voxels.map_json import MAP_JSON, describe, name_of, read_description, read_frame, tile_of
@@ -165,12 +166,16 @@ def open_map(
     def of(tile: Tile) -> tuple[Path, Tile, dict[str, Any], float, LabelSet]:
         return folder / names[tile], tile, files[names[tile]], voxel_size_m, label_set
 
+    def read_tile(tile: Tile) -> SemanticMap:
+        release_memory()  # of the tiles before: exports of a large map would leave 200 MB in pieces
+        return tile_files.read(*of(tile))
+
     return TiledMap(
         voxel_size_m,
         label_set,
         read_frame(folder),
         tuple(sorted(names)),
-        Recent(lambda tile: tile_files.read(*of(tile)), voxels_held),
+        Recent(read_tile, voxels_held),
         Recent(lambda tile: tile_files.read_voxels(*of(tile)), voxels_held),
     )
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans.local_maps import cloud_of, normals
 from gnss_sem_map.scans.revisits import Pass, RevisitSettings, candidates, pass_of, register_passes
 from gnss_sem_map.sensor_log import Points, SensorLog
 
@@ -132,3 +133,11 @@ def test_sweeps_that_cannot_be_read_make_no_pair() -> None:
     found = register_passes([pass_with(log, truth), pass_with(torn, truth)], SETTINGS)
     assert len(found.pairs) == 0
     assert found.refused == len(pass_with(torn, truth).anchors)
+
+
+def test_normals_are_across_the_surface_and_keep_nothing_else() -> None:
+    """A view of all three axes would hold a megabyte for each place of a long drive."""
+    floor = np.random.default_rng(5).uniform(-9, 9, (600, 3)) * (1, 1, 0)
+    across = normals(cloud_of(floor), 3)
+    np.testing.assert_allclose(np.abs(across), np.tile([0.0, 0.0, 1.0], (200, 1)), atol=1e-6)
+    assert across.base is None

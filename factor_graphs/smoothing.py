@@ -80,7 +80,7 @@ class Solution:
         stamps = self.trajectory.stamps
         rows = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], IN_SHORT_S))
         rows = np.unique([*rows.tolist(), len(stamps) - 1])
-        return replace(self, trajectory=self.trajectory[rows], state_covariances=self.state_covariances[:0])
+        return replace(self, trajectory=self.trajectory[rows], state_covariances=np.empty((0, 15, 15)))
 
 
 def smooth(

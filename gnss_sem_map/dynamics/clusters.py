@@ -49,11 +49,19 @@ class PointSets:
 
     @classmethod
     def of(
-        cls, p_map: NDArray[np.float64], is_object: NDArray[np.bool_], part: NDArray[np.int32], count: int
+        cls,
+        p_map: NDArray[np.float64],
+        is_object: NDArray[np.bool_],
+        gaps_m: NDArray[np.float64],
+        part: NDArray[np.int32],
+        count: int,
     ) -> PointSets:
-        """The sets of points (n, 3): `part` (n,) is the set of each point, 0 to `count` - 1, or -1 for none."""
-        ones = np.ones(len(p_map), np.int32)
-        return cls(ones, is_object.astype(np.int32), p_map, p_map, p_map).merged(part, count)
+        """The sets of points (n, 3): `part` (n,) is the set of each point, 0 to `count` - 1, or -1 for none.
+
+        A point stands for half of the gap (n,) m between the rings above and below it.
+        """
+        ones, half = np.ones(len(p_map), np.int32), np.outer(gaps_m, (0.0, 0.0, 0.5))
+        return cls(ones, is_object.astype(np.int32), p_map, p_map - half, p_map + half).merged(part, count)
 
     def merged(self, whole: NDArray[np.integer], count: int) -> PointSets:
         """Unions of these sets: `whole` (p,) is the union of each set, 0 to `count` - 1, or -1 for none."""
@@ -140,18 +148,19 @@ def _enclosing_clusters(low, high):
 
 
 def find_segments(
-    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float
+    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], gaps_m: NDArray[np.float64], eps_m: float
 ) -> tuple[Segments, NDArray[np.int32]]:
     """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
     Returns them, and for every point (n,) the index of its voxel, -1 for a point in no segment.
-    `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image. A
+    `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image.
+    `gaps_m` (n,) lie between the rings above and below each point, 0 where none is wide. A
     vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
     its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
     is a segment. Source: the clustering of section 3.3.2 (Ester et al., 1996), here on single scans.
     """
     keys, voxel = distinct(keys_of(p_map, VOXEL_M))
-    voxels = PointSets.of(p_map, is_object, voxel, len(keys))
+    voxels = PointSets.of(p_map, is_object, gaps_m, voxel, len(keys))
     clusters, count = _object_clusters(keys, voxels, eps_m)
     whole = voxels.merged(clusters, count)
     fits = _is_vehicle_sized(whole)
@@ -168,7 +177,7 @@ def find_segments(
     kept = number >= 0
     row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
     row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
-    parts = PointSets.of(p_map, is_object, row, int(kept.sum())).flat()
+    parts = PointSets.of(p_map, is_object, gaps_m, row, int(kept.sum())).flat()
     all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
     return Segments(keys[kept], parts, number[kept], all_truncated), row
 

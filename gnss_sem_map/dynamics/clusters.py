@@ -25,8 +25,8 @@ LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.5
 """A segment longer than LARGE_M may be two vehicles. A segment that extends beyond the image has at most LONGEST_M and
 HIGHEST_M, the size of a lorry or a bus. One without vehicle labels is at least LEAST_HEIGHT_M high: of a car behind the
 LiDAR only the front returns points, not the windscreen."""
-LEAST_POINTS = 20
-"""A segment without vehicle labels has at least so many points."""
+LEAST_BEAMS = 20
+"""A segment without vehicle labels has at least so many points, or as many as fewer rings show of the same surface."""
 MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200
 """A segment is split into two objects only when each has at least this share of its points and at least so many points:
 a sparse object would be split as well."""
@@ -148,13 +148,18 @@ def _enclosing_clusters(low, high):
 
 
 def find_segments(
-    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], gaps_m: NDArray[np.float64], eps_m: float
+    p_map: NDArray[np.float64],
+    is_object: NDArray[np.bool_],
+    gaps_m: NDArray[np.float64],
+    beams: NDArray[np.float64],
+    eps_m: float,
 ) -> tuple[Segments, NDArray[np.int32]]:
     """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
     Returns them, and for every point (n,) the index of its voxel, -1 for a point in no segment.
     `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image.
-    `gaps_m` (n,) lie between the rings above and below each point, 0 where none is wide. A
+    `gaps_m` (n,) lie between the rings above and below each point, 0 where none is wide; `beams` (n,) would
+    have hit it if rows of a cell adjoined. A
     vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
     its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
     is a segment. Source: the clustering of section 3.3.2 (Ester et al., 1996), here on single scans.
@@ -163,7 +168,7 @@ def find_segments(
     voxels = PointSets.of(p_map, is_object, gaps_m, voxel, len(keys))
     clusters, count = _object_clusters(keys, voxels, eps_m)
     whole = voxels.merged(clusters, count)
-    fits = _is_vehicle_sized(whole)
+    fits = _is_vehicle_sized(whole, np.asarray(np.bincount(clusters[voxel], beams, count), np.float64))
     number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
     shown = ~fits[clusters] & (
         voxels.labelled > 0
@@ -182,10 +187,10 @@ def find_segments(
     return Segments(keys[kept], parts, number[kept], all_truncated), row
 
 
-def _is_vehicle_sized(whole: PointSets) -> NDArray[np.bool_]:
+def _is_vehicle_sized(whole: PointSets, beams: NDArray[np.float64]) -> NDArray[np.bool_]:
     size = whole.highest - whole.lowest
     length, height = np.hypot(size[:, 0], size[:, 1]), size[:, 2]
-    unnamed = (height >= LEAST_HEIGHT_M) & (whole.points >= LEAST_POINTS)
+    unnamed = (height >= LEAST_HEIGHT_M) & (beams >= LEAST_BEAMS)
     return np.asarray((length <= LONGEST_M) & (height <= HIGHEST_M) & ((whole.labelled > 0) | unnamed))
 
 

@@ -22,6 +22,8 @@ CELLS, LOWEST_DEG = 430, -215 * CELL_DEG
 FINE, COARSE = (155, 225), 4
 """The cells from -25.2 to 4.2 degrees, where what moves is seen, are rows; elsewhere a row is so many cells, so that
 128 rings have 80 rows."""
+HORIZON = 215
+"""The first cell above it."""
 WIDEST_GAP = 1
 """More empty cells than these, side by side, are a gap between rings."""
 BEYOND = 3
@@ -76,6 +78,13 @@ class Rows:
             if low < high:
                 gaps[first:end] = np.maximum(gaps[first:end], np.radians((high - low + 1) * CELL_DEG))
         return gaps
+
+    @property
+    def gap_on_ground_deg(self) -> float:
+        """The usual gap between rings that meet the ground around the vehicle."""
+        ground = slice(FINE[0], HORIZON)
+        gaps = self.gaps_rad[ground][self.of_return[ground] > 0]
+        return float(np.degrees(np.median(gaps))) if len(gaps) else 0.0
 
     @cached_property
     def of_return(self) -> NDArray[np.int32]:

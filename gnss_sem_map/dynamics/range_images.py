@@ -37,7 +37,10 @@ def _pixel(x, y, z):
     """Cell of elevation, see `image_rows`, and column without the margin."""
     cell = int32(np.floor((atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / CELL_DEG))
     column = int32(np.floor((atan2_deg(y, x) + 180.0) / COLUMN_DEG))
-    return cell if 0 <= cell < CELLS else 0, column if 0 <= column < COLUMNS else 0  # straight up is in no row
+    return (
+        cell if 0 <= cell < CELLS else 0,
+        column if 0 <= column < COLUMNS else 0,
+    )  # straight up is in no row
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -141,7 +144,17 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_hits_and_misses(
-    positions, images, T_lidar_map, around, chosen, nearest_m, farthest_m, margin_m, margin_ratio, hits, misses
+    positions,
+    images,
+    T_lidar_map,
+    around,
+    chosen,
+    nearest_m,
+    farthest_m,
+    margin_m,
+    margin_ratio,
+    hits,
+    misses,
 ):
     """Count for every position (m, 3) m the scans that hit it and those that saw through it; adds to `hits`, `misses`.
 
@@ -245,12 +258,16 @@ def _in_range(positions, T_lidar_map, nearest_m, farthest_m, p_lidar, index):
 
 def gaps_at(
     p_map: NDArray[np.float64], T_lidar_map: NDArray[np.float64], rows: Rows
-) -> NDArray[np.float64]:
-    """Height (n,) m of the gap between the rings above and below each point (n, 3) m of a scan; 0 where rows adjoin."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The gap (n,) m between the rings above and below each point (n, 3) m of a scan, and the beams it has room for.
+
+    Where rows adjoin these are 0 and 1.
+    """
     p_lidar = p_map @ T_lidar_map[:3, :3].T + T_lidar_map[:3, 3]
     ranges = np.linalg.norm(p_lidar, axis=1)
     elevations = np.degrees(np.arcsin(p_lidar[:, 2] / ranges))
-    return ranges * rows.gaps_rad[((elevations - LOWEST_DEG) / CELL_DEG).astype(np.intp)]
+    gaps_rad = rows.gaps_rad[((elevations - LOWEST_DEG) / CELL_DEG).astype(np.intp)]
+    return ranges * gaps_rad, np.maximum(gaps_rad / np.radians(CELL_DEG), 1.0)
 
 
 def empty_image(rows: Rows) -> NDArray[np.uint16]:

@@ -28,6 +28,9 @@ SCANS_PER_PART = 64
 MARGIN_M, MARGIN_RATIO = 0.3, 0.01
 """A range within this, plus this share of the range, of a position is a hit: noise of ranges and poses."""
 
+ASKED_M, BEFORE, ASKED_EVERY = (5.0, 40.0), 0.8, 16
+"""A scan is asked about the places at this share of the range of some of its returns: those in a range of so many m."""
+
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
@@ -117,6 +120,22 @@ def spatial_order(positions: NDArray[np.float64]) -> NDArray[np.intp]:
     cubes = (positions / CUBE_M).astype(np.int64)
     x, y, z = (cubes - cubes.min(axis=0, initial=0)).T
     return np.argsort((x << 42) + (y << 21) + z, kind="stable")
+
+
+def share_seen_through(scans: Sequence[NDArray[np.floating]], rows: Rows) -> float:
+    """The share of the returns of some scans (n, 3) m, in LiDAR axes, before which the scan says that nothing is.
+
+    It is low for a pattern that is too sparse for an image: most pixels around a return are empty.
+    """
+    misses, asked = 0, 0
+    for points in scans:
+        p_lidar = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        ranges = np.linalg.norm(p_lidar, axis=1)
+        some = BEFORE * p_lidar[(ranges > ASKED_M[0]) & (ranges < ASKED_M[1])][::ASKED_EVERY]
+        seen = KeyframeScans.of([RangeImage.of(p_lidar, np.eye(4), rows)])
+        misses += int(hits_and_misses(some, seen, ASKED_M[1])[1].sum())
+        asked += len(some)
+    return misses / asked if asked else 1.0
 
 
 def hits_and_misses(

@@ -68,7 +68,13 @@ def test_neighbours_that_are_hidden_together_are_left_out_and_nothing_else_is(ho
     clusters = np.array_split(places[order], len(places) // range_images.CLUSTER)
     hidden = [
         range_images._is_hidden(
-            *range_images._sphere_around(cluster), T_lidar_map, DENSE.around, image.reshape(-1), 40.0, 0.3, 0.01
+            *range_images._sphere_around(cluster),
+            T_lidar_map,
+            DENSE.around,
+            image.reshape(-1),
+            40.0,
+            0.3,
+            0.01,
         )
         for cluster in clusters
     ]
@@ -117,7 +123,9 @@ def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
         azimuths = np.radians(np.arange(-4, 4.5, 0.4))
         points = WALL_M * np.stack([np.cos(azimuths), np.sin(azimuths), -0.02 + 0 * azimuths], axis=1)
         segments = np.zeros(len(points), np.int32)
-        assert range_images.hidden_sides(points, segments, np.eye(4), DENSE.of_return, nearer, 1, 0.5).tolist() == [expected]
+        assert range_images.hidden_sides(
+            points, segments, np.eye(4), DENSE.of_return, nearer, 1, 0.5
+        ).tolist() == [expected]
 
 
 def test_pixels_are_where_the_angles_say():

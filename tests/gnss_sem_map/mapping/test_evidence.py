@@ -13,7 +13,6 @@ from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import evidence
 
-
 IMAGE_SHAPE = (DENSE.count + 1, WIDTH)
 
 
@@ -36,7 +35,9 @@ def test_those_of_more_than_a_gibibyte_too(tmp_path: Path) -> None:
     """10 km of drive."""
     count = (1 << 30) // (2 * int(np.prod(IMAGE_SHAPE))) + 1
     images = np.zeros((count, *IMAGE_SHAPE), np.uint16)
-    evidence.write_keyframes(KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)), DENSE), tmp_path / "k.npz")
+    evidence.write_keyframes(
+        KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)), DENSE), tmp_path / "k.npz"
+    )
     assert len(evidence.read_keyframes(tmp_path / "k.npz").images) == count
 
 

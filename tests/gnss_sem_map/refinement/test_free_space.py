@@ -113,8 +113,8 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     looks = visibility.hits_and_misses(places, witnesses, reach_m)
     hits, misses = np.zeros((2, len(places)), np.int32)
     range_images.count_hits_and_misses(
-        places, witnesses.images, witnesses.T_lidar_map, DENSE.around, np.arange(len(far)), visibility.NEAREST_M, reach_m,
-        visibility.MARGIN_M, visibility.MARGIN_RATIO, hits, misses,
+        places, witnesses.images, witnesses.T_lidar_map, DENSE.around, np.arange(len(far)), visibility.NEAREST_M,
+        reach_m, visibility.MARGIN_M, visibility.MARGIN_RATIO, hits, misses,
     )  # fmt: skip
     np.testing.assert_array_equal(looks, [hits, misses])
     assert looks.any(axis=1).all()

@@ -231,7 +231,8 @@ def removed_in_all(drive: Drive, chunks: list[MappedChunk]) -> Points:
     static = reduce(add, (chunk.static for chunk in chunks))
     known = [chunk.keyframes for chunk in chunks if chunk.keyframes is not None]
     keyframes = KeyframeScans(
-        np.concatenate([one.images for one in known]), np.concatenate([one.T_lidar_map for one in known])
+        np.concatenate([one.images for one in known]), np.concatenate([one.T_lidar_map for one in known]),
+        known[0].rows,
     ) if known else None  # fmt: skip
     refined, _ = refine(static, beside=Evidence(keyframes=keyframes))
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last

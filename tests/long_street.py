@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scenes import DENSE
 from surfaces import with_heights
 
 from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage
@@ -43,5 +44,5 @@ def keyframes() -> KeyframeScans:
     for x in np.linspace(325.0, 350.0, 10):
         T_map_lidar = np.eye(4)
         T_map_lidar[:3, 3] = (x, 0.0, 2.0)
-        scans.append(RangeImage.of(sphere.reshape(-1, 3) + T_map_lidar[:3, 3], T_map_lidar))
+        scans.append(RangeImage.of(sphere.reshape(-1, 3) + T_map_lidar[:3, 3], T_map_lidar, DENSE))
     return KeyframeScans.of(scans)

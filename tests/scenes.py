@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.simulation import Motion, follow
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.dynamics.image_rows import CELLS, Rows
 from gnss_sem_map.sensor_log import Calibration, Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
@@ -19,6 +20,9 @@ FRAME = LocalFrame(49.011, 8.423, 112.0)
 SWEEP_S, RANGE_M, NOISE_M = 0.1, 80.0, 0.01
 IMU_HEIGHT_M = 0.93
 T_IMU_LIDAR = np.array([[1, 0, 0, 0.81], [0, 1, 0, -0.32], [0, 0, 1, 0.8], [0, 0, 0, 1.0]])
+
+DENSE = Rows((np.arange(CELLS) >= 155) & (np.arange(CELLS) < 220))
+"""Rows of a LiDAR that sees everything from -25 to 2 degrees."""
 
 # A box is its two opposite corners, in the map at stamp zero, and its velocity.
 Box = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]

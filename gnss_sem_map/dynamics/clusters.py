@@ -25,8 +25,8 @@ LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.5
 """A segment longer than LARGE_M may be two vehicles. A segment that extends beyond the image has at most LONGEST_M and
 HIGHEST_M, the size of a lorry or a bus. One without vehicle labels is at least LEAST_HEIGHT_M high: of a car behind the
 LiDAR only the front returns points, not the windscreen."""
-LEAST_POINTS = 20
-"""A segment without vehicle labels has at least so many points."""
+LEAST_BEAMS = 20
+"""A segment without vehicle labels has at least so many points, or as many as fewer rings show of the same surface."""
 MIXED_SHARE, LEAST_DENSE_POINTS = 0.2, 200
 """A segment is split into two objects only when each has at least this share of its points and at least so many points:
 a sparse object would be split as well."""
@@ -49,11 +49,19 @@ class PointSets:
 
     @classmethod
     def of(
-        cls, p_map: NDArray[np.float64], is_object: NDArray[np.bool_], part: NDArray[np.int32], count: int
+        cls,
+        p_map: NDArray[np.float64],
+        is_object: NDArray[np.bool_],
+        gaps_m: NDArray[np.float64],
+        part: NDArray[np.int32],
+        count: int,
     ) -> PointSets:
-        """The sets of points (n, 3): `part` (n,) is the set of each point, 0 to `count` - 1, or -1 for none."""
-        ones = np.ones(len(p_map), np.int32)
-        return cls(ones, is_object.astype(np.int32), p_map, p_map, p_map).merged(part, count)
+        """The sets of points (n, 3): `part` (n,) is the set of each point, 0 to `count` - 1, or -1 for none.
+
+        A point stands for half of the gap (n,) m between the rings above and below it.
+        """
+        ones, half = np.ones(len(p_map), np.int32), np.outer(gaps_m, (0.0, 0.0, 0.5))
+        return cls(ones, is_object.astype(np.int32), p_map, p_map - half, p_map + half).merged(part, count)
 
     def merged(self, whole: NDArray[np.integer], count: int) -> PointSets:
         """Unions of these sets: `whole` (p,) is the union of each set, 0 to `count` - 1, or -1 for none."""
@@ -140,21 +148,27 @@ def _enclosing_clusters(low, high):
 
 
 def find_segments(
-    p_map: NDArray[np.float64], is_object: NDArray[np.bool_], eps_m: float
+    p_map: NDArray[np.float64],
+    is_object: NDArray[np.bool_],
+    gaps_m: NDArray[np.float64],
+    beams: NDArray[np.float64],
+    eps_m: float,
 ) -> tuple[Segments, NDArray[np.int32]]:
     """Segments of points above ground (n, 3) m by DBSCAN, with those marked that the edge of the image truncates.
 
     Returns them, and for every point (n,) the index of its voxel, -1 for a point in no segment.
-    `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image. A
+    `is_object` (n,) marks the points that the image labels as movable; the other points lie outside of the image.
+    `gaps_m` (n,) lie between the rings above and below each point, 0 where none is wide; `beams` (n,) would
+    have hit it if rows of a cell adjoined. A
     vehicle at the edge of the image continues in the points around it, if the whole is no larger than a vehicle; else
     its labelled part is a segment, marked as truncated. Outside of the image, every cluster with the size of a vehicle
     is a segment. Source: the clustering of section 3.3.2 (Ester et al., 1996), here on single scans.
     """
     keys, voxel = distinct(keys_of(p_map, VOXEL_M))
-    voxels = PointSets.of(p_map, is_object, voxel, len(keys))
+    voxels = PointSets.of(p_map, is_object, gaps_m, voxel, len(keys))
     clusters, count = _object_clusters(keys, voxels, eps_m)
     whole = voxels.merged(clusters, count)
-    fits = _is_vehicle_sized(whole)
+    fits = _is_vehicle_sized(whole, np.asarray(np.bincount(clusters[voxel], beams, count), np.float64))
     number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
     shown = ~fits[clusters] & (
         voxels.labelled > 0
@@ -168,15 +182,15 @@ def find_segments(
     kept = number >= 0
     row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
     row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
-    parts = PointSets.of(p_map, is_object, row, int(kept.sum())).flat()
+    parts = PointSets.of(p_map, is_object, gaps_m, row, int(kept.sum())).flat()
     all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
     return Segments(keys[kept], parts, number[kept], all_truncated), row
 
 
-def _is_vehicle_sized(whole: PointSets) -> NDArray[np.bool_]:
+def _is_vehicle_sized(whole: PointSets, beams: NDArray[np.float64]) -> NDArray[np.bool_]:
     size = whole.highest - whole.lowest
     length, height = np.hypot(size[:, 0], size[:, 1]), size[:, 2]
-    unnamed = (height >= LEAST_HEIGHT_M) & (whole.points >= LEAST_POINTS)
+    unnamed = (height >= LEAST_HEIGHT_M) & (beams >= LEAST_BEAMS)
     return np.asarray((length <= LONGEST_M) & (height <= HIGHEST_M) & ((whole.labelled > 0) | unnamed))
 
 

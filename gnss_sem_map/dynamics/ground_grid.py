@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 GROUND_CELL_M = 1.0
 
 
-def height_over_ground(p_map: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (n,) m of every point (n, 3) m over the lowest point in its 1 m cell and the eight cells around it."""
+def height_over_ground(p_map: NDArray[np.float64], cell_m: float = GROUND_CELL_M) -> NDArray[np.float64]:
+    """Height (n,) m of every point (n, 3) m over the lowest point in its cell and the eight cells around it."""
     heights = np.empty(len(p_map))
     if len(p_map):
-        _heights(p_map, GROUND_CELL_M, heights)
+        _heights(p_map, cell_m, heights)
     return heights
 
 

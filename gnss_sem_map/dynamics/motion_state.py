@@ -8,6 +8,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import cKDTree
 from scipy.special import betaincc, ndtr
 
 from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
@@ -154,10 +155,10 @@ def _motion_of_track(
     moved = displacement_of([segments[n] for n in members])
     displaced = 0.0
     if moved and moved.speed_m_s > settings.least_speed_m_s and moved.shift_m > 0:
-        away = _away_from_median(members, segments, settings.least_shift_m)
+        hit_elsewhere, missed_elsewhere = _elsewhere(members, segments, hits, misses, settings.least_shift_m)
         # an object that moved less than its length hides the volume where it was: it must be free more often
         least = settings.displaced_misses_per_hit * max(1.0, LENGTH_M / moved.shift_m)
-        if misses[away].sum() > least * hits[away].sum():
+        if missed_elsewhere > least * hit_elsewhere:
             displaced = float(ndtr((moved.shift_m - settings.least_shift_m) / SHIFT_STDDEV_M))
     reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
     if moved and displaced > 0.5:
@@ -171,11 +172,20 @@ def _motion_of_track(
     return _tracked_object(members, segments, motion, max(vanished, displaced), reason, displaced > 0.5)
 
 
-def _away_from_median(members: list[int], segments: list[Segment], reach_m: float) -> list[int]:
-    """The segments of a track away from its median position, where a moving object may have stood for long."""
+def _elsewhere(
+    members: list[int],
+    segments: list[Segment],
+    hits: NDArray[np.float64],
+    misses: NDArray[np.float64],
+    reach_m: float,
+) -> tuple[float, float]:
+    """Hits and misses of a track away from its median position, each place once however long the object stood there."""
     centroids = np.array([segments[n].centroid for n in members])
-    distances = np.linalg.norm(centroids - np.median(centroids, axis=0), axis=1)
-    return [n for n, distance in zip(members, distances, strict=True) if distance > reach_m]
+    away = np.linalg.norm(centroids - np.median(centroids, axis=0), axis=1) > reach_m
+    tree = cKDTree(centroids)
+    once = 1 / tree.query_ball_point(centroids[away], reach_m, return_length=True)
+    of_track = np.array(members)[away]
+    return float(once @ hits[of_track]), float(once @ misses[of_track])
 
 
 def _motion_without_labels(
@@ -186,8 +196,8 @@ def _motion_without_labels(
     settings: MotionSettings,
 ) -> list[TrackedObject]:
     """Motion state of a track without vehicle labels: it must be displaced, and its volume free at other times."""
-    away = _away_from_median(members, segments, settings.least_shift_m)
-    if misses[away].sum() <= settings.misses_per_hit * hits[away].sum():
+    hit, missed = _elsewhere(members, segments, hits, misses, settings.least_shift_m)
+    if missed <= settings.misses_per_hit * hit:
         return []
     whole = _motion_of_track(members, segments, hits, misses, settings, settings.misses_per_hit)
     return [whole] if whole.displaced else []

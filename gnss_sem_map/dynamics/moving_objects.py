@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.clusters import Segments, find_segments, split_segments
-from gnss_sem_map.dynamics.ground_grid import closer_than, height_over_ground, in_cells_near, within_radius
+from gnss_sem_map.dynamics.ground_grid import (
+    GROUND_CELL_M,
+    closer_than,
+    height_over_ground,
+    in_cells_near,
+    within_radius,
+)
+from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
 from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses, spatial_order
@@ -25,6 +32,9 @@ from gnss_sem_map.voxels.hash_unique import distinct
 FOOT_HEIGHT_M, BODY_HEIGHT_M = 0.05, 0.2
 """Heights over the lowest ground around: the body of an object begins at BODY_HEIGHT_M, its foot at FOOT_HEIGHT_M."""
 FOOT_REACH_M = 0.2
+CELL_M_PER_DEG, LARGEST_CELL_M = 1.0, 2.0
+"""Cells of the ground grow with the gap between rings: in one of 1 m the lowest return of 16 rings is often of the
+object."""
 HIDING_M = 0.5
 """Something nearer by this hides the side of an object."""
 SCANS_AT_A_TIME = 64
@@ -138,24 +148,29 @@ def observe(
     is_object: NDArray[np.bool_],
     is_known: NDArray[np.bool_],
     settings: MotionSettings,
+    rows: Rows,
 ) -> tuple[Observation, NearPoints]:
     """Segments and range image of one scan, and its points in or near a segment.
 
     `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) marks the
-    points that the image labels as movable, `is_known` (n,) those with any label.
+    points that the image labels as movable, `is_known` (n,) those with any label. `rows` are those of its LiDAR.
     """
-    seen = RangeImage.of(p_map, T_map_lidar)
-    heights, centre = height_over_ground(p_map), T_map_lidar[:2, 3]
+    seen = RangeImage.of(p_map, T_map_lidar, rows)
+    cell_m = float(np.clip(CELL_M_PER_DEG * rows.gap_on_ground_deg, GROUND_CELL_M, LARGEST_CELL_M))
+    heights, centre = height_over_ground(p_map, cell_m), T_map_lidar[:2, 3]
     above = (heights > FOOT_HEIGHT_M) & within_radius(p_map, centre, settings.farthest_object_m)
     is_body = heights > BODY_HEIGHT_M
     # beyond this range there is no evidence: only labelled points become candidates there
     unknown = ~is_known & within_radius(p_map, centre, settings.farthest_m)
     candidates = np.flatnonzero(above & is_body & (is_object | unknown))
     points = p_map.take(candidates, axis=0)
-    segments, voxel_of_candidates = find_segments(points, is_object.take(candidates), settings.segment_eps_m)
+    gaps = range_images.gaps_at(points, seen.T_lidar_map, rows)
+    segments, voxel_of_candidates = find_segments(
+        points, is_object.take(candidates), *gaps, settings.segment_eps_m
+    )
     hidden = range_images.hidden_sides(
-        points, segments.of_points(voxel_of_candidates), seen.T_lidar_map, seen.image, len(segments.truncated),
-        HIDING_M,
+        points, segments.of_points(voxel_of_candidates), seen.T_lidar_map, rows.of_return, seen.image,
+        len(segments.truncated), HIDING_M,
     )  # fmt: skip
     voxel = np.full(len(p_map), -1, np.int32)
     voxel[candidates] = voxel_of_candidates

@@ -13,16 +13,14 @@ import numpy as np
 from numba import int32, njit, uint16
 from numpy.typing import NDArray
 
+from gnss_sem_map.dynamics.image_rows import CELL_DEG, CELLS, LOWEST_DEG, Rows
 from gnss_sem_map.scans.angles import atan2_deg
 
-ROWS, COLUMNS = 68, 900
-LOWEST_DEG, ROW_DEG, COLUMN_DEG = -25.2, 0.42, 0.4
-"""Elevation and azimuth of the pixels: a little finer than the 64 beams of an HDL-64E."""
+COLUMNS, COLUMN_DEG = 900, 0.4
 WIDTH = COLUMNS + 2
-"""An image has a margin of one pixel: empty rows above and below; left and right the column from the other side."""
+"""An image has a margin of one pixel left and right, the column from the other side; its first row is empty."""
 NEAREST_M, FARTHEST_M = 2.5, 650.0
 """Nearer returns are of the vehicle that carries the LiDAR; farther ones do not fit the 16 bits of a pixel."""
-IMAGE_SHAPE = (ROWS + 2, WIDTH)
 UNITS_PER_M = 100
 EMPTY = np.uint16(65535)
 SLENDER = 0.7
@@ -36,10 +34,13 @@ CLUSTER = 256
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _pixel(x, y, z):
-    """Row and column without the margin; the row may lie outside of the image."""
-    row = int32(np.floor((atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / ROW_DEG))
+    """Cell of elevation, see `image_rows`, and column without the margin."""
+    cell = int32(np.floor((atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / CELL_DEG))
     column = int32(np.floor((atan2_deg(y, x) + 180.0) / COLUMN_DEG))
-    return row, column - COLUMNS if column >= COLUMNS else column
+    return (
+        cell if 0 <= cell < CELLS else 0,
+        column if 0 <= column < COLUMNS else 0,
+    )  # straight up is in no row
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -53,47 +54,51 @@ def _in_lidar(T, p_map, i):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw(p_map, T_lidar_map, image):
-    """Draw the points (n, 3) of a scan into its range image of cm: the nearest return of each pixel."""
-    pixels, depths = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.uint16)
+def draw(p_map, T_lidar_map, row_of, image):
+    """Draw the points (n, 3) of a scan into its range image of cm: the nearest return of each pixel.
+
+    `row_of` (CELLS,) is the row of a return in each cell of elevation, 0 for none.
+    """
+    cells, columns = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    depths = np.empty(BLOCK, np.uint16)
     drawn = image.reshape(-1)
     for start in range(0, len(p_map), BLOCK):
         here = p_map[start : start + BLOCK].reshape(-1)
         for i in range(len(here) // 3):
             x, y, z = _in_lidar(T_lidar_map, here, i)
-            row, column = _pixel(x, y, z)
+            cells[i], columns[i] = _pixel(x, y, z)
             r = np.sqrt(x * x + y * y + z * z)
-            seen = (r >= NEAREST_M) & (r < FARTHEST_M) & (row >= 0) & (row < ROWS)
-            pixels[i] = (row + 1) * WIDTH + column + 1 if seen else 0
-            depths[i] = r * UNITS_PER_M if seen else EMPTY
+            depths[i] = r * UNITS_PER_M if (r >= NEAREST_M) & (r < FARTHEST_M) else EMPTY
         for i in range(len(here) // 3):
-            drawn[pixels[i]] = min(drawn[pixels[i]], depths[i])
+            row = row_of[cells[i]]
+            pixel = row * WIDTH + columns[i] + 1
+            drawn[pixel] = min(drawn[pixel], depths[i] if row > 0 else EMPTY)
     image[:, 0], image[:, -1] = image[:, -2], image[:, 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _test_visibility(drawn, corner, low, high):
+def _test_visibility(drawn, around, column, low, high):
     """Visibility test of a position at a range of `low` to `high` cm in one scan: 1 hit, -1 miss, 0 hidden or unknown.
 
-    `corner` is the lowest pixel of the 3 x 3 window around the position.
+    `around` (3,) are the rows below, at and above the position; `column` is the first of its three.
     """
     filled, rows, hit, nearer = 0, 0, False, False
     for row in range(3):
-        a, b, c = drawn[corner], drawn[corner + 1], drawn[corner + 2]
+        at = around[row] * WIDTH + column
+        a, b, c = drawn[at], drawn[at + 1], drawn[at + 2]
         beams = (a != EMPTY) + (b != EMPTY) + (c != EMPTY)
         hit |= ((low <= a) & (a <= high)) | ((low <= b) & (b <= high)) | ((low <= c) & (c <= high))
         nearer |= (a < low) | (b < low) | (c < low)
         filled += beams
         rows |= (beams > 0) << row
-        corner += WIDTH
     if hit:
         return 1
-    around = rows & 0b010 or rows == 0b101  # beams passed in its row, or in the rows above and below
-    return -1 if around and filled >= LEAST_FILLED and not nearer else 0
+    between = rows & 0b010 or rows == 0b101  # beams passed in its row, or in the rows above and below
+    return -1 if between and filled >= LEAST_FILLED and not nearer else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
+def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
     """Mask (count,) of the segments of a scan that something nearer hides in part, on the left or on the right.
 
     The sides of a segment are its outermost columns; nearer returns in the three columns beyond hide it.
@@ -105,7 +110,8 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
     for i in range(n):
         x, y, z = _in_lidar(T_lidar_map, flat, i)
         ranges[i] = np.sqrt(x * x + y * y + z * z)
-        rows[i], columns[i] = _pixel(x, y, z)
+        cell, columns[i] = _pixel(x, y, z)
+        rows[i] = row_of[cell]
     for i in range(n):
         s = segments[i]
         if s < 0:
@@ -119,14 +125,14 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
     counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
     for i in range(n):
         s = segments[i]
-        if s < 0 or not 0 <= rows[i] < ROWS:
+        if s < 0 or rows[i] == 0:
             continue
         for side, edge, step in ((0, low[s], -1), (1, high[s], 1)):
             if abs(columns[i] - edge) > 1:
                 continue
             counts[s, side] += 1
             for beyond in range(1, 4):
-                seen = image[rows[i] + 1, (columns[i] + first[s] + step * beyond) % COLUMNS + 1]
+                seen = image[rows[i], (columns[i] + first[s] + step * beyond) % COLUMNS + 1]
                 if seen != EMPTY and seen / UNITS_PER_M < ranges[i] - margin_m:
                     hidden[s, side] += 1
                     break
@@ -138,38 +144,47 @@ def hidden_sides(p_map, segments, T_lidar_map, image, count, margin_m):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_hits_and_misses(
-    positions, images, T_lidar_map, chosen, nearest_m, farthest_m, margin_m, margin_ratio, hits, misses
+    positions,
+    images,
+    T_lidar_map,
+    around,
+    chosen,
+    nearest_m,
+    farthest_m,
+    margin_m,
+    margin_ratio,
+    hits,
+    misses,
 ):
     """Count for every position (m, 3) m the scans that hit it and those that saw through it; adds to `hits`, `misses`.
 
-    `images` (k, 70, 902) cm, `T_lidar_map` (k, 4, 4), of which those at the places `chosen` are asked. Only scans with
-    the position in range count. A return is a hit within a margin that grows with range.
+    `images` (k, h, 902) cm, `T_lidar_map` (k, 4, 4), of which those at the places `chosen` are asked; `around`
+    (CELLS, 3) are the rows that tell of each cell of elevation. Only scans with the position in range count. A return
+    is a hit within a margin that grows with range.
     """
     p_lidar, index = np.empty((3, CLUSTER)), np.empty(CLUSTER, np.int32)
-    corners = np.empty(CLUSTER, np.int32)
+    cells, columns = np.empty(CLUSTER, np.int32), np.empty(CLUSTER, np.int32)
     lows, highs = np.empty(CLUSTER, np.uint16), np.empty(CLUSTER, np.uint16)
     for start in range(0, len(positions), CLUSTER):
         here = positions[start : start + CLUSTER]
         centre, radius = _sphere_around(here)
         for k in chosen:
             T, drawn = T_lidar_map[k], images[k].reshape(-1)
-            if _is_hidden(centre, radius, T, drawn, farthest_m, margin_m, margin_ratio):
+            if _is_hidden(centre, radius, T, around, drawn, farthest_m, margin_m, margin_ratio):
                 continue
             count = _in_range(here, T, nearest_m, farthest_m, p_lidar, index)
             xs, ys, zs = p_lidar[0], p_lidar[1], p_lidar[2]
             for i in range(count):
                 x, y, z = xs[i], ys[i], zs[i]
                 r = np.sqrt(x * x + y * y + z * z)
-                row, column = _pixel(x, y, z)
+                cells[i], columns[i] = _pixel(x, y, z)
                 margin = margin_m + margin_ratio * r
                 lows[i] = uint16(max(np.ceil(UNITS_PER_M * (r - margin)), 0.0))
                 highs[i] = uint16(min(np.floor(UNITS_PER_M * (r + margin)), float(EMPTY - 1)))
-                corners[i] = row * WIDTH + column if (row >= 0) & (row < ROWS) else -1
             for i in range(count):
-                if corners[i] >= 0:
-                    visibility = _test_visibility(drawn, corners[i], lows[i], highs[i])
-                    hits[start + index[i]] += visibility == 1
-                    misses[start + index[i]] += visibility == -1
+                visibility = _test_visibility(drawn, around[cells[i]], columns[i], lows[i], highs[i])
+                hits[start + index[i]] += visibility == 1
+                misses[start + index[i]] += visibility == -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -183,7 +198,7 @@ def _sphere_around(positions):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_hidden(centre, radius, T_lidar_map, drawn, farthest_m, margin_m, margin_ratio):
+def _is_hidden(centre, radius, T_lidar_map, around, drawn, farthest_m, margin_m, margin_ratio):
     """Whether a scan says nothing of any place in a sphere: out of its range or view, or behind all that it saw there.
 
     The window of pixels around the sphere is a little too large, and the range to it a little too small.
@@ -195,14 +210,16 @@ def _is_hidden(centre, radius, T_lidar_map, drawn, farthest_m, margin_m, margin_
     if radius > SLENDER * level:
         return False  # it is around the scan, or nearly so
     half = np.degrees(np.arcsin(radius / level))
-    row = (atan2_deg(z, level) - LOWEST_DEG) / ROW_DEG
-    first_row, last_row = int(row - half / ROW_DEG) - 2, int(row + half / ROW_DEG) + 3
-    if last_row < 0 or first_row > ROWS:
-        return True
+    cell = (atan2_deg(z, level) - LOWEST_DEG) / CELL_DEG
+    lowest, highest = len(drawn) // WIDTH, 0
+    for c in range(max(int(cell - half / CELL_DEG) - 1, 0), min(int(cell + half / CELL_DEG) + 2, CELLS)):
+        for row in around[c]:
+            if row > 0:
+                lowest, highest = min(lowest, row), max(highest, row)
     nearest = UNITS_PER_M * ((1 - margin_ratio) * (distance - radius) - margin_m) - 1
     column = (atan2_deg(y, x) + 180.0) / COLUMN_DEG
     first, last = int(column - half / COLUMN_DEG) - 2, int(column + half / COLUMN_DEG) + 3
-    for r in range(max(first_row, 0) + 1, min(last_row, ROWS - 1) + 2):
+    for r in range(lowest, highest + 1):
         at = r * WIDTH + 1
         if first < 0 or last > COLUMNS:  # across the seam
             seen = max(
@@ -239,6 +256,20 @@ def _in_range(positions, T_lidar_map, nearest_m, farthest_m, p_lidar, index):
     return count
 
 
-def empty_image() -> NDArray[np.uint16]:
+def gaps_at(
+    p_map: NDArray[np.float64], T_lidar_map: NDArray[np.float64], rows: Rows
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The gap (n,) m between the rings above and below each point (n, 3) m of a scan, and the beams it has room for.
+
+    Where rows adjoin these are 0 and 1.
+    """
+    p_lidar = p_map @ T_lidar_map[:3, :3].T + T_lidar_map[:3, 3]
+    ranges = np.linalg.norm(p_lidar, axis=1)
+    elevations = np.degrees(np.arcsin(p_lidar[:, 2] / ranges))
+    gaps_rad = rows.gaps_rad[((elevations - LOWEST_DEG) / CELL_DEG).astype(np.intp)]
+    return ranges * gaps_rad, np.maximum(gaps_rad / np.radians(CELL_DEG), 1.0)
+
+
+def empty_image(rows: Rows) -> NDArray[np.uint16]:
     """A range image without returns."""
-    return np.full(IMAGE_SHAPE, EMPTY, np.uint16)
+    return np.full((rows.count + 1, WIDTH), EMPTY, np.uint16)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
+from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.scans.prefetch import prefetch, threads
 
 THREADS = min(threads(), 4)
@@ -27,6 +28,9 @@ SCANS_PER_PART = 64
 MARGIN_M, MARGIN_RATIO = 0.3, 0.01
 """A range within this, plus this share of the range, of a position is a hit: noise of ranges and poses."""
 
+ASKED_M, BEFORE, ASKED_EVERY = (5.0, 40.0), 0.8, 16
+"""A scan is asked about the places at this share of the range of some of its returns: those in a range of so many m."""
+
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
@@ -36,12 +40,13 @@ class RangeImage:
     """(h, w) cm."""
     T_lidar_map: NDArray[np.float64]
     """(4, 4)."""
+    rows: Rows
 
     @classmethod
-    def of(cls, p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64]) -> RangeImage:
+    def of(cls, p_map: NDArray[np.float64], T_map_lidar: NDArray[np.float64], rows: Rows) -> RangeImage:
         """The range image of the points (n, 3) m of a scan, seen from its pose (4, 4)."""
-        seen = cls(range_images.empty_image(), np.asarray(np.linalg.inv(T_map_lidar), np.float64))
-        range_images.draw(p_map, seen.T_lidar_map, seen.image)
+        seen = cls(range_images.empty_image(rows), np.asarray(np.linalg.inv(T_map_lidar), np.float64), rows)
+        range_images.draw(p_map, seen.T_lidar_map, rows.of_return, seen.image)
         return seen
 
 
@@ -53,11 +58,14 @@ class KeyframeScans:
     """(k, h, w) cm: range images."""
     T_lidar_map: NDArray[np.float64]
     """(k, 4, 4): poses."""
+    rows: Rows
+    """Of all images."""
 
     @classmethod
     def of(cls, scans: Sequence[RangeImage]) -> KeyframeScans:
-        """Range images with their poses, at least one."""
-        return cls(np.stack([one.image for one in scans]), np.stack([one.T_lidar_map for one in scans]))
+        """Range images of one LiDAR with their poses, at least one."""
+        images = np.stack([one.image for one in scans])
+        return cls(images, np.stack([one.T_lidar_map for one in scans]), scans[0].rows)
 
     def __len__(self) -> int:
         return len(self.images)
@@ -66,7 +74,7 @@ class KeyframeScans:
         """The scans, some at a time."""
         for start in range(0, len(self), SCANS_PER_PART):
             part = slice(start, start + SCANS_PER_PART)
-            yield KeyframeScans(self.images[part], self.T_lidar_map[part])
+            yield replace(self, images=self.images[part], T_lidar_map=self.T_lidar_map[part])
 
 
 class Keyframes(Protocol):
@@ -114,6 +122,22 @@ def spatial_order(positions: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.argsort((x << 42) + (y << 21) + z, kind="stable")
 
 
+def share_seen_through(scans: Sequence[NDArray[np.floating]], rows: Rows) -> float:
+    """The share of the returns of some scans (n, 3) m, in LiDAR axes, before which the scan says that nothing is.
+
+    It is low for a pattern that is too sparse for an image: most pixels around a return are empty.
+    """
+    misses, asked = 0, 0
+    for points in scans:
+        p_lidar = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        ranges = np.linalg.norm(p_lidar, axis=1)
+        some = BEFORE * p_lidar[(ranges > ASKED_M[0]) & (ranges < ASKED_M[1])][::ASKED_EVERY]
+        seen = KeyframeScans.of([RangeImage.of(p_lidar, np.eye(4), rows)])
+        misses += int(hits_and_misses(some, seen, ASKED_M[1])[1].sum())
+        asked += len(some)
+    return misses / asked if asked else 1.0
+
+
 def hits_and_misses(
     positions: NDArray[np.float64], keyframes: KeyframeScans, farthest_m: float
 ) -> NDArray[np.int32]:
@@ -127,7 +151,7 @@ def hits_and_misses(
     def count(part: slice) -> None:
         close = np.flatnonzero(are_near(keyframes.T_lidar_map, positions[part], farthest_m))
         range_images.count_hits_and_misses(
-            positions[part], keyframes.images, keyframes.T_lidar_map, close,
+            positions[part], keyframes.images, keyframes.T_lidar_map, keyframes.rows.around, close,
             NEAREST_M, farthest_m, MARGIN_M, MARGIN_RATIO, *counts[:, part],
         )  # fmt: skip
 

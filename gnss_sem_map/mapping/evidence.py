@@ -7,10 +7,9 @@ evidence/moved/               the voxels of moving points, tile by tile
 
 from __future__ import annotations
 
-import math
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,7 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.dynamics.range_images import IMAGE_SHAPE
+from gnss_sem_map.dynamics.image_rows import CELLS, Rows
+from gnss_sem_map.dynamics.range_images import WIDTH
 from gnss_sem_map.dynamics.visibility import KeyframeScans, are_near
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import Archive, open_archive
@@ -29,8 +29,8 @@ from gnss_sem_map.voxels.tiles import TiledMap
 
 FOLDER = "evidence"
 MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
-MOST_KEYFRAME_BYTES = 10_000 * math.prod(IMAGE_SHAPE) * 2
-"""Images of the keyframe scans of one chunk that are read: ten thousand."""
+MOST_KEYFRAME_BYTES = 10_000 * 70 * WIDTH * 2
+"""Images of the keyframe scans of one chunk that are read: ten thousand of 70 rows."""
 FILES_HELD = 2
 """Files of keyframes in memory at a time, some 19 MB each: those of short drives are read once. Of longer ones every
 tile reads so many that none is held."""
@@ -91,7 +91,7 @@ class NearKeyframes:
         """The scans, file by file; raises DataError."""
         for path, scans in self.chosen.items():
             of_file = self.read(path)
-            yield KeyframeScans(of_file.images[scans], of_file.T_lidar_map[scans])
+            yield replace(of_file, images=of_file.images[scans], T_lidar_map=of_file.T_lidar_map[scans])
 
 
 def write(moving_points: Iterable[bytes], keyframes: Iterable[bytes], run: Path) -> None:
@@ -116,7 +116,7 @@ def write_moving_points(moving: Mapping[int, NDArray[np.int64]], file: Path | Bi
 
 def write_keyframes(scans: KeyframeScans, file: Path | BinaryIO) -> None:
     """Write range images and poses of keyframe scans; raises OSError."""
-    _write(file, images=scans.images, T_lidar_map=scans.T_lidar_map)
+    _write(file, images=scans.images, T_lidar_map=scans.T_lidar_map, seen=scans.rows.seen)
 
 
 def _write(file: Path | BinaryIO, **arrays: NDArray[Any]) -> None:
@@ -163,14 +163,18 @@ def read_keyframes(path: Path) -> KeyframeScans:
     """Range images and poses of keyframe scans; raises DataError."""
     with open_archive(path, MOST_KEYFRAME_BYTES) as archive:
         images = _array(archive, path, "images", "u", 3, MOST_KEYFRAME_BYTES)
-        T = _array(archive, path, "T_lidar_map", "f", 3)
-    is_image = images.dtype == np.uint16 and images.shape == (len(T), *IMAGE_SHAPE)
+        T, seen = _array(archive, path, "T_lidar_map", "f", 3), _array(archive, path, "seen", "b", 1)
+    if seen.shape != (CELLS,):
+        raise DataError(f"{shown(path)}: found {seen.shape} cells, expected {(CELLS,)}; make the run again")
+    rows = Rows(seen)
+    expected = len(T), rows.count + 1, WIDTH
+    is_image = images.dtype == np.uint16 and images.shape == expected
     if not is_image or T.shape[1:] != (4, 4) or not np.isfinite(T).all():
         raise DataError(
-            f"{shown(path)}: found images {images.shape} and poses {T.shape}, expected {(len(T), *IMAGE_SHAPE)} and"
+            f"{shown(path)}: found images {images.shape} and poses {T.shape}, expected {expected} and"
             f" {(len(T), 4, 4)}; make the run again"
         )
-    return KeyframeScans(images, T.astype(np.float64))
+    return KeyframeScans(images, T.astype(np.float64), rows)
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:

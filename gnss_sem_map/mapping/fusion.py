@@ -106,6 +106,11 @@ def _warn(drive: Drive, stats: RunStats) -> None:
         stats.warnings.append("no segmenter: the map shows geometry only")
     elif not _has_camera(drive):
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
+    if drive.settings.dynamics.enabled and not drive.is_motion_sought:
+        stats.warnings.append(
+            f"{drive.log.name}: the points of its scans are too far apart to tell what they see through: the search for"
+            " moving objects was left out"
+        )
 
 
 def _check(drive: Drive, stats: RunStats) -> None:

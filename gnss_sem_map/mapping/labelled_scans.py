@@ -6,6 +6,7 @@ A thread reads and decodes files a few scans ahead.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
+from gnss_sem_map.dynamics.image_rows import Rows
+from gnss_sem_map.dynamics.visibility import share_seen_through
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet, open_label_set
 from gnss_sem_map.labels.probabilities import KeepsLabels
@@ -37,6 +40,11 @@ from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.voxels.voxel_map import MappingSettings, keys_of
 
 READ_AHEAD = 4
+SAMPLED_SCANS = 8
+"""So many scans tell the rows in which a LiDAR measures."""
+LEAST_SEEN_THROUGH = 0.3
+"""With a smaller share of returns that the scan sees up to, its points are too far apart for an image: rings have more
+than 0.85, a pattern without rings 0.4 with 9000 points all around, and 0.2 with 4000."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +62,32 @@ class Drive:
     def label_set(self) -> LabelSet:
         """The classes of the map."""
         return open_label_set(self.settings.classes)
+
+    @property
+    def image_rows(self) -> Rows:
+        """Rows of the range images of its LiDAR, by some scans of the whole drive: for every chunk the same."""
+        return self._pattern[0]
+
+    @property
+    def is_motion_sought(self) -> bool:
+        """Whether moving objects are sought: they are where the scans see through what is free before their returns."""
+        return self.settings.dynamics.enabled and self._pattern[1] >= LEAST_SEEN_THROUGH
+
+    @cached_property
+    def _pattern(self) -> tuple[Rows, float]:
+        """Rows of the range images, and the share of returns that scans see up to."""
+        scans = _sample(self.log.scans)
+        rows = Rows.of(scans)
+        return rows, share_seen_through(scans, rows)
+
+
+def _sample(scans: Sequence[Scan]) -> list[NDArray[np.float32]]:
+    """The points of some scans; those that cannot be read are reported elsewhere."""
+    found = []
+    for scan in scans[:: max(len(scans) // SAMPLED_SCANS, 1)]:
+        with suppress(DataError):
+            found.append(scan.read().xyz)
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,7 +40,7 @@ def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
     drive, scan = seen.drive, seen.scan
     return observe(
         scan.number, scan.stamp, seen.p_map, _lidar_pose(drive, scan),
-        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics,
+        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics, drive.image_rows,
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def range_images(drive: Drive, scans: Sequence[Scan]) -> list[RangeImage]:
             p_map, _ = map_points(points, scan, drive.trajectory, drive.log, drive.settings.mapping)
         except (DataError, MeasurementError):
             return None
-        return RangeImage.of(p_map, _lidar_pose(drive, scan)) if len(p_map) else None
+        return RangeImage.of(p_map, _lidar_pose(drive, scan), drive.image_rows) if len(p_map) else None
 
     return [image for _, image in prefetch(draw, scans, THREADS) if image is not None]
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.dynamics.moving_objects import decide, moved_points, observe
 from gnss_sem_map.errors import DataError
@@ -19,6 +20,7 @@ RAYS = np.stack(
     ],
     axis=1,
 )
+ROWS = Rows.of([20 * RAYS])
 
 
 def cast(origin, boxes):
@@ -60,7 +62,7 @@ def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=N
         T_map_lidar = np.eye(4)
         T_map_lidar[:3, 3] = origin + drift_m * np.array([np.sin(t), np.cos(1.7 * t), 0.3 * np.sin(2 * t)])
         p_map = p_map + T_map_lidar[:3, 3] - origin
-        scans_seen.append(observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings))
+        scans_seen.append(observe(scan, t, p_map, T_map_lidar, (what > 2) & known, known, settings, ROWS))
         kept.append(what)
     moving, objects = decided(scans_seen, settings, matched)
     removed, total = np.zeros(len(cars) + 3), np.zeros(len(cars) + 3)
@@ -216,7 +218,7 @@ def test_only_points_of_the_mover_are_removed_and_no_scans_are_no_error():
 def seen(scan, p_map, T_map_lidar, is_object):
     """A scan of a camera that counts all around."""
     known = np.ones(len(p_map), bool)
-    return observe(scan, scan * SCAN_S, p_map, T_map_lidar, is_object, known, MotionSettings())
+    return observe(scan, scan * SCAN_S, p_map, T_map_lidar, is_object, known, MotionSettings(), ROWS)
 
 
 def pose(x):

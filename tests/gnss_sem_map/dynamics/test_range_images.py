@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scenes import DENSE
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.dynamics import range_images
+from gnss_sem_map.dynamics.image_rows import CELL_DEG, LOWEST_DEG
 from gnss_sem_map.dynamics.visibility import CUBE_M, spatial_order
 
 WALL_M = 20.0
@@ -20,8 +22,12 @@ def wall_image(hole=None):
         azimuths, elevations = azimuths[outside], elevations[outside]
     a, e = azimuths.ravel(), elevations.ravel()
     points = WALL_M * np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
-    image = range_images.empty_image()
-    range_images.draw(points, np.eye(4), image)
+    return image_of(points)
+
+
+def image_of(points, rows=DENSE):
+    image = range_images.empty_image(rows)
+    range_images.draw(points, np.eye(4), rows.of_return, image)
     return image
 
 
@@ -31,12 +37,12 @@ def pose_of(rotation, position):
     return T
 
 
-def seen_at(image, places, T_lidar_map=None):
+def seen_at(image, places, T_lidar_map=None, rows=DENSE):
     places = np.asarray(places, float).reshape(-1, 3)
     hits, misses = np.zeros(len(places), np.int32), np.zeros(len(places), np.int32)
     poses = np.eye(4)[None] if T_lidar_map is None else T_lidar_map[None]
     range_images.count_hits_and_misses(
-        places, image[None], poses, np.arange(1), 3.0, 40.0, 0.3, 0.01, hits, misses
+        places, image[None], poses, rows.around, np.arange(1), 3.0, 40.0, 0.3, 0.01, hits, misses
     )
     return hits - misses
 
@@ -62,7 +68,13 @@ def test_neighbours_that_are_hidden_together_are_left_out_and_nothing_else_is(ho
     clusters = np.array_split(places[order], len(places) // range_images.CLUSTER)
     hidden = [
         range_images._is_hidden(
-            *range_images._sphere_around(cluster), T_lidar_map, image.reshape(-1), 40.0, 0.3, 0.01
+            *range_images._sphere_around(cluster),
+            T_lidar_map,
+            DENSE.around,
+            image.reshape(-1),
+            40.0,
+            0.3,
+            0.01,
         )
         for cluster in clusters
     ]
@@ -84,8 +96,8 @@ def test_where_nothing_came_back_nothing_is_known():
 
 def test_beams_that_pass_only_above_a_place_have_not_looked_through_it():
     image = wall_image()
-    row = int((np.degrees(np.arctan2(-1.0, 10.0)) - range_images.LOWEST_DEG) / range_images.ROW_DEG)
-    image[: row + 2] = range_images.EMPTY  # the first is the frame
+    cell = int((np.degrees(np.arctan2(-1.0, 10.0)) - LOWEST_DEG) / CELL_DEG)
+    image[: DENSE.of_return[cell] + 1] = range_images.EMPTY
     assert seen_at(image, [(10.0, 0.0, -1.0)]) == 0
     assert seen_at(wall_image(), [(10.0, 0.0, -1.0)]) == -1
 
@@ -98,8 +110,7 @@ def test_the_pose_of_the_scan_is_taken_into_account():
 
 
 def test_the_nearest_return_of_a_pixel_counts():
-    image = range_images.empty_image()
-    range_images.draw(np.array([[20.0, 0, 0], [10.0, 0, 0], [15.0, 0, 0], [1.0, 0, 0]]), np.eye(4), image)
+    image = image_of(np.array([[20.0, 0, 0], [10.0, 0, 0], [15.0, 0, 0], [1.0, 0, 0]]))
     assert image[image != range_images.EMPTY].tolist() == [1000]
 
 
@@ -112,7 +123,9 @@ def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
         azimuths = np.radians(np.arange(-4, 4.5, 0.4))
         points = WALL_M * np.stack([np.cos(azimuths), np.sin(azimuths), -0.02 + 0 * azimuths], axis=1)
         segments = np.zeros(len(points), np.int32)
-        assert range_images.hidden_sides(points, segments, np.eye(4), nearer, 1, 0.5).tolist() == [expected]
+        assert range_images.hidden_sides(
+            points, segments, np.eye(4), DENSE.of_return, nearer, 1, 0.5
+        ).tolist() == [expected]
 
 
 def test_pixels_are_where_the_angles_say():
@@ -121,14 +134,13 @@ def test_pixels_are_where_the_angles_say():
     points = rng.normal(size=(2000, 3)) * [20, 20, 3]
     azimuths = np.degrees(np.arctan2(points[:, 1], points[:, 0])) + 180
     elevations = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
-    rows = np.floor((elevations - range_images.LOWEST_DEG) / range_images.ROW_DEG).astype(int)
+    rows = DENSE.of_return[np.floor((elevations - LOWEST_DEG) / CELL_DEG).astype(int)]
     columns = np.floor(azimuths / range_images.COLUMN_DEG).astype(int) % range_images.COLUMNS
     ranges = np.linalg.norm(points, axis=1)
-    expected = range_images.empty_image()
-    seen = (ranges >= range_images.NEAREST_M) & (rows >= 0) & (rows < range_images.ROWS)
+    expected = range_images.empty_image(DENSE)
+    seen = (ranges >= range_images.NEAREST_M) & (rows > 0)
     centimetres = (ranges[seen] * range_images.UNITS_PER_M).astype(np.uint16)
-    np.minimum.at(expected, (rows[seen] + 1, columns[seen] + 1), centimetres)
-    drawn = range_images.empty_image()
-    range_images.draw(points, np.eye(4), drawn)
+    np.minimum.at(expected, (rows[seen], columns[seen] + 1), centimetres)
+    drawn = image_of(points)
     np.testing.assert_array_equal(drawn[:, 1:-1], expected[:, 1:-1])
     np.testing.assert_array_equal(drawn[:, [0, -1]], expected[:, [-2, 1]])

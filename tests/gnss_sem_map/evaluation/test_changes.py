@@ -63,7 +63,7 @@ def session(
     clouds, poses = seen(boxes)
     keyframes = KeyframeSelector()
     for k, (cloud, T) in enumerate(zip(clouds, poses, strict=True)):
-        keyframes.add(k * scenes.SWEEP_S, RangeImage.of(cloud, T))
+        keyframes.add(k * scenes.SWEEP_S, RangeImage.of(cloud, T, scenes.DENSE))
     scans = keyframes.keyframes()
     assert scans is not None
     folder.mkdir()

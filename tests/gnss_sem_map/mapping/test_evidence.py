@@ -6,16 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import DENSE
 
-from gnss_sem_map.dynamics.range_images import IMAGE_SHAPE
+from gnss_sem_map.dynamics.range_images import WIDTH
 from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping import evidence
 
+IMAGE_SHAPE = (DENSE.count + 1, WIDTH)
+
 
 def keyframes(count: int) -> KeyframeScans:
     images = np.random.default_rng(0).integers(0, 1 << 16, (count, *IMAGE_SHAPE), np.uint16)
-    return KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)))
+    return KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)), DENSE)
 
 
 def test_keyframes_come_back(tmp_path: Path) -> None:
@@ -24,6 +27,7 @@ def test_keyframes_come_back(tmp_path: Path) -> None:
     read = evidence.read_keyframes(tmp_path / "k.npz")
     np.testing.assert_array_equal(read.images, written.images)
     np.testing.assert_array_equal(read.T_lidar_map, written.T_lidar_map)
+    np.testing.assert_array_equal(read.rows.seen, written.rows.seen)
 
 
 @pytest.mark.slow
@@ -31,14 +35,17 @@ def test_those_of_more_than_a_gibibyte_too(tmp_path: Path) -> None:
     """10 km of drive."""
     count = (1 << 30) // (2 * int(np.prod(IMAGE_SHAPE))) + 1
     images = np.zeros((count, *IMAGE_SHAPE), np.uint16)
-    evidence.write_keyframes(KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1))), tmp_path / "k.npz")
+    evidence.write_keyframes(
+        KeyframeScans(images, np.tile(np.eye(4), (count, 1, 1)), DENSE), tmp_path / "k.npz"
+    )
     assert len(evidence.read_keyframes(tmp_path / "k.npz").images) == count
 
 
 @pytest.mark.parametrize("shape", [(3, 68, 900), (2, *IMAGE_SHAPE), (3, IMAGE_SHAPE[0], IMAGE_SHAPE[1] + 1)])
 def test_images_of_another_shape_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
     """They would be read beyond their end."""
-    np.savez(tmp_path / "k.npz", images=np.zeros(shape, np.uint16), T_lidar_map=np.tile(np.eye(4), (3, 1, 1)))
+    T = np.tile(np.eye(4), (3, 1, 1))
+    np.savez(tmp_path / "k.npz", images=np.zeros(shape, np.uint16), T_lidar_map=T, seen=DENSE.seen)
     with pytest.raises(DataError, match="expected"):
         evidence.read_keyframes(tmp_path / "k.npz")
 

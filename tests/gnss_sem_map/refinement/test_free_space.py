@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scenes import DENSE
 
 from gnss_sem_map.dynamics import range_images, visibility
 from gnss_sem_map.dynamics.visibility import POINTS_PER_BLOCK, KeyframeScans, KeyframeSelector, RangeImage
@@ -44,7 +45,7 @@ def pose(eye_x: float) -> NDArray[np.float64]:
 
 
 def witness(eye_x: float) -> RangeImage:
-    return RangeImage.of(ground_and_facades(eye_x), pose(eye_x))
+    return RangeImage.of(ground_and_facades(eye_x), pose(eye_x), DENSE)
 
 
 STREET = [float(x) for x in range(0, 30, 2)]
@@ -104,7 +105,7 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     rng = np.random.default_rng(0)
     far = [float(x) for x in range(0, 2000, 20)]
     witnesses = KeyframeScans(
-        np.stack([witness(0.0).image] * len(far)), np.linalg.inv([pose(x) for x in far])
+        np.stack([witness(0.0).image] * len(far)), np.linalg.inv([pose(x) for x in far]), DENSE
     )
     places = rng.uniform([0, -8, 0], [2000, 8, 3], (POINTS_PER_BLOCK + 5000, 3))
     places = places[np.argsort(places[:, 0])]
@@ -112,8 +113,8 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     looks = visibility.hits_and_misses(places, witnesses, reach_m)
     hits, misses = np.zeros((2, len(places)), np.int32)
     range_images.count_hits_and_misses(
-        places, witnesses.images, witnesses.T_lidar_map, np.arange(len(far)), visibility.NEAREST_M, reach_m,
-        visibility.MARGIN_M, visibility.MARGIN_RATIO, hits, misses,
+        places, witnesses.images, witnesses.T_lidar_map, DENSE.around, np.arange(len(far)), visibility.NEAREST_M,
+        reach_m, visibility.MARGIN_M, visibility.MARGIN_RATIO, hits, misses,
     )  # fmt: skip
     np.testing.assert_array_equal(looks, [hits, misses])
     assert looks.any(axis=1).all()
@@ -138,7 +139,7 @@ def test_witnesses_are_two_metres_or_two_seconds_apart() -> None:
     along = KeyframeSelector()
     assert along.keyframes() is None
     for k, x in enumerate(stood):
-        along.add(0.1 * k, RangeImage.of(np.empty((0, 3)), pose(x)))
+        along.add(0.1 * k, RangeImage.of(np.empty((0, 3)), pose(x), DENSE))
     kept = along.keyframes()
     assert kept is not None
     x = np.linalg.inv(kept.T_lidar_map)[:, 0, 3]

@@ -60,7 +60,7 @@ class MappedChunk:
 
 def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
     """The scans of every chunk; the last one has up to a window more, so that every other has a window after it."""
-    scans, window = drive.log.scans, drive.settings.dynamics.window_scans
+    scans, window = drive.scans, drive.settings.dynamics.window_scans
     count = 1 + max(0, len(scans) - window) // (WINDOWS * window)
     edges = [*range(0, count * WINDOWS * window, WINDOWS * window), len(scans)]
     return [scans[start:end] for start, end in pairwise(edges)]
@@ -77,7 +77,7 @@ def map_chunks(
     start = sum(map(len, chunks[: numbers.start]))
     total = sum(len(chunks[number]) for number in numbers)
     is_sought = drive.is_motion_sought
-    before = range_images(drive, drive.log.scans[max(start - window, 0) : start]) if is_sought else []
+    before = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
     undecided: _Chunk | None = None
     done = 0
     for number in numbers:

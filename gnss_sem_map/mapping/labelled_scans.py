@@ -24,6 +24,7 @@ from gnss_sem_map.labels.probabilities import KeepsLabels
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
+from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
     NEAREST_DEPTH_M,
@@ -74,11 +75,20 @@ class Drive:
         return self.settings.dynamics.enabled and self._pattern[1] >= LEAST_SEEN_THROUGH
 
     @cached_property
+    def scans(self) -> tuple[Scan, ...]:
+        """Those of the log; what told the rows is not read again."""
+        return self._kept.taking(self.log).scans
+
+    @cached_property
     def _pattern(self) -> tuple[Rows, float]:
         """Rows of the range images, and the share of returns that scans see up to."""
-        scans = _sample(self.log.scans)
+        scans = _sample(self._kept.keeping(self.log).scans)
         rows = Rows.of(scans)
         return rows, share_seen_through(scans, rows)
+
+    @cached_property
+    def _kept(self) -> KeptSweeps:
+        return KeptSweeps()
 
 
 def _sample(scans: Sequence[Scan]) -> list[NDArray[np.float32]]:

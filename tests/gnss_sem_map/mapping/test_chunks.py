@@ -76,7 +76,7 @@ def test_every_chunk_but_the_last_has_two_windows_of_scans_and_one_after_it(movi
     for count in range(1, SWEEPS + 1):
         scans = moving.log.scans[:count]
         chunks = chunks_of(replace(moving, log=replace(moving.log, scans=scans)))
-        assert [scan for chunk in chunks for scan in chunk] == list(scans)
+        assert [scan.number for chunk in chunks for scan in chunk] == [scan.number for scan in scans]
         assert all(len(chunk) == 2 * WINDOW for chunk in chunks[:-1])
         assert len(chunks) == 1 or WINDOW <= len(chunks[-1]) < 3 * WINDOW
 
@@ -117,13 +117,12 @@ def test_a_range_of_chunks_reads_its_scans_and_a_window_on_either_side_once(
     moving: Drive, numbers: range, first: int, last: int, tmp_path: Path
 ) -> None:
     reads: Counter[int] = Counter()
-    drive = counting(moving, reads)
-    assert drive.is_motion_sought  # by a few scans, whatever the range
-    assert reads.total() <= 2 * SAMPLED_SCANS
-    reads.clear()
-    for _ in map_chunks(drive, numbers, tmp_path):
+    for _ in map_chunks(counting(moving, reads), numbers, tmp_path):
         pass
-    assert reads == Counter(range(first, last))
+    assert set(range(first, last)) <= reads.keys()
+    again = {number for number, times in reads.items() if times > 1}
+    assert again <= {DAMAGED}, "those that tell the rows of range images are read once, too"
+    assert len(reads.keys() - range(first, last)) <= 2 * SAMPLED_SCANS
     assert list(tmp_path.iterdir()) == [], "points wait no longer"
 
 

@@ -111,19 +111,20 @@ def _changed(
     some = np.flatnonzero(_over_ground(voxels, settings))
     margin_m = here.fused.voxel_size_m
     some = some[~_is_beside(voxels.keys[some], there.around(tile, margin_m).keys)]
-    if not len(some):
-        return
     counts = _counted(voxels.centres[some], there, settings)
     free = (counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])
-    if free.any():
-        hits, misses = _counted(voxels.centres[some[free]], here, settings)
-        stands = hits >= settings.misses_per_hit * misses
-        yield voxels[some[free][stands]], counts[:, free][:, stands]
+    some, counts = some[free], counts[:, free]
+    hits, misses = _counted(voxels.centres[some], here, settings)
+    stands = hits >= settings.misses_per_hit * misses
+    if stands.any():
+        yield voxels[some[stands]], counts[:, stands]
 
 
 def _counted(places: Array, session: RawMap, settings: ChangeSettings) -> NDArray[np.int32]:
     """How many keyframe scans of a session hit the places, and how many see through them (2, v)."""
     counts = np.zeros((2, len(places)), np.int32)
+    if not len(places):
+        return counts
     keyframes = session.evidence.keyframes_near(places, settings.farthest_m)
     for part in keyframes.parts() if keyframes is not None else ():
         counts += hits_and_misses(places, part, settings.farthest_m)

@@ -404,6 +404,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         work = words.work or Path(folder)
         for case in words.only:
+            found: Figures | None
             if case == "coverage":
                 found = {gnss: coverage(gnss, DRAWS) for gnss in ("unit", "consumer")}
             else:

@@ -18,9 +18,8 @@ from factor_graphs.condensing import CondensedDrive
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuSamples
 from factor_graphs.relative_poses import RelativePoses
-from factor_graphs.rigid_motion import RigidMotion
 from factor_graphs.sessions import AnchorPairs, bind
-from factor_graphs.simulation import random_drive
+from factor_graphs.simulation import Motion, random_drive
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
@@ -68,7 +67,7 @@ def _draw(gnss: Gnss, seed: int) -> tuple[tuple[float, float], tuple[float, floa
     )
 
 
-def _located(motion: RigidMotion, gnss: Gnss, rng: np.random.Generator) -> Solution:
+def _located(motion: Motion, gnss: Gnss, rng: np.random.Generator) -> Solution:
     """A drive as a navigation unit and a LiDAR see it."""
     stamps = np.arange(0.0, SECONDS, 0.01)
     rows = dict(zip(COLUMNS, oxts_rows(motion, stamps, FRAME, rng, gnss).T, strict=True))
@@ -88,7 +87,7 @@ def _located(motion: RigidMotion, gnss: Gnss, rng: np.random.Generator) -> Solut
     return smooth(imu, fixes, FRAME, settings, np.zeros(3), prior, sweeps, condensed=True)
 
 
-def _sweeps(motion: RigidMotion, stamps: Array, rng: np.random.Generator) -> RelativePoses:
+def _sweeps(motion: Motion, stamps: Array, rng: np.random.Generator) -> RelativePoses:
     """Each bound to the one before and to the last of ten."""
     later = np.arange(1, len(stamps))
     pairs = np.concatenate(
@@ -100,7 +99,7 @@ def _sweeps(motion: RigidMotion, stamps: Array, rng: np.random.Generator) -> Rel
     return RelativePoses(stamps[pairs], between, np.tile(np.diag(STDDEVS**2), (len(pairs), 1, 1)))
 
 
-def _places(motion: RigidMotion, drives: Sequence[CondensedDrive], rng: np.random.Generator) -> AnchorPairs:
+def _places(motion: Motion, drives: Sequence[CondensedDrive], rng: np.random.Generator) -> AnchorPairs:
     """Registrations of the second drive to the first, as good as they say."""
     first, second = (drive.stamps for drive in drives)
     later = np.arange(1, len(second) - 1, EVERY_NTH)
@@ -123,7 +122,7 @@ def _condensed(solution: Solution) -> CondensedDrive:
     return solution.condensed
 
 
-def _squares(track: Trajectory, motion: RigidMotion) -> Array:
+def _squares(track: Trajectory, motion: Motion) -> Array:
     """Squared whitened errors of positions twice a second: chi2 of 3 dof where covariances are honest."""
     some = track[np.arange(50, len(track) - 50, 50)]
     assert some.covariances is not None

@@ -1,9 +1,10 @@
 """Two days in one street: how well their surfaces fit, how honest the poses are, and whether changes are found.
 
-    python benchmarks/sessions.py [--work FOLDER] [--seeds 101 102 ...] [--only unit consumer real]
+    python benchmarks/sessions.py [--work FOLDER] [--seeds 101 102 ...] [--only unit consumer coverage real]
 
 simulates two sessions for every seed, with the navigation unit's errors and with those of a consumer's receiver, maps
 them into one map, compares with the exact truth, and writes benchmarks/results/sessions.json. FOLDER keeps the drives.
+Six towns are few draws of the errors of a unit: `coverage` (benchmarks/sessions_coverage.py) makes many, without LiDAR.
 The real excerpt is read from $GNSS_SEM_MAP_DATA (or ../shared/data) and left out where it is absent.
 """
 
@@ -25,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from sessions_coverage import coverage
 
 from factor_graphs.chi_square import quantile
 from factor_graphs.geodesy import LocalFrame
@@ -60,6 +62,7 @@ Figures = dict[str, Any]
 RESULTS = Path(__file__).parent / "results" / "sessions.json"
 EXCERPT = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
 SECONDS, SEEDS, PLANTED = 30.0, (101, 102, 103, 104, 105, 106), 17
+CASES, DRAWS = ("unit", "consumer", "coverage", "real"), 40
 SETTINGS, REVISITS = Settings(), RevisitSettings()
 SHIFT_M = np.array([0.62, -0.62, 0.1])
 """Of the fixes of one half of the real excerpt: 0.88 m."""
@@ -395,15 +398,17 @@ def main() -> None:
     )
     parser.add_argument("--work", type=Path)
     parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS)
-    parser.add_argument(
-        "--only", nargs="*", choices=("unit", "consumer", "real"), default=("unit", "consumer", "real")
-    )
+    parser.add_argument("--only", nargs="*", choices=CASES, default=CASES)
     words = parser.parse_args()
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         work = words.work or Path(folder)
         for case in words.only:
-            found = real() if case == "real" else simulated(case, words.seeds, work)
+            found: Figures | None
+            if case == "coverage":
+                found = {gnss: coverage(gnss, DRAWS) for gnss in ("unit", "consumer")}
+            else:
+                found = real() if case == "real" else simulated(case, words.seeds, work)
             if found is not None:
                 known[case] = found
                 print(

@@ -1,8 +1,9 @@
 """What changed from one session to the next: voxels that stand in one and that the other one sees through.
 
 A voxel that is only missing proves nothing: it may have been hidden, or too far away. So the keyframe scans of the
-other session must see through its place, again and again, while its own session hits it. Voxels that changed are
-grouped to objects. Ground is left out, which grazing rays pass through.
+other session must see through its place, again and again, while its own session hits it: what that one sees through as
+well is the trail of somebody who walked. Voxels that changed are grouped to objects. Ground is left out, which grazing
+rays pass through.
 """
 
 from __future__ import annotations
@@ -32,17 +33,20 @@ class ChangeSettings(BaseModel):
     least_misses: int = Field(
         3, ge=1, description="Least number of keyframe scans that see through the place,"
     )
-    misses_per_hit: float = Field(3.0, gt=0, description="and least ratio of them to those that hit it.")
-    own_misses_per_hit: float = Field(
-        1.0, gt=0, description="Largest such ratio of an object in its own session: it stands there."
+    misses_per_hit: float = Field(
+        3.0,
+        gt=0,
+        description="and least ratio of them to those that hit it; in its own session, of hits to misses.",
     )
     farthest_m: float = Field(40.0, gt=0, description="Scans farther than this are no evidence.")
-    least_points: int = Field(2, ge=1, description="A voxel with fewer points proves nothing.")
+    least_points: int = Field(
+        2, ge=1, description="A voxel with fewer points is no more than part of an object."
+    )
     over_ground_m: float = Field(0.3, ge=0, description="Voxels that are not so far above the lowest stay.")
     together_m: float = Field(
         0.36, gt=0, description="Changed voxels that are nearer are of one object: those of 0.2 m that touch."
     )
-    least_voxels: int = Field(12, ge=1, description="Fewer voxels are no object.")
+    least_voxels: int = Field(12, ge=1, description="Fewer voxels with so many points are no object.")
     least_size_m: float = Field(0.5, ge=0, description="Nor is what is smaller in every direction.")
 
 
@@ -92,12 +96,9 @@ def _objects(
     clusters = dbscan(voxels.indices, settings.together_m / size_m, 1)
     for cluster in range(clusters.max() + 1):
         rows = np.flatnonzero(clusters == cluster)
-        of_there, of_here = np.split(counts[:, rows], 2)
-        if len(rows) < settings.least_voxels:
+        if np.sum(voxels.hits[rows] >= settings.least_points) < settings.least_voxels:
             continue
-        if of_here[1].sum() > settings.own_misses_per_hit * of_here[0].sum():
-            continue  # what its own session sees through as well is the trail of somebody who walked
-        thing = _object(voxels[rows], of_there, appeared)
+        thing = _object(voxels[rows], counts[:, rows], appeared)
         if thing.size.max() >= settings.least_size_m:
             yield thing
 
@@ -105,38 +106,39 @@ def _objects(
 def _changed(
     here: RawMap, there: RawMap, tile: tuple[int, int], settings: ChangeSettings
 ) -> Iterator[tuple[VoxelMap, NDArray[np.int32]]]:
-    """The voxels of a tile that changed; how often the other session hit and missed them, and their own one (4, v)."""
+    """The voxels of a tile that changed, and how often the other session hit and missed them (2, v)."""
     voxels = here.around(tile, 0.0)
-    some = np.flatnonzero(voxels.hits >= settings.least_points)
-    some = some[_over_ground(voxels, some, settings)]
+    some = np.flatnonzero(_over_ground(voxels, settings))
     margin_m = here.fused.voxel_size_m
     some = some[~_is_beside(voxels.keys[some], there.around(tile, margin_m).keys)]
-    if not len(some):
-        return
     counts = _counted(voxels.centres[some], there, settings)
     free = (counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])
-    if free.any():
-        own = _counted(voxels.centres[some[free]], here, settings)
-        yield voxels[some[free]], np.concatenate([counts[:, free], own])
+    some, counts = some[free], counts[:, free]
+    hits, misses = _counted(voxels.centres[some], here, settings)
+    stands = hits >= settings.misses_per_hit * misses
+    if stands.any():
+        yield voxels[some[stands]], counts[:, stands]
 
 
 def _counted(places: Array, session: RawMap, settings: ChangeSettings) -> NDArray[np.int32]:
     """How many keyframe scans of a session hit the places, and how many see through them (2, v)."""
     counts = np.zeros((2, len(places)), np.int32)
+    if not len(places):
+        return counts
     keyframes = session.evidence.keyframes_near(places, settings.farthest_m)
     for part in keyframes.parts() if keyframes is not None else ():
         counts += hits_and_misses(places, part, settings.farthest_m)
     return counts
 
 
-def _over_ground(voxels: VoxelMap, some: NDArray[np.intp], settings: ChangeSettings) -> Mask:
-    """Which of the voxels stand over the lowest one of the columns around them, a metre wide."""
+def _over_ground(voxels: VoxelMap, settings: ChangeSettings) -> Mask:
+    """Which voxels stand over the lowest one of the columns around them, a metre wide."""
     size_m = voxels.voxel_size_m
     columns = np.floor_divide(voxels.indices[:, :2], round(1.0 / size_m))
     _, column = np.unique(columns, axis=0, return_inverse=True)
     lowest = np.full(column.max(initial=-1) + 1, np.inf)
     np.minimum.at(lowest, column, voxels.centres[:, 2])
-    return np.asarray(voxels.centres[some, 2] - lowest[column[some]] >= settings.over_ground_m)
+    return np.asarray(voxels.centres[:, 2] - lowest[column] >= settings.over_ground_m)
 
 
 def _is_beside(keys: NDArray[np.int64], others: NDArray[np.int64]) -> Mask:

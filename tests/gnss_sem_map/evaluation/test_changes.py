@@ -26,6 +26,7 @@ CAR = scenes.still(11.6, 3.6, 0.0, 4.0, 1.8, 1.5)
 CONTAINER = scenes.still(11.9, -5.4, 0.0, 3.4, 1.8, 1.5)
 BEHIND_A_HOUSE = scenes.still(2.0, 19.5, 0.0, 4.0, 1.8, 1.5)
 WALKER = ((2.0, 4.0, 0.0), (2.5, 4.5, 1.7), (1.2, 0.0, 0.0))
+AIR_BESIDE_THE_CAR = scenes.still(11.6, 2.4, 0.6, 4.0, 1.0, 0.7)
 LABELS = open_label_set("urban")
 VEHICLE = LABELS.index("vehicle")
 
@@ -119,6 +120,20 @@ def test_what_the_other_day_cannot_see_has_not_changed(tmp_path: Path) -> None:
 
 def test_somebody_who_walked_by_is_no_change(tmp_path: Path) -> None:
     assert changes_between(session(tmp_path / "a", (WALKER,)), session(tmp_path / "b")) == []
+
+
+def test_what_its_own_day_sees_through_is_no_part_of_what_stands_there(tmp_path: Path) -> None:
+    """Chance points touch a car; what is 0.3 m in front of a surface counts as a hit of it."""
+    before, after = session(tmp_path / "a", (CAR,)), session(tmp_path / "b")
+    low, high, _ = AIR_BESIDE_THE_CAR
+    chance = np.random.default_rng(0).uniform(low, high, (5000, 3))
+    clouds, _ = seen((CAR,))
+    fused = in_memory(SemanticMap.of(voxels_of(np.concatenate([*clouds, chance]))))
+    found = changes_between(RawMap(fused, before.evidence), after)
+    places = np.concatenate([thing.voxels.centres for thing in found])
+    assert np.ptp(places[:, 0]) > 3.0
+    assert (places[:, 1] > CAR[0][1] - 0.3 - SIZE_M / 2).all()
+    assert changes_between(RawMap(fused, after.evidence), after) == []
 
 
 def test_without_keyframe_scans_nothing_is_said(tmp_path: Path) -> None:

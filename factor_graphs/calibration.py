@@ -15,7 +15,7 @@ from gtsam.symbol_shorthand import C, X
 from numpy.typing import NDArray
 
 from factor_graphs.elimination import by_sections, eliminate, split
-from factor_graphs.graph import from_values, relative_pose_factors
+from factor_graphs.graph import motion_from, relative_pose_factors
 from factor_graphs.problem import RELATIVE_LOSSES, Fit, Problem
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def correct(
 
 
 def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
-    T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
+    T, velocities = motion_from(fit.values)
     unit, x, y, z = gtsam.noiseModel.Unit.Create(3), *problem.p_imu_antenna
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     scales = np.sqrt(fit.weights)[:, None] / problem.fixes.stddevs

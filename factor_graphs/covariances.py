@@ -10,7 +10,6 @@ from collections import Counter
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
@@ -21,6 +20,7 @@ from factor_graphs.elimination import (
     by_sections,
     eliminate,
     in_time,
+    shared_keys,
     split,
     split_key,
 )
@@ -73,7 +73,7 @@ def keyframe_covariances(
     M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
     eliminated last, as if they were one more keyframe. `sums` finds the variance of sums over keyframes on the way.
     """
-    shared = tuple(key for key in (M(k), gtsam.symbol("w", k)) if values.exists(key))
+    shared = shared_keys(values, k)
     groups = by_sections(graph, k, shared) if sums is None else in_time(k, shared)
     linear = (part.linearize(values) for part in split(graph, groups))
     order = [split_key(keys[0])[1] for keys in groups]

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, M, V, W, X
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -39,6 +39,11 @@ class Conditional:
     R: Array
     S: Array
     d: Array
+
+
+def shared_keys(values: gtsam.Values, k: int) -> Group:
+    """Keys of what all k keyframes share, where they are: the mounting of the IMU, the calibration of the wheels."""
+    return tuple(key for key in (M(k), W(k)) if values.exists(key))
 
 
 def in_time(k: int, last: Group = ()) -> list[Group]:

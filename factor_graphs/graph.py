@@ -112,6 +112,13 @@ def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:
 
 def from_values(values: gtsam.Values, k: int) -> tuple[Array, Array, Array]:
     """GTSAM values as keyframe states: poses (k, 4, 4), velocities (k, 3), biases (k, 6)."""
-    T = np.array([values.atPose3(X(i)).matrix() for i in range(k)])
-    velocities = np.array([values.atVector(V(i)) for i in range(k)])
+    T, velocities = motion_from(values)
     return T, velocities, np.array([values.atConstantBias(B(i)).vector() for i in range(k)])
+
+
+def motion_from(values: gtsam.Values) -> tuple[Array, Array]:
+    """Poses (k, 4, 4) and velocities (k, 3) of all keyframes, without a call per keyframe."""
+    rows, velocities = gtsam.utilities.extractPose3(values), gtsam.utilities.extractVectors(values, "v")
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+    return T, velocities

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
-from factor_graphs.elimination import OF_KEYFRAME, PLACES, Group, by_sections, eliminate, split, split_key
+from factor_graphs.elimination import PLACES, Group, by_sections, eliminate, shared_keys, split, split_key
 
 Array = NDArray[np.float64]
 
@@ -29,8 +29,7 @@ def minimise(
     They are found when the cost changes by less than `tolerance` of itself. Raises RuntimeError where the equations
     have no solution.
     """
-    shared = tuple(key for key in list(start.keys()) if split_key(key)[0] not in OF_KEYFRAME)
-    groups = by_sections(graph, k, shared)
+    groups = by_sections(graph, k, shared_keys(start, k))
     parts = split(graph, groups)
     values, cost, damping = start, graph.error(start), 0.0
     for iteration in range(1, limit):

@@ -76,7 +76,7 @@ def map_chunks(
     chunks, window = chunks_of(drive), drive.settings.dynamics.window_scans
     start = sum(map(len, chunks[: numbers.start]))
     total = sum(len(chunks[number]) for number in numbers)
-    is_sought = drive.is_motion_sought
+    is_sought = drive.settings.dynamics.enabled
     before = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
     undecided: _Chunk | None = None
     done = 0
@@ -109,7 +109,7 @@ def _observed(
 
     Threads call `put_aside` with the points that may have moved.
     """
-    is_sought = drive.is_motion_sought
+    is_sought = drive.settings.dynamics.enabled
     labelled = label_each_scan(drive, scans, stats, keep_points=is_sought)
     if not is_sought:
         return (None if seen is None else (seen, None) for seen in labelled)

@@ -106,10 +106,10 @@ def _warn(drive: Drive, stats: RunStats) -> None:
         stats.warnings.append("no segmenter: the map shows geometry only")
     elif not _has_camera(drive):
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
-    if drive.settings.dynamics.enabled and not drive.is_motion_sought:
+    if drive.settings.dynamics.enabled and drive.is_too_sparse:
         stats.warnings.append(
-            f"{drive.log.name}: the points of its scans are too far apart to tell what they see through: the search for"
-            " moving objects was left out"
+            f"{drive.log.name}: the points of its scans are too far apart to tell what they see through: hardly any"
+            " moving object is found, and hardly any voxel is cleared"
         )
 
 

@@ -70,9 +70,9 @@ class Drive:
         return self._pattern[0]
 
     @property
-    def is_motion_sought(self) -> bool:
-        """Whether moving objects are sought: they are where the scans see through what is free before their returns."""
-        return self.settings.dynamics.enabled and self._pattern[1] >= LEAST_SEEN_THROUGH
+    def is_too_sparse(self) -> bool:
+        """Whether points are too far apart to tell what a scan sees through, so that nothing is found to have moved."""
+        return self._pattern[1] < LEAST_SEEN_THROUGH
 
     @cached_property
     def scans(self) -> tuple[Scan, ...]:

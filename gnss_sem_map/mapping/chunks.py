@@ -77,6 +77,8 @@ def map_chunks(
     start = sum(map(len, chunks[: numbers.start]))
     total = sum(len(chunks[number]) for number in numbers)
     is_sought = drive.settings.dynamics.enabled
+    if is_sought:
+        _ = drive.image_rows  # the scans that tell them are kept for their turn
     before = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
     undecided: _Chunk | None = None
     done = 0

@@ -69,9 +69,10 @@ def locate(
     if log.given is not None:
         return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
-    found = first if first is not None else smooth_log(log, settings.trajectory)
+    with_lidar = settings.trajectory.lidar_odometry and bool(log.scans)
+    found = first if first is not None else smooth_log(log, _plain(settings.trajectory, with_lidar))
     from_lidar_odometry, without_lidar = False, None
-    if settings.trajectory.lidar_odometry and log.scans:
+    if with_lidar:
         matches = (match or _in_this_process)(log, found.trajectory, settings, progress)
         release_memory()  # of the local map
         stats.counts.update(matches.counts)
@@ -81,9 +82,18 @@ def locate(
         if len(matches.relative_poses):
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
+        elif first is None:
+            found = smooth_log(log, settings.trajectory)
     stats.warnings.extend(found.notes)
     located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
     return _bound(located, log, settings, stats) if bound else located
+
+
+def _plain(settings: TrajectorySettings, with_lidar: bool) -> TrajectorySettings:
+    """How a drive is smoothed for the first time: with LiDAR odometry to come, only the motion within a sweep counts."""
+    if not with_lidar:
+        return settings
+    return settings.model_copy(update={"vehicle_constraint": "off", "estimate_time_offset": False})
 
 
 def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: RunStats) -> DriveTrajectory:

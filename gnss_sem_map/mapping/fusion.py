@@ -22,7 +22,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.chunks import chunks_of, map_chunks, writing_to
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -87,14 +87,10 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
     """Map some chunks in a row and save each when it is done; raises DataError when the disk is full."""
     # not named after the process: those of two containers may have one number
     waiting = store.folder / f".{numbers.start}.{secrets.randbelow(1 << 60)}{WAITING}"
-    try:
+    with writing_to(waiting):
         waiting.mkdir()
-    except OSError as error:
-        raise DataError(
-            f"{waiting}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
     try:
-        for chunk in map_chunks(drive, numbers, waiting, progress):
+        for chunk in map_chunks(drive, numbers, waiting, store.folder, progress):
             store.write(chunk)
             del chunk  # the next one needs its memory
     finally:

@@ -38,6 +38,7 @@ from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
@@ -83,11 +84,13 @@ def run(
         with new_folder(out) as folder:
             with executor_of(workers, scheduler, claim.work) as executor:
                 match = SavedMatches(source, claim.work, executor, resume)
+                register = None if executor is None else RevisitTasks(source, claim.work, executor)
                 elsewhere = None if executor is None else ChunkTasks(source, executor)
                 mapped = pipeline.run(
                     log, network, settings, folder, claim.work, progress,
-                    origin=origin, resume=resume, match=match, elsewhere=elsewhere, labels_from=source.labels_from,
-                    force=force, write=partial(run_folder.write_trajectory_files, folder),
+                    origin=origin, resume=resume, match=match, registrar_of=register, elsewhere=elsewhere,
+                    labels_from=source.labels_from, force=force,
+                    write=partial(run_folder.write_trajectory_files, folder),
                 )  # fmt: skip
                 refined = pipeline.refine(
                     folder, settings, mapped.stats, progress, executor=executor, work=claim.work

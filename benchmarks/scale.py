@@ -3,8 +3,9 @@
     python benchmarks/scale.py DRIVE PROBABILITIES [--work FOLDER] [--only memory reads ...]
 
 DRIVE is a long simulated drive in KITTI raw format (`gnss-sem-map simulate --seconds 600 --seed 7`), PROBABILITIES its
-class probabilities (`gnss-sem-map segment`, or `simulation.write_corrupted_labels`, which takes a tenth of the time). It is cut into shorter drives (`cut_drive.py`). Prints the figures and
-writes benchmarks/results/scale.json. Every run is a process of its own.
+class probabilities (`gnss-sem-map segment`, or `simulation.write_corrupted_labels`, which takes a tenth of the time).
+It is cut into shorter drives (`cut_drive.py`). Prints the figures and writes benchmarks/results/scale.json. Every run
+is a process of its own.
 """
 
 from __future__ import annotations

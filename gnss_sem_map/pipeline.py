@@ -277,8 +277,8 @@ def check_drive(
 
 def _remembered(drive: Drive, work: Path, resume: bool, labels_from: str) -> Drive:
     """The drive with a network whose answers are kept in `work`: --resume segments no image twice."""
-    size = drive.log.calibration.image_size
-    if drive.segmenter is None or size is None or isinstance(drive.segmenter, CachedLabels):
+    if drive.segmenter is None or not drive.log.cameras or isinstance(drive.segmenter, CachedLabels):
         return drive
-    folder = probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume)
-    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, size, folder))
+    sizes = drive.log.calibration.image_sizes
+    folder = probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume, sizes)
+    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, sizes, folder))

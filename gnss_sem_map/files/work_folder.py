@@ -34,7 +34,7 @@ OF_CHUNKS = re.compile(
     r"|\.\d+\.\d+\.waiting/(\d+\.npy)?|edges/(\d+\.npz|\.[^/]+\.\d+\.part)?"
 )
 OURS = re.compile(
-    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"
     r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
@@ -73,7 +73,7 @@ def holds_work(folder: Path) -> bool:
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
     return done or any(
         any((folder / place).glob(files))
-        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "*.npz"), (DRIVES, "*/run.json"))
+        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"))
     )
 
 

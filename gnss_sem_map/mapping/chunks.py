@@ -132,7 +132,7 @@ def _observed(
     Threads call `put_aside` with the points that may have moved.
     """
     is_sought = drive.settings.dynamics.enabled
-    labelled = label_each_scan(drive, scans, stats, keep_points=is_sought)
+    labelled = label_each_scan(drive, scans, stats)
     if not is_sought:
         return (None if seen is None else (seen, None) for seen in labelled)
 

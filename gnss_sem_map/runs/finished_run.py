@@ -198,7 +198,7 @@ class Run:
         """
         self._refuse_merged("relabelling")
         log, settings = self.drive(), self.settings
-        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
+        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
         inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}

@@ -19,7 +19,6 @@ from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, 
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
-from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest, of_map, of_work, save
@@ -73,11 +72,8 @@ def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:
     """Write `map/` and `evidence/` of a run folder from the chunks of a drive; raises DataError, OSError."""
 
     def fused() -> Iterator[tuple[Tile, SemanticMap]]:
-        # the next tile is summed while one is written
-        for tile, total in prefetch(
-            lambda tile: store.tile(STATIC, tile) + store.tile(REMOVED, tile), store.tiles(), under_way=1
-        ):
-            yield tile, SemanticMap.of(total)
+        for tile in store.tiles():
+            yield tile, SemanticMap.of(store.tile(STATIC, tile) + store.tile(REMOVED, tile))
 
     def moved() -> Iterator[tuple[Tile, SemanticMap]]:
         for tile in store.tiles():

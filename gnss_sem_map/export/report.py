@@ -157,6 +157,8 @@ def _facts(run: Mapping[str, Any]) -> str:
         )
     else:
         facts.append("not georeferenced")
+    if delivery := run.get("delivery"):
+        facts.append(f"files in {delivery['crs']} (EPSG:{delivery['epsg']}), heights {delivery['heights']}")
     return f'<p class="facts">{escape(" · ".join(facts))}</p>'
 
 

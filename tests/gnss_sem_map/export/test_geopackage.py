@@ -106,3 +106,9 @@ def test_an_object_across_tiles_is_one(street: SemanticMap, karlsruhe: LocalFram
 def test_a_map_without_georeference_is_refused(street: SemanticMap, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="needs a georeference"):
         write_geopackage(Exported(tiles.in_memory(street), title="street"), tmp_path / "map.gpkg")
+
+
+def test_the_documentation_names_every_layer_and_column() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "formats.md").read_text("utf-8")
+    names = {name for layer in LAYERS for name in (layer.name, *layer.columns)}
+    assert {name for name in names if f"`{name}`" not in text} == set()

@@ -7,8 +7,9 @@
                                                        or by `speed_unit` in log.yaml
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
-    images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg; of several cameras, each has a folder
-                                                                          of its name in images/
+    images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg
+
+Of several LiDARs or cameras, each has a folder of its name in lidar/ or images/.
 
 Stamps are seconds on one clock.
 """
@@ -47,7 +48,7 @@ from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit, in_or
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
-from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log import Calibration, Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -115,6 +116,15 @@ class CameraFile(BaseModel):
         return Camera(T_camera_lidar, K, self.image_size, self.time_offset_s, self.distortion, name)
 
 
+class LidarFile(BaseModel):
+    """One of several LiDARs in `log.yaml`; its scans are in `lidar/NAME/`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    T_imu_lidar: Matrix4 = Field(description="LiDAR to IMU.")
+    is_compensated: bool = Field(False, description="As `lidar_is_compensated`.")
+
+
 class LogFile(SensorConventions):
     """Content of `log.yaml`; axes, units and clocks are those of `SensorConventions`."""
 
@@ -125,6 +135,9 @@ class LogFile(SensorConventions):
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
     T_imu_lidar: Matrix4 = Field(IDENTITY, description="LiDAR to IMU.")
+    lidars: dict[str, LidarFile] = Field(
+        {}, description="Several LiDARs by name, in place of T_imu_lidar; T_camera_lidar is of the first."
+    )
     T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to the only camera.")
     K: Matrix3 | None = Field(None, description="Its intrinsics, px.")
     image_size: tuple[int, int] | None = Field(None, description="Width and height of its images, px.")
@@ -141,6 +154,12 @@ class LogFile(SensorConventions):
     lidar_is_compensated: bool = Field(
         False, description="Scans of four columns are already motion-compensated to their stamp."
     )
+
+    @property
+    def all_lidars(self) -> list[tuple[str, LidarFile]]:
+        """The LiDARs with the names of their folders; the first is the one that all else is relative to."""
+        alone = LidarFile(T_imu_lidar=self.T_imu_lidar, is_compensated=self.lidar_is_compensated)
+        return list(self.lidars.items()) or [("", alone)]
 
 
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv (CSV log)"
@@ -165,14 +184,16 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         if repairs.dropped
     ]
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
-    scans, scan_skips = _scans(drive / "lidar", about.lidar_is_compensated)
+    lidars, scan_skips = _lidars(drive / "lidar", about)
     calibration = _calibration(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
     return SensorLog(
         name=shown(drive.name),
         epoch_ns=about.epoch_ns,
         calibration=calibration,
-        scans=scans,
+        scans=lidars[0].scans,
+        lidar=lidars[0].name,
+        others=lidars[1:],
         images=images,
         frame=frame,
         imu=imu,
@@ -199,7 +220,7 @@ def _about(path: Path) -> LogFile:
 
 
 def _calibration(about: LogFile, path: Path) -> Calibration:
-    T_imu_lidar = np.array(about.T_imu_lidar, np.float64)
+    T_imu_lidar = np.array(about.all_lidars[0][1].T_imu_lidar, np.float64)
     given = about.cameras or _only_camera(about, path)
     cameras = [one.camera(T_imu_lidar, name if len(given) > 1 else "") for name, one in given.items()]
     return Calibration(T_imu_lidar, tuple(cameras), np.array(about.p_imu_antenna, np.float64))
@@ -313,6 +334,18 @@ def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, f
     ]
     skips += frames.missing(what, folder, stamps, found.files) + found.skips
     return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
+
+
+def _lidars(folder: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]:
+    """All LiDARs; the only one has no name."""
+    found: list[Lidar] = []
+    skips: list[Skip] = []
+    for name, one in about.all_lidars:
+        scans, lost = _scans(folder / name, one.is_compensated)
+        called = name if len(about.all_lidars) > 1 else ""
+        found.append(Lidar(called, np.array(one.T_imu_lidar, np.float64), scans))
+        skips += lost
+    return tuple(found), skips
 
 
 def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:

@@ -37,9 +37,17 @@ def _values(path: Path, dtype: str) -> NDArray[Any]:
 
 
 def label_files(folder: Path) -> dict[str, Path]:
-    """The label files of a folder by scan name; raises DataError when there are none."""
+    """The label files of a folder by scan name, or, in folders of several LiDARs, by LIDAR/NAME.
+
+    Raises DataError when there are none.
+    """
     found = inside(folder) if is_folder(folder) else []
-    files = {path.stem: path for path in found if path.suffix == ".label"}
+    deeper = [path for lidar in found if lidar.is_dir() for path in inside(lidar)]
+    files = {
+        path.relative_to(folder).with_suffix("").as_posix(): path
+        for path in (*found, *deeper)
+        if path.suffix == ".label"
+    }
     if not files:
         raise DataError(f"{shown(folder)}: no .label files; expected one per scan")
     return files

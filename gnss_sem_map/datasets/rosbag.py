@@ -23,7 +23,7 @@ from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import SUFFIXES, Bag, Messages, bag_files
-from gnss_sem_map.datasets.ros.calibration import calibration_of
+from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.rig import (
     GnssTopic,
@@ -37,7 +37,7 @@ from gnss_sem_map.datasets.ros.stamps import Clock, stamps_of
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
-from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log import Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -81,13 +81,21 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         gnss_skips.append(Skip("samples", shown(drive), str(repairs)))
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
-    scans, scan_skips = _scans(bag, rig, epoch_ns)
+    scans: list[tuple[Scan, ...]] = []
+    for one in rig.lidars.values():
+        found, scan_skips = _scans(bag, one, epoch_ns)
+        scans.append(found)
+        gnss_skips += scan_skips
+    names = list(rig.lidars) if len(scans) > 1 else [""]
+    others = zip(names[1:], other_poses(bag, rig), scans[1:], strict=True)
     images, image_skips = _images(bag, rig, epoch_ns, calibration.cameras)
     return SensorLog(
         name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
         calibration=calibration,
-        scans=scans,
+        scans=scans[0] if scans else (),
+        lidar=names[0],
+        others=tuple(Lidar(*other) for other in others),
         images=images,
         frame=frame,
         imu=samples,
@@ -95,7 +103,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu_noise=rig.imu.noise,
         initial_attitude=attitude,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*gnss_skips, *imu_skips, *calibration_skips, *scan_skips, *image_skips),
+        skips=(*gnss_skips, *imu_skips, *calibration_skips, *image_skips),
     )
 
 
@@ -185,10 +193,7 @@ def _attitude(message: object, topic: str) -> AttitudePrior:
     return AttitudePrior(np.asarray(Rotation.from_quat(quaternion).as_matrix()), np.sqrt(variances))
 
 
-def _scans(bag: Bag, rig: Rig, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
-    if not rig.lidars:
-        return (), []
-    [about] = rig.lidars.values()
+def _scans(bag: Bag, about: LidarTopic, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps)
     _check_times(bag, messages, about)

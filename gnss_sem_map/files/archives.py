@@ -42,6 +42,9 @@ class Archive:
     def __init__(self, path: Path, members: zipfile.ZipFile) -> None:
         self._path, self._members = path, members
 
+    def __contains__(self, name: str) -> bool:
+        return any(entry.filename == f"{name}.npy" for entry in self._members.infolist()[:MOST_MEMBERS])
+
     def array(self, name: str, most_bytes: int = MOST_BYTES) -> Member:
         """Type and shape of an array; raises DataError if it does not exist or is not in numpy's format."""
         entries = {entry.filename: entry for entry in self._members.infolist()[:MOST_MEMBERS]}

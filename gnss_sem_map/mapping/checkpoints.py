@@ -174,7 +174,7 @@ def _files(chunk: MappedChunk) -> Iterator[tuple[str, bytes]]:
         for (x, y), part in by_tile(voxels):
             yield f"{layer}/{x}_{y}.parquet", encode_voxels(part)
     file = io.BytesIO()
-    evidence.write_moving_points(chunk.moving, file)
+    evidence.write_moving_points(chunk.moving, file, chunk.lidar)
     yield MOVING_POINTS, file.getvalue()
     if chunk.keyframes is not None:
         file = io.BytesIO()

@@ -1,8 +1,9 @@
 """One pass over the scans of a drive, chunk by chunk: all points are fused, and those that moved are subtracted.
 
-A chunk is two windows of scans (`dynamics.window_scans`). What moved in it is decided by its own scans, the range
-images of a window of scans before it, and the segments of a window of scans after it. So no chunk depends on what was
-decided elsewhere: the map is the same for any division of the chunks among processes, and after any interruption.
+A chunk is two windows of scans of one LiDAR (`dynamics.window_scans`); the chunks of the first LiDAR come first. What
+moved in it is decided by its own scans, the range images of a window of scans before it, and the segments of a window
+of scans after it. So no chunk depends on what was decided elsewhere: the map is the same for any division of the chunks
+among processes, and after any interruption.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -47,6 +49,8 @@ class MappedChunk:
     """What one chunk of scans says."""
 
     number: int
+    lidar: str
+    """Name of its LiDAR; empty where the drive has but one."""
     static: VoxelMap
     removed: VoxelMap
     """The points that moved; none of them is in `static`."""
@@ -61,7 +65,11 @@ class MappedChunk:
 
 
 def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
-    """The scans of every chunk; the last one has up to a window more, so that every other has a window after it."""
+    """The scans of every chunk; the last of a LiDAR has up to a window more, so that the others have one after them."""
+    return [chunk for one in drive.by_lidar for chunk in _chunks_of(one)]
+
+
+def _chunks_of(drive: Drive) -> list[Sequence[Scan]]:
     scans, window = drive.scans, drive.settings.dynamics.window_scans
     count = 1 + max(0, len(scans) - window) // (WINDOWS * window)
     edges = [*range(0, count * WINDOWS * window, WINDOWS * window), len(scans)]
@@ -76,9 +84,27 @@ def map_chunks(
     What its first window tells of motion is saved in the folder `work`, for the process that maps the chunk before.
     Raises DataError when the stamps of the scans do not increase, or a folder cannot be written.
     """
-    chunks, window = chunks_of(drive), drive.settings.dynamics.window_scans
+    chunks = chunks_of(drive)
+    total, first, done = sum(len(chunks[number]) for number in numbers), 0, 0
+    for one in drive.by_lidar:
+        count = len(_chunks_of(one))
+        here = range(max(numbers.start - first, 0), min(numbers.stop - first, count))
+        if len(here):
+            yield from _map_chunks(one, here, first, folder, work, partial(_ready, progress, done, total))
+            done += sum(len(chunks[first + number]) for number in here)
+        first += count
+
+
+def _ready(progress: Progress, before: int, total: int, done: int) -> None:
+    progress("mapping", before + done, total)
+
+
+def _map_chunks(
+    drive: Drive, numbers: range, first: int, folder: Path, work: Path, ready: Callable[[int], None]
+) -> Iterator[MappedChunk]:
+    """Those of one LiDAR, the first of which has the number `first`; `ready` gets how many scans are done."""
+    chunks, window = _chunks_of(drive), drive.settings.dynamics.window_scans
     start = sum(map(len, chunks[: numbers.start]))
-    total = sum(len(chunks[number]) for number in numbers)
     is_sought = drive.settings.dynamics.enabled
     if is_sought:
         _ = drive.image_rows  # the scans that tell them are kept for their turn
@@ -86,7 +112,7 @@ def map_chunks(
     undecided: _Chunk | None = None
     done = 0
     for number in numbers:
-        chunk = _Chunk(drive, number, folder)
+        chunk = _Chunk(drive, number, first, folder)
         for place, seen in enumerate(_observed(drive, chunks[number], chunk.stats, chunk.put_aside), 1):
             if seen is not None:
                 chunk.add(*seen)
@@ -95,15 +121,15 @@ def map_chunks(
                 before, undecided = undecided.last_images, None
             elif place == window and number > 0 and is_sought:
                 with writing_to(work):
-                    edge_windows.save(chunk.observations, work, number)
+                    edge_windows.save(chunk.observations, work, first + number)
             done += 1
-            progress("mapping", done, total)
+            ready(done)
             if done % RELEASED_EVERY == 0:
                 release_memory()
         undecided = chunk
     if undecided is not None:
         is_followed = numbers.stop < len(chunks) and is_sought
-        after = edge_windows.read(work, numbers.stop, drive.image_rows) if is_followed else []
+        after = edge_windows.read(work, first + numbers.stop, drive.image_rows) if is_followed else []
         if after is None:
             after = _observations(drive, chunks[numbers.stop][:window])
         yield undecided.decided(before, after)
@@ -157,8 +183,8 @@ def _observations(drive: Drive, scans: Sequence[Scan]) -> list[Observation]:
 class _Chunk:
     """A chunk under way: its points in a table, and those that may have moved on disk."""
 
-    def __init__(self, drive: Drive, number: int, folder: Path) -> None:
-        self._drive, self._number, self._folder = drive, number, folder
+    def __init__(self, drive: Drive, number: int, first: int, folder: Path) -> None:
+        self._drive, self._number, self._first, self._folder = drive, number, first, folder
         self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
         self.observations: list[Observation] = []
         self.last_images: list[RangeImage] = []
@@ -204,11 +230,14 @@ class _Chunk:
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if self._drive.from_lidar_odometry else None
         static = self._all.to_map() - gone
-        return MappedChunk(self._number, static, gone, moving, decision.objects, keyframes, self.stats)
+        number = self._first + self._number
+        return MappedChunk(
+            number, self._drive.log.lidar, static, gone, moving, decision.objects, keyframes, self.stats
+        )
 
     def _last_window(self) -> frozenset[int]:
         window = self._drive.settings.dynamics.window_scans
-        return frozenset(scan.number for scan in chunks_of(self._drive)[self._number][-window:])
+        return frozenset(scan.number for scan in _chunks_of(self._drive)[self._number][-window:])
 
     def _waiting(self, number: int) -> Path:
         return self._folder / f"{number}.npy"

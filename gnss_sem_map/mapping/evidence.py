@@ -29,6 +29,7 @@ from gnss_sem_map.voxels.tiles import TiledMap
 
 FOLDER = "evidence"
 MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
+LIDAR, MOST_NAME_BYTES = "lidar", 1 << 10
 MOST_KEYFRAME_BYTES = 10_000 * 70 * WIDTH * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand of 70 rows."""
 FILES_HELD = 2
@@ -50,11 +51,14 @@ class RunEvidence:
     keyframes: Sequence[Path]
     """Files of keyframe scans; none unless the poses come from LiDAR odometry."""
 
-    def moving(self) -> dict[int, NDArray[np.int64]]:
+    def moving(self, lidar: str = "") -> dict[int, NDArray[np.int64]]:
         """Frame number -> indices of the moving points among the usable points of the scan; raises DataError."""
-        return {
-            number: found for path in self.moving_points for number, found in read_moving_points(path).items()
-        }
+        paths = self.moving_points_of(lidar)
+        return {number: found for path in paths for number, found in read_moving_points(path).items()}
+
+    def moving_points_of(self, lidar: str = "") -> list[Path]:
+        """The files of one LiDAR; raises DataError."""
+        return [path for path in self.moving_points if read_lidar(path) == lidar]
 
     @cached_property
     def poses(self) -> dict[Path, NDArray[np.float64]]:
@@ -102,15 +106,19 @@ def write(moving_points: Iterable[bytes], keyframes: Iterable[bytes], run: Path)
             (run / FOLDER / name / f"{number}.npz").write_bytes(content)
 
 
-def write_moving_points(moving: Mapping[int, NDArray[np.int64]], file: Path | BinaryIO) -> None:
-    """Write the indices of the moving points of every frame; raises OSError."""
+def write_moving_points(
+    moving: Mapping[int, NDArray[np.int64]], file: Path | BinaryIO, lidar: str = ""
+) -> None:
+    """Write the indices of the moving points of every frame, and the name of their LiDAR; raises OSError."""
     frames = sorted(moving)
+    named = {LIDAR: np.array([lidar])} if lidar else {}
     indices = [moving[number] for number in frames]
     _write(
         file,
         frames=np.array(frames, np.int64),
         counts=np.array([len(some) for some in indices], np.int64),
         places=np.concatenate([*indices, np.empty(0, np.int64)]).astype(np.int32),
+        **named,
     )
 
 
@@ -143,6 +151,12 @@ def _numbered(folder: Path) -> list[Path]:
         return []
     paths = [path for path in folder.iterdir() if path.suffix == ".npz" and path.stem.isdecimal()]
     return sorted(paths, key=lambda path: int(path.stem))
+
+
+def read_lidar(path: Path) -> str:
+    """The name of the LiDAR of a file of moving points, empty for the only one; raises DataError."""
+    with open_archive(path) as archive:
+        return str(archive.array(LIDAR, MOST_NAME_BYTES).read()[0]) if LIDAR in archive else ""
 
 
 def read_moving_points(path: Path) -> dict[int, NDArray[np.int64]]:

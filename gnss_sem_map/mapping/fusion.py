@@ -50,7 +50,7 @@ def map_scans(
     `work` cannot be written or holds something else.
     """
     _warn(drive, stats)
-    chunks, total = chunks_of(drive), len(drive.log.scans)
+    chunks, total = chunks_of(drive), drive.log.scan_count
     voxel_size_m = drive.settings.mapping.voxel_size_m
     store = open_store(
         work, fingerprint(drive, labels_from), len(chunks), resume, voxel_size_m, drive.label_set
@@ -102,9 +102,12 @@ def _warn(drive: Drive, stats: RunStats) -> None:
         stats.warnings.append("no segmenter: the map shows geometry only")
     elif not drive.log.cameras:
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
-    if drive.settings.dynamics.enabled and drive.is_too_sparse:
+    for one in drive.by_lidar if drive.settings.dynamics.enabled else ():
+        if not one.is_too_sparse:
+            continue
+        of = f" of {one.log.lidar}" if one.log.lidar else ""
         stats.warnings.append(
-            f"{drive.log.name}: the points of its scans are too far apart to tell what they see through: hardly any"
+            f"{drive.log.name}: the points of its scans{of} are too far apart to tell what they see through: hardly any"
             " moving object is found, and hardly any voxel is cleared"
         )
 
@@ -112,7 +115,7 @@ def _warn(drive: Drive, stats: RunStats) -> None:
 def _check(drive: Drive, stats: RunStats) -> None:
     if not stats.counts["scans"]:
         why = _first_reason(stats, "scan")
-        raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
+        raise DataError(f"{drive.log.name}: none of {drive.log.scan_count} scans can be used{why}")
     if drive.segmenter is not None and drive.log.cameras and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
         stats.warnings.append(f"no point got a label, and the map shows geometry only{why}")
@@ -135,7 +138,7 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
         log.name, labels_from, list(names), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
-        [(scan.name, scan.number, scan.stamp, state_of(scan)) for scan in log.scans],
+        [(one.lidar, scan.name, scan.number, scan.stamp, state_of(scan)) for one in log.by_lidar for scan in one.scans],
         [(image.camera, image.number, image.stamp, state_of(image)) for image in log.images], _states(labels_from),
         [(camera.name, camera.image_size, camera.time_offset_s) for camera in log.calibration.cameras],
     ]  # fmt: skip
@@ -185,7 +188,8 @@ def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
     learnt = sensor_model.opened(drive.settings.calibration, open_label_set(drive.settings.classes))
     if learnt is not None:
         yield learnt.log_likelihoods
-    yield from (trajectory.stamps, trajectory.T_map_imu, calibration.T_imu_lidar)
+    yield from (trajectory.stamps, trajectory.T_map_imu)
+    yield from (one.calibration.T_imu_lidar for one in drive.log.by_lidar)
     for camera in calibration.cameras:
         yield from (camera.T_camera_lidar, camera.K, camera.lens)
     if trajectory.velocities is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -62,6 +62,12 @@ class Drive:
     def label_set(self) -> LabelSet:
         """The classes of the map."""
         return open_label_set(self.settings.classes)
+
+    @cached_property
+    def by_lidar(self) -> tuple[Drive, ...]:
+        """The drive once for each of its LiDARs, with its scans alone."""
+        logs = self.log.by_lidar
+        return (self,) if len(logs) == 1 else tuple(replace(self, log=log) for log in logs)
 
     @property
     def image_rows(self) -> Rows:
@@ -152,14 +158,14 @@ def _see(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
         )  # fmt: skip
     except MeasurementError as error:
-        stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+        stats.skips.append(Skip("scan", f"frame {log.frame_of(scan)}", str(error)))
         return None
     count = kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, valid, keys, heights, at,
     )  # fmt: skip
     if count == 0:
-        stats.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
+        stats.skips.append(Skip("scan", f"frame {log.frame_of(scan)}", f"no usable point of {n}"))
         return None
     p_map = at[: 3 * count].reshape(-1, 3)
     pixels, classes = pooled(
@@ -249,7 +255,7 @@ class _Read:
         try:
             points = scan.read()
         except DataError as error:
-            self._stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
+            self._stats.skips.append(Skip("scan", f"frame {self._log.frame_of(scan)}", str(error)))
             return None, []
         if self._segmenter is None:
             return points, []
@@ -260,7 +266,9 @@ class _Read:
         image = self._log.image_at(scan.stamp, self._within_s, camera.name)
         if image is None:
             of = f" of {camera.name}" if camera.name else ""
-            self._stats.skips.append(Skip("labels", f"frame {scan.number}", f"no image{of} near its stamp"))
+            self._stats.skips.append(
+                Skip("labels", f"frame {self._log.frame_of(scan)}", f"no image{of} near its stamp")
+            )
             return None
         try:
             seen = segmenter.kept(image) if isinstance(segmenter, KeepsLabels) else segmenter(image)

@@ -282,24 +282,28 @@ def write_point_labels(
     """Write for every original point: class before and after refinement, confidence, and whether it was removed.
 
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
-    `known_raw`: a folder with the labels before refinement, which are copied. `run`: the folder of the maps, if it is
-    another one.
+    Of several LiDARs, each has a folder of its name. `known_raw`: a folder with the labels before refinement, which are
+    copied. `run`: the folder of the maps, if it is another one.
     """
     for name in LABELS:
-        (folder / name).mkdir()
+        for one in log.by_lidar:
+            (folder / name / one.lidar).mkdir(parents=True, exist_ok=True)
     if known_raw is not None:
         shutil.copytree(known_raw, folder / RAW_LABELS, dirs_exist_ok=True)
     label_set = open_label_set(settings.classes)
     ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
     places = [(run or folder) / name for name in (MAP, REFINED)[known_raw is not None :]]
     maps = [tiles.open_map(place, label_set) for place in places]
-    moving = evidence.read(folder, label_set).moving_points
-    for scan, (*raw, refined) in label_points(log, trajectory, maps, settings, moving, kerbs):
-        if raw:
-            ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{scan.name}.label")
-        ids[refined.labels].tofile(folder / "labels" / f"{scan.name}.label")
-        refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{scan.name}.bin")
-        refined.removed.astype("<u4").tofile(folder / "removed" / f"{scan.name}.label")
+    beside = evidence.read(folder, label_set)
+    for one in log.by_lidar:
+        moving = beside.moving_points_of(one.lidar)
+        for scan, (*raw, refined) in label_points(one, trajectory, maps, settings, moving, kerbs):
+            place = Path(one.lidar) / scan.name
+            if raw:
+                ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{place}.label")
+            ids[refined.labels].tofile(folder / "labels" / f"{place}.label")
+            refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{place}.bin")
+            refined.removed.astype("<u4").tofile(folder / "removed" / f"{place}.label")
 
 
 def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:

@@ -7,6 +7,7 @@ stamp, or by the frame number in the file name, never by their position in a lis
 from __future__ import annotations
 
 import bisect
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.sensor_log.cameras import Camera, is_rigid
+from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
@@ -146,6 +147,17 @@ class Calibration:
         return {camera.name: camera.image_size for camera in self.cameras}
 
 
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """One LiDAR of several."""
+
+    name: str
+    T_imu_lidar: NDArray[np.float64]
+    """(4, 4)."""
+    scans: tuple[Scan, ...]
+    """Sorted by stamp."""
+
+
 @dataclass(frozen=True)
 class Skip:
     """Something that is missing or not usable, and was skipped."""
@@ -166,7 +178,7 @@ class SensorLog:
     """Unix time of stamp zero."""
     calibration: Calibration
     scans: tuple[Scan, ...]
-    """Sorted by stamp."""
+    """Of the LiDAR that all else is relative to, sorted by stamp; `by_lidar` has those of the others."""
     images: tuple[Image, ...]
     """Of all cameras, sorted by stamp; empty for a drive without a camera."""
     frame: LocalFrame | None = None
@@ -186,9 +198,24 @@ class SensorLog:
     skips: tuple[Skip, ...] = ()
     conventions: SensorConventions | None = field(default_factory=SensorConventions)
     """Axes, units and clocks of the drive's sensors, as the drive declares them; None: all are ours."""
+    lidar: str = ""
+    """Name of the LiDAR of `scans`; empty where the log has but one."""
+    others: tuple[Lidar, ...] = ()
+    """More LiDARs."""
 
     def __post_init__(self) -> None:
+        names = [self.lidar, *(lidar.name for lidar in self.others)]
+        if (
+            len(set(names)) < len(names)
+            or not all(re.fullmatch(NAME, name) for name in names)
+            or (self.others and "" in names)
+        ):
+            raise DataError(
+                f"{self.name}: found LiDARs {names}, expected names of letters, digits, _ and -, all different"
+            )
         stamps = {"scans": [scan.stamp for scan in self.scans]}
+        for lidar in self.others:
+            stamps[f"scans of {lidar.name}"] = [scan.stamp for scan in lidar.scans]
         for name, found in self._image_stamps.items():
             stamps[f"images of {name}" if name else "images"] = found
         for what, some in stamps.items():
@@ -202,7 +229,9 @@ class SensorLog:
     @property
     def folders(self) -> set[Path]:
         """Folders of the files of scans and images; of a bag, which holds many of them, its files."""
-        counts = Counter(file for items in (self.scans, self.images) for file in map(file_of, items))
+        items: list[Scan | Image] = [*self.scans, *self.images]
+        items += [scan for lidar in self.others for scan in lidar.scans]
+        counts = Counter(map(file_of, items))
         return {file.parent if count == 1 else file for file, count in counts.items() if file is not None}
 
     def between(self, frames: str | None) -> SensorLog:
@@ -213,7 +242,7 @@ class SensorLog:
         if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):
             raise ConfigError(f"frames: found {frames!r}, expected A:B with frame numbers")
         low, high = int(first or 0), int(last) if last else float("inf")
-        return replace(self, scans=tuple(scan for scan in self.scans if low <= scan.number < high))
+        return self._with_scans(lambda scans: tuple(scan for scan in scans if low <= scan.number < high))
 
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
         """The same log in our axes, units and clock; chosen conventions have priority over those of the drive."""
@@ -221,14 +250,45 @@ class SensorLog:
             return self
         theirs = chosen.over(self.conventions)
         offset = theirs.lidar_time_offset_s or 0.0
+        late = (
+            self._with_scans(lambda scans: tuple(_later(scan, offset) for scan in scans)) if offset else self
+        )
         return replace(
-            self,
+            late,
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
             gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
             wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
-            scans=self.scans if offset == 0.0 else tuple(_later(scan, offset) for scan in self.scans),
             conventions=None,
         )
+
+    def _with_scans(self, change: Callable[[tuple[Scan, ...]], tuple[Scan, ...]]) -> SensorLog:
+        others = tuple(replace(lidar, scans=change(lidar.scans)) for lidar in self.others)
+        return replace(self, scans=change(self.scans), others=others)
+
+    def frame_of(self, scan: Scan) -> str:
+        """The number of a scan in words, with its LiDAR where there are several."""
+        return f"{scan.number} of {self.lidar}" if self.lidar else str(scan.number)
+
+    @property
+    def scan_count(self) -> int:
+        """Number of the scans of all LiDARs."""
+        return sum(len(log.scans) for log in self.by_lidar)
+
+    @cached_property
+    def by_lidar(self) -> tuple[SensorLog, ...]:
+        """The same log once for each LiDAR, with its scans alone: this one where it has but one."""
+        if not self.others:
+            return (self,)
+        return (replace(self, others=()), *(self._of(lidar) for lidar in self.others))
+
+    def _of(self, lidar: Lidar) -> SensorLog:
+        T_first_lidar = np.linalg.inv(self.calibration.T_imu_lidar) @ lidar.T_imu_lidar
+        cameras = tuple(
+            replace(camera, T_camera_lidar=camera.T_camera_lidar @ T_first_lidar)
+            for camera in self.calibration.cameras
+        )
+        calibration = replace(self.calibration, T_imu_lidar=lidar.T_imu_lidar, cameras=cameras)
+        return replace(self, lidar=lidar.name, scans=lidar.scans, calibration=calibration, others=())
 
     @property
     def cameras(self) -> tuple[Camera, ...]:

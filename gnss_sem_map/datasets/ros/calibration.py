@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, Rig, matrix
+from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, LidarTopic, Rig, matrix
 from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
@@ -29,11 +29,9 @@ def calibration_of(bag: Bag, rig: Rig) -> tuple[Calibration, list[Skip]]:
     antenna, skips = _antenna(bag, rig.gnss, imu, transforms)
     if not rig.lidars:
         return Calibration(np.eye(4), p_imu_antenna=antenna), skips
-    [lidar] = rig.lidars.values()
+    lidar = next(iter(rig.lidars.values()))
     frame = lidar.frame or _frame_in(bag, lidar.topic)
-    T_imu_lidar = matrix(lidar.T_imu_lidar)
-    if T_imu_lidar is None:
-        T_imu_lidar = _found(bag, transforms, imu, frame, "T_imu_lidar")
+    T_imu_lidar = lidar_pose(bag, lidar, imu, transforms)
     cameras = []
     for name, camera in rig.cameras.items():
         K, size, T_shift, distortion = _intrinsics(bag, camera)
@@ -48,6 +46,25 @@ def calibration_of(bag: Bag, rig: Rig) -> tuple[Calibration, list[Skip]]:
         called = name if len(rig.cameras) > 1 else ""
         cameras.append(Camera(T_camera_lidar, K, size, camera.time_offset_s, distortion, called))
     return Calibration(T_imu_lidar, tuple(cameras), antenna), skips
+
+
+def lidar_pose(bag: Bag, lidar: LidarTopic, imu: str, transforms: StaticTransforms) -> Array:
+    """T_imu_lidar (4, 4) by rig.yaml, else by the transforms; raises DataError for one that is nowhere."""
+    T_imu_lidar = matrix(lidar.T_imu_lidar)
+    if T_imu_lidar is not None:
+        return T_imu_lidar
+    return _found(bag, transforms, imu, lidar.frame or _frame_in(bag, lidar.topic), "T_imu_lidar")
+
+
+def other_poses(bag: Bag, rig: Rig) -> list[Array]:
+    """T_imu_lidar (4, 4) of every LiDAR but the first, which is in the calibration."""
+    assert rig.imu is not None
+    lidars = list(rig.lidars.values())[1:]
+    if not lidars:
+        return []
+    transforms = read_static_transforms(bag)
+    imu = rig.imu.frame or _frame_in(bag, rig.imu.topic)
+    return [lidar_pose(bag, lidar, imu, transforms) for lidar in lidars]
 
 
 def _frame_in(bag: Bag, topic: str) -> str:

@@ -91,11 +91,6 @@ def _only(bag: Bag, sensor: str, key: str) -> str | None:
 
 
 def _check(bag: Bag, rig: Rig) -> None:
-    if len(rig.lidars) > 1:
-        raise DataError(
-            f"rig.yaml: names {len(rig.lidars)} LiDARs: {', '.join(rig.lidars)}; one is used as yet; leave the others"
-            " out"
-        )
     named: list[tuple[str, str, str | None]] = [
         *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
         *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),

@@ -239,7 +239,7 @@ store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_s
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),
-    lambda: store.write(MappedChunk(0, written.voxels, written.voxels - written.voxels, {}, (), None, RunStats())),
+    lambda: store.write(MappedChunk(0, "", written.voxels, written.voxels - written.voxels, {}, (), None, RunStats())),
 ):
     try:
         attempt()

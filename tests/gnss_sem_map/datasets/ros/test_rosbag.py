@@ -268,9 +268,17 @@ def test_the_rig_says_which_of_several_lidars(tmp_path: Path) -> None:
         open_drive(bag)
     rig_yaml(bag, lidars={"rear": {"topic": "/rear/points"}})
     assert len(open_drive(bag).scans) == 1
-    rig_yaml(bag, lidars={"rear": {"topic": "/rear/points"}, "front": {"topic": "/points"}})
-    with pytest.raises(DataError, match=r"names 2 LiDARs: rear, front; one is used as yet"):
-        open_drive(bag)
+    T = np.eye(4)
+    T[:3, 3] = 1.5, 0.0, 0.9
+    rear = {"topic": "/rear/points", "T_imu_lidar": T.tolist()}
+    rig_yaml(bag, lidars={"front": {"topic": "/points"}, "rear": rear})
+    log = open_drive(bag)
+    assert (log.lidar, len(log.scans)) == ("front", 10)
+    np.testing.assert_allclose(log.calibration.T_imu_lidar[:3, 3], [1.0, 0.0, 0.5])
+    (other,) = log.others
+    assert (other.name, len(other.scans)) == ("rear", 1)
+    np.testing.assert_array_equal(other.T_imu_lidar, T)
+    assert len(other.scans[0].read().xyz) == 5
 
 
 def test_a_rig_may_say_the_poses_itself(tmp_path: Path) -> None:

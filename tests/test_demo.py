@@ -68,7 +68,7 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
 
 
 WITHOUT_TORCH = """
-import sys
+import importlib.util, sys
 
 class Absent:
     def find_spec(self, name, *_):
@@ -76,17 +76,30 @@ class Absent:
             raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
 sys.meta_path.insert(0, Absent())
+find_spec = importlib.util.find_spec
+importlib.util.find_spec = lambda name: None if name == "torch" else find_spec(name)
 from gnss_sem_map.cli import main
 main()
 """
 
 
+def demo_without_torch(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WITHOUT_TORCH, "demo", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", WITHOUT_TORCH, "demo", "-o", str(tmp_path / "demo")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = demo_without_torch("-o", tmp_path / "demo", "--labels", "network")
     assert done.returncode == 1
     assert "torch is not installed; in the clone: pip install -e '.[segmentation]'" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_torch_the_demo_takes_corrupted_labels_and_says_so(tmp_path: Path) -> None:
+    done = demo_without_torch("-o", tmp_path / "demo", "--seconds", "3")
+    assert done.returncode == 0, done.stderr
+    assert "torch and safetensors are not installed: the demo takes corrupted true labels" in done.stderr
+    assert "true class images, corrupted" in done.stdout
 
 
 def test_the_corrupted_truth_can_stand_in_for_the_network(

@@ -68,10 +68,12 @@ def test_the_suggested_rig_has_all_that_may_be_a_sensor(tmp_path: Path) -> None:
     bag = Bag(path)
     text = suggested_rig(bag, contents_of(bag))
     (path / "rig.yaml").write_text(text)
-    with pytest.raises(DataError, match="names 2 LiDARs: lidar, rear"):
-        open_drive(path)
+    both = open_drive(path)
+    assert (both.lidar, len(both.scans)) == ("lidar", 10)
+    assert [(other.name, len(other.scans)) for other in both.others] == [("rear", 1)]
     (path / "rig.yaml").write_text(text.replace("  rear:\n    topic: /rear/points\n", ""))
-    assert len(open_drive(path).scans) == 10
+    alone = open_drive(path)
+    assert (len(alone.scans), alone.others) == (10, ())
 
 
 def test_the_command_writes_a_rig_once(tmp_path: Path) -> None:

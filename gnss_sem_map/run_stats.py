@@ -20,6 +20,11 @@ def silent(stage: str, done: int, total: int) -> None:
     """Progress that is not shown."""
 
 
+def shifted(progress: Progress, done: int, total: int) -> Progress:
+    """The progress of a part, told as that of a whole of which so many steps were done before."""
+    return lambda stage, more, _: progress(stage, done + more, total)
+
+
 @dataclass
 class RunStats:
     """Statistics of a run: counts, skips, warnings, and time and memory of every stage."""

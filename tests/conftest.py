@@ -13,6 +13,10 @@ import pytest
 import street
 from declared import DATA, absent
 
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.runs.source import Source, source_of
+from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Simulation
 
 TESTS = Path(__file__).parent
@@ -90,6 +94,25 @@ def _refused(what: str) -> Callable[..., NoReturn]:
 def small_drive(tmp_path_factory: pytest.TempPathFactory) -> street.Street:
     """A dozen scans of the analytic street, written as a KITTI raw drive; read only."""
     return street.write(tmp_path_factory.mktemp("street"))
+
+
+@pytest.fixture(scope="session")
+def small_source(small_drive: street.Street) -> Source:
+    """The small drive as workers open it."""
+    return source_of(small_drive.drive)
+
+
+@pytest.fixture(scope="session")
+def small_log(small_source: Source) -> SensorLog:
+    """The log of the small drive."""
+    return open_drive(small_source.drive)
+
+
+@pytest.fixture(scope="session")
+def small_track(small_log: SensorLog) -> Trajectory:
+    """The poses of its navigation unit."""
+    assert small_log.reference is not None
+    return small_log.reference
 
 
 @pytest.fixture(scope="session")

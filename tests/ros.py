@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -233,3 +234,16 @@ def _write(writer: Any, store: Any, messages: Iterable[Message], is_ros1: bool) 
             connections[topic] = writer.add_connection(topic, kind, typestore=store)
         data = store.serialize_ros1(message, kind) if is_ros1 else store.serialize_cdr(message, kind)
         writer.write(connections[topic], ns, data)
+
+
+def rig_yaml(bag: Path, **about: object) -> None:
+    """Write a rig.yaml for a bag."""
+    (bag / "rig.yaml" if bag.is_dir() else bag.parent / "rig.yaml").write_text(json.dumps(about))
+
+
+def with_camera(**info: Any) -> Rig:
+    """A good rig with a camera beside the LiDAR."""
+    rig = drive()
+    rig.transforms(("lidar", "camera", (0.0, 0.1, 0.2)))
+    rig.info(START_NS, **info)
+    return rig

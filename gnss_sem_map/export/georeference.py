@@ -14,6 +14,7 @@ from pyproj.crs import CompoundCRS, VerticalCRS
 from pyproj.exceptions import CRSError, ProjError
 
 from factor_graphs.geodesy import LocalFrame
+from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError
 
 WGS84_EPSG = 4326
@@ -34,6 +35,11 @@ class Georeference:
     frame: LocalFrame
     epsg: int | None = None
     geoid: Path | None = None
+
+    @classmethod
+    def of(cls, frame: LocalFrame, delivery: DeliverySettings) -> Georeference:
+        """The coordinates that are set for the files of a map with this frame."""
+        return cls(frame, delivery.crs, delivery.geoid)
 
     def __post_init__(self) -> None:
         origin = self.frame.lat_deg, self.frame.lon_deg

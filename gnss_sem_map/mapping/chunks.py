@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,7 +29,7 @@ from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
 from gnss_sem_map.mapping.waiting_points import WaitingPoints
 from gnss_sem_map.memory import release_memory
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
@@ -90,21 +89,18 @@ def map_chunks(
         count = len(_chunks_of(one))
         here = range(max(numbers.start - first, 0), min(numbers.stop - first, count))
         if len(here):
-            yield from _map_chunks(one, here, first, folder, work, partial(_ready, progress, done, total))
+            yield from _map_chunks(one, here, first, folder, work, shifted(progress, done, total))
             done += sum(len(chunks[first + number]) for number in here)
         first += count
 
 
-def _ready(progress: Progress, before: int, total: int, done: int) -> None:
-    progress("mapping", before + done, total)
-
-
 def _map_chunks(
-    drive: Drive, numbers: range, first: int, folder: Path, work: Path, ready: Callable[[int], None]
+    drive: Drive, numbers: range, first: int, folder: Path, work: Path, progress: Progress
 ) -> Iterator[MappedChunk]:
-    """Those of one LiDAR, the first of which has the number `first`; `ready` gets how many scans are done."""
+    """Those of one LiDAR, whose first chunk has the number `first` in the drive."""
     chunks, window = _chunks_of(drive), drive.settings.dynamics.window_scans
     start = sum(map(len, chunks[: numbers.start]))
+    total = sum(len(chunks[number]) for number in numbers)
     is_sought = drive.settings.dynamics.enabled
     if is_sought:
         _ = drive.image_rows  # the scans that tell them are kept for their turn
@@ -123,7 +119,7 @@ def _map_chunks(
                 with writing_to(work):
                     edge_windows.save(chunk.observations, work, first + number)
             done += 1
-            ready(done)
+            progress("mapping", done, total)
             if done % RELEASED_EVERY == 0:
                 release_memory()
         undecided = chunk

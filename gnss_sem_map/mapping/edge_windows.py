@@ -30,7 +30,7 @@ def save(observations: Sequence[Observation], work: Path, chunk: int) -> None:
     """Save the observations of the first window of a chunk in the work folder of a run; raises OSError."""
     file = io.BytesIO()
     arrays = {f"{n}/{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
-    np.savez(file, **arrays)  # type: ignore[arg-type]
+    np.savez(file, **arrays)
     (work / EDGES).mkdir(exist_ok=True)
     write_whole(_file(work, chunk), file.getvalue())
 
@@ -51,7 +51,7 @@ def _file(work: Path, chunk: int) -> Path:
     return work / EDGES / f"{chunk}.npz"
 
 
-def _arrays(one: Observation) -> dict[str, NDArray[Any]]:
+def _arrays(one: Observation) -> dict[str, Any]:
     seen, segments = one.seen, one.segments
     parts = {field.name: getattr(segments.parts, field.name) for field in fields(PointSets)}
     return parts | {

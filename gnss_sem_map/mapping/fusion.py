@@ -25,7 +25,7 @@ from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks, writing_to
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
 
 Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
@@ -64,7 +64,7 @@ def map_scans(
             progress("mapping", done, total)
     else:
         for numbers in ranges(pending, len(chunks)):
-            map_range(drive, store, numbers, _shifted(progress, done, total))
+            map_range(drive, store, numbers, shifted(progress, done, total))
             done += sum(len(chunks[number]) for number in numbers)
     for record in store.records():
         stats.counts.update(record["counts"])
@@ -124,10 +124,6 @@ def _check(drive: Drive, stats: RunStats) -> None:
 def _first_reason(stats: RunStats, what: str) -> str:
     """The reason of the first skip of this kind, as the end of a sentence; empty without skips."""
     return next((f"; first reason: {s.where}: {s.reason}" for s in stats.skips if s.what == what), "")
-
-
-def _shifted(progress: Progress, done: int, total: int) -> Progress:
-    return lambda stage, more, _: progress(stage, done + more, total)
 
 
 def fingerprint(drive: Drive, labels_from: str) -> str:

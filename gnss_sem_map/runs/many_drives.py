@@ -117,9 +117,7 @@ def run_drives(
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
-        Georeference(
-            frame, settings.delivery.crs, settings.delivery.geoid
-        )  # refuses what cannot be delivered
+        Georeference.of(frame, settings.delivery)  # refuses what cannot be delivered
         sources = [how.source(drive) for drive in drives]
         file = _begin(claim, settings, how)
         tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
@@ -279,12 +277,7 @@ def _write(
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
-            write_changes(
-                changes,
-                Georeference(frame, settings.delivery.crs, settings.delivery.geoid),
-                label_set,
-                folder,
-            )
+            write_changes(changes, Georeference.of(frame, settings.delivery), label_set, folder)
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],

@@ -98,11 +98,9 @@ def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings,
 
 def _packed(found: Found | None) -> Any:
     """As JSON, in which numbers keep all their digits."""
-    return (
-        None
-        if found is None
-        else [found.T.tolist(), found.covariance.tolist(), [a.tolist() for a in found.sample]]
-    )
+    if found is None:
+        return None
+    return [found.T.tolist(), found.covariance.tolist(), [a.tolist() for a in found.sample]]
 
 
 def _unpacked(packed: Any) -> Found | None:

@@ -185,7 +185,7 @@ def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeferenc
     """Coordinates of the files of a map with this frame; raises ConfigError, so ask it before the work."""
     delivery = settings.delivery
     check_delivery(delivery.crs, delivery.geoid)
-    return None if frame is None else Georeference(frame, delivery.crs, delivery.geoid)
+    return None if frame is None else Georeference.of(frame, delivery)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:

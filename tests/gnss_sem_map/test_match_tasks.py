@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from street import Street
 
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
-from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import clear
 from gnss_sem_map.mapping.execution import Executor, InProcess
@@ -20,7 +18,7 @@ from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import silent
 from gnss_sem_map.runs import match_tasks
 from gnss_sem_map.runs.match_tasks import SavedMatches
-from gnss_sem_map.runs.source import Source, source_of
+from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_scans, sections_of
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -29,26 +27,10 @@ MATCHING = SETTINGS.trajectory.scan_matching
 
 
 @pytest.fixture(scope="module")
-def source(small_drive: Street) -> Source:
-    return source_of(small_drive.drive)
-
-
-@pytest.fixture(scope="module")
-def log(source: Source) -> SensorLog:
-    return open_drive(source.drive)
-
-
-@pytest.fixture(scope="module")
-def guess(log: SensorLog) -> Trajectory:
-    assert log.reference is not None
-    return log.reference
-
-
-@pytest.fixture(scope="module")
-def expected(log: SensorLog, guess: Trajectory) -> ScanMatches:
-    found = match_scans(log, guess, MATCHING)
+def expected(small_log: SensorLog, small_track: Trajectory) -> ScanMatches:
+    found = match_scans(small_log, small_track, MATCHING)
     assert found.counts["scans matched"] > 3
-    assert len(sections_of(len(log.scans), MATCHING)) > 1
+    assert len(sections_of(len(small_log.scans), MATCHING)) > 1
     return found
 
 
@@ -61,23 +43,28 @@ def assert_same(found: ScanMatches, expected: ScanMatches) -> None:
 
 @pytest.mark.parametrize("executor", [None, InProcess()])
 def test_what_is_saved_comes_back(
-    log: SensorLog,
-    guess: Trajectory,
+    small_log: SensorLog,
+    small_track: Trajectory,
     expected: ScanMatches,
-    source: Source,
+    small_source: Source,
     tmp_path: Path,
     executor: Executor | None,
 ) -> None:
-    assert_same(SavedMatches(source, tmp_path / "w", executor)(log, guess, SETTINGS, silent), expected)
+    assert_same(
+        SavedMatches(small_source, tmp_path / "w", executor)(small_log, small_track, SETTINGS, silent),
+        expected,
+    )
     clear(tmp_path / "w")
     assert not (tmp_path / "w").exists()
 
 
 @pytest.mark.integration
 def test_processes_find_the_same(
-    log: SensorLog, guess: Trajectory, expected: ScanMatches, source: Source, tmp_path: Path
+    small_log: SensorLog, small_track: Trajectory, expected: ScanMatches, small_source: Source, tmp_path: Path
 ) -> None:
-    assert_same(SavedMatches(source, tmp_path, Processes(2))(log, guess, SETTINGS, silent), expected)
+    assert_same(
+        SavedMatches(small_source, tmp_path, Processes(2))(small_log, small_track, SETTINGS, silent), expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,11 +72,11 @@ def test_processes_find_the_same(
     [("1.npz", b""), ("1.npz", b"no archive"), ("1.json", b"[]"), ("1.json", b"{"), ("1.json", b"{}")],
 )
 def test_an_interrupted_run_matches_only_what_is_missing_or_damaged(
-    log: SensorLog, guess: Trajectory, expected: ScanMatches, source: Source, tmp_path: Path,
+    small_log: SensorLog, small_track: Trajectory, expected: ScanMatches, small_source: Source, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch, file: str, damage: bytes,
 ) -> None:  # fmt: skip
-    match = SavedMatches(source, tmp_path, resume=True)
-    match(log, guess, SETTINGS, silent)
+    match = SavedMatches(small_source, tmp_path, resume=True)
+    match(small_log, small_track, SETTINGS, silent)
     (tmp_path / "matches" / file).write_bytes(damage)
     matched: list[int] = []
     save = match_tasks._save
@@ -99,28 +86,28 @@ def test_an_interrupted_run_matches_only_what_is_missing_or_damaged(
         save(found, folder, number, fingerprint)
 
     monkeypatch.setattr(match_tasks, "_save", noted)
-    assert_same(match(log, guess, SETTINGS, silent), expected)
+    assert_same(match(small_log, small_track, SETTINGS, silent), expected)
     assert matched == [1]
     matched.clear()
     again = replace(match, resume=False)
-    assert_same(again(log, guess, SETTINGS, silent), expected)
-    assert matched == list(range(len(sections_of(len(log.scans), MATCHING))))
+    assert_same(again(small_log, small_track, SETTINGS, silent), expected)
+    assert matched == list(range(len(sections_of(len(small_log.scans), MATCHING))))
 
 
 def test_matches_of_another_first_trajectory_are_not_taken(
-    log: SensorLog, guess: Trajectory, source: Source, tmp_path: Path
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path
 ) -> None:
-    match = SavedMatches(source, tmp_path, resume=True)
-    match(log, guess, SETTINGS, silent)
-    T = guess.T_map_imu.copy()
-    T[:, 0, 3] += 0.01 * (guess.stamps - guess.start)
-    moved = Trajectory(guess.stamps, T)
-    assert_same(match(log, moved, SETTINGS, silent), match_scans(log, moved, MATCHING))
+    match = SavedMatches(small_source, tmp_path, resume=True)
+    match(small_log, small_track, SETTINGS, silent)
+    T = small_track.T_map_imu.copy()
+    T[:, 0, 3] += 0.01 * (small_track.stamps - small_track.start)
+    moved = Trajectory(small_track.stamps, T)
+    assert_same(match(small_log, moved, SETTINGS, silent), match_scans(small_log, moved, MATCHING))
 
 
 def test_a_worker_that_finds_another_drive_says_so(
-    log: SensorLog, guess: Trajectory, source: Source, tmp_path: Path
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path
 ) -> None:
-    shorter = replace(log, scans=log.scans[:-1])
+    shorter = replace(small_log, scans=small_log.scans[:-1])
     with pytest.raises(DataError, match="a worker finds another drive"):
-        SavedMatches(source, tmp_path, InProcess())(shorter, guess, SETTINGS, silent)
+        SavedMatches(small_source, tmp_path, InProcess())(shorter, small_track, SETTINGS, silent)

@@ -5,30 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from street import Street
 
 from gnss_sem_map.config import Settings
-from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.trajectory import locate, smooth_log
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.sensor_log import Points, SensorLog
 
 
-@pytest.fixture(scope="module")
-def log(small_drive: Street) -> SensorLog:
-    return open_drive(small_drive.drive)
-
-
-def test_a_drive_of_which_no_scan_matches_is_smoothed_in_full(log: SensorLog) -> None:
+def test_a_drive_of_which_no_scan_matches_is_smoothed_in_full(small_log: SensorLog) -> None:
     def damaged() -> Points:
         raise DataError("this scan is damaged")
 
     settings = Settings()
-    blind = replace(log, scans=tuple(replace(scan, read=damaged) for scan in log.scans))
+    blind = replace(small_log, scans=tuple(replace(scan, read=damaged) for scan in small_log.scans))
     found = locate(blind, settings, RunStats())
-    expected = smooth_log(log, settings.trajectory)
+    expected = smooth_log(small_log, settings.trajectory)
     assert found.solution is not None
     assert not found.from_lidar_odometry
     np.testing.assert_array_equal(found.trajectory.T_map_imu, expected.trajectory.T_map_imu)

@@ -1,0 +1,236 @@
+"""What is wrong with a bag is said in one line, with what to do."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ros
+from ros import START_NS, rig_yaml, sweep, with_camera
+
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import DataError, PointTimesError
+
+TIMES = np.linspace(-0.05, 0.05, 64)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ros.write(tmp_path_factory.mktemp("plain") / "drive", ros.drive())
+
+
+def damaged(bag: Path, change: Callable[[bytearray], bytes | bytearray]) -> None:
+    file = bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
+    file.write_bytes(change(bytearray(file.read_bytes())))
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3", "bag"])
+def test_a_truncated_bag_is_refused_with_its_repair(tmp_path: Path, storage: str) -> None:
+    name = "drive.bag" if storage == "bag" else "drive"
+    bag = ros.write(tmp_path / name, ros.drive(storage == "bag"), storage)
+    damaged(bag, lambda content: content[: len(content) // 3])
+    with pytest.raises(DataError, match=r"truncated.*(mcap recover|rosbag reindex|sqlite3)"):
+        open_drive(bag).scans[-1].read()
+
+
+def test_an_unindexed_ros1_bag_is_refused(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "drive.bag", ros.drive(is_ros1=True), "bag")
+
+    def not_closed(content: bytearray) -> bytearray:
+        at = content.index(b"index_pos=") + len(b"index_pos=")
+        content[at : at + 8] = bytes(8)  # what a recorder leaves that was killed
+        return content
+
+    damaged(bag, not_closed)
+    with pytest.raises(DataError, match=r"not indexed.*rosbag reindex drive.bag"):
+        open_drive(bag)
+
+
+def test_an_mcap_that_was_not_closed_is_refused(plain: Path, tmp_path: Path) -> None:
+    content = next(plain.glob("*.mcap")).read_bytes()
+    (tmp_path / "open.mcap").write_bytes(content[:-40])
+    with pytest.raises(DataError, match=r"not closed.*mcap recover open.mcap"):
+        open_drive(tmp_path / "open.mcap")
+
+
+def test_an_unknown_codec_is_named(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "drive", ros.drive(), compression="storage")
+    damaged(bag, lambda content: content.replace(b"\x04\x00\x00\x00zstd", b"\x04\x00\x00\x00abcd"))
+    with pytest.raises(
+        DataError, match=r"compressed with 'abcd', which is not here; expected none, lz4, zstd or bz2"
+    ):
+        open_drive(bag)
+
+
+def test_files_that_are_compressed_as_a_whole_are_refused(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "drive", ros.drive(), "db3", "file")
+    with pytest.raises(DataError, match=r"compressed as whole files.*zstd -d"):
+        open_drive(bag)
+
+
+def test_every_flipped_byte_is_an_error_or_a_value(plain: Path, tmp_path: Path) -> None:
+    """Nothing but our own errors, whatever the bytes of a message or of the index are."""
+    content = next(plain.glob("*.mcap")).read_bytes()
+    rng = np.random.default_rng(1)
+    file = tmp_path / "drive.mcap"
+    for _ in range(60):
+        changed = bytearray(content)
+        for at in rng.integers(0, len(content), 20):
+            changed[at] = rng.integers(256)
+        file.write_bytes(changed)
+        with suppress(DataError):
+            for scan in open_drive(file).scans:
+                scan.read()
+
+
+def test_a_topic_of_another_type_than_said(plain: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(plain, bag)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/imu"}})
+    with pytest.raises(
+        DataError, match=r"lidars.lidar: /imu is of sensor_msgs/msg/Imu, expected sensor_msgs/msg/PointCloud2"
+    ):
+        open_drive(bag)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/nowhere"}})
+    with pytest.raises(DataError, match=r"no topic '/nowhere'; it has /fix, /imu, /points"):
+        open_drive(bag)
+    rig_yaml(bag, lidar={"topic": "/points"})
+    with pytest.raises(DataError, match=r"rig.yaml: lidar: Extra inputs"):
+        open_drive(bag)
+
+
+def test_a_few_wrong_header_stamps_are_skipped_and_counted(tmp_path: Path) -> None:
+    rig = ros.drive()
+    for number, header_ns in enumerate((0, START_NS + 3600 * 10**9)):
+        rig.imu(START_NS + 2_010_000_000 + number * 10_000_000, header_ns)
+    for k in range(20):
+        rig.imu(START_NS + 2_030_000_000 + k * 10_000_000)
+    log = open_drive(ros.write(tmp_path / "drive", rig))
+    assert log.imu is not None
+    assert len(log.imu) == 221
+    [skip] = log.skips
+    assert (skip.what, skip.frames) == ("stamp", 2)
+    assert "1 of 223 header stamps are zero" in skip.reason
+    assert "1 of 223 header stamps jump" in skip.reason
+
+
+@pytest.mark.parametrize("header_ns", [lambda k: 0, lambda k: START_NS + k * 10**7 + (k > 100) * 5 * 10**9])
+def test_wrong_header_stamps_are_refused_and_arrivals_offered(
+    tmp_path: Path, header_ns: Callable[[int], int]
+) -> None:
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/imu"]
+    for k in range(201):
+        rig.imu(START_NS + k * 10**7, header_ns(k))
+    bag = ros.write(tmp_path / "drive", rig)
+    with pytest.raises(
+        DataError, match=r"/imu: .* of 201 header stamps .*set `stamps: received` for this topic"
+    ):
+        open_drive(bag)
+    rig_yaml(bag, imu={"topic": "/imu", "stamps": "received"})
+    log = open_drive(bag)
+    assert log.imu is not None
+    np.testing.assert_allclose(np.diff(log.imu.stamps), 0.01, atol=1e-9)
+
+
+def test_a_bag_that_is_played_at_half_speed_keeps_its_header_stamps(tmp_path: Path) -> None:
+    rig = ros.Rig()
+    for k in range(400):
+        rig.imu(START_NS + 2 * k * 10**7, START_NS + k * 10**7)
+    rig.fix(START_NS)
+    log = open_drive(ros.write(tmp_path / "drive", rig))
+    assert log.imu is not None
+    assert log.imu.stamps[-1] == pytest.approx(3.99)
+
+
+def test_a_cloud_without_times_is_refused_unless_it_is_compensated(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/points"]
+    rig.cloud(START_NS, sweep(TIMES, name="ring"))
+    bag = ros.write(tmp_path / "drive", rig)
+    with pytest.raises(
+        DataError, match=r"found fields x, y, z, intensity, ring, and none with the time of each point"
+    ):
+        open_drive(bag)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/points", "point_times": "compensated"}})
+    assert open_drive(bag).scans[0].read().stamps is None
+
+
+@pytest.mark.parametrize(
+    ("times", "mistake"),
+    [(TIMES * 1e3, "in ms"), (START_NS * 1e-9 + 37.0 + TIMES, "of another clock")],
+)
+def test_times_of_no_sweep_are_named(tmp_path: Path, times: np.ndarray, mistake: str) -> None:
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/points"]
+    rig.cloud(START_NS, sweep(times, "<f8", "timestamp"))
+    with pytest.raises(PointTimesError, match=mistake):
+        open_drive(ros.write(tmp_path / "drive", rig)).scans[0].read()
+
+
+def test_a_camera_info_of_zeros_is_refused(tmp_path: Path) -> None:
+    rig = with_camera(focal=0.0)
+    rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8")
+    bag = ros.write(tmp_path / "drive", rig)
+    with pytest.raises(
+        DataError, match=r"/camera_info: its CameraInfo is all zero: the camera was not calibrated"
+    ):
+        open_drive(bag)
+    rig_yaml(bag, cameras={})
+    assert open_drive(bag).images == ()
+
+
+def test_images_of_an_unknown_lens_are_refused(tmp_path: Path) -> None:
+    rig = with_camera(d=(0.1,) * 4, model="omni")
+    rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8", topic="/image_raw")
+    with pytest.raises(DataError, match=r"/camera_info: found distortion model 'omni' with 4 coefficients"):
+        open_drive(ros.write(tmp_path / "drive", rig))
+
+
+def test_an_encoding_that_is_not_known_is_named(tmp_path: Path) -> None:
+    rig = with_camera()
+    rig.image(START_NS, np.zeros((4, 6), np.uint8), "bayer_rggb8")
+    with pytest.raises(DataError, match=r"found encoding 'bayer_rggb8', expected rgb8, bgr8 or mono8"):
+        open_drive(ros.write(tmp_path / "drive", rig)).images[0].read()
+
+
+def test_missing_and_circular_transforms(tmp_path: Path) -> None:
+    bag = ros.write(tmp_path / "none", ros.drive(frames=False))
+    with pytest.raises(
+        DataError, match=r"no static transform leads from 'lidar' to 'imu' \(frames in /tf_static: none\)"
+    ):
+        open_drive(bag)
+    rig = ros.drive(frames=False)
+    rig.transforms(("imu", "base", (0, 0, 0)), ("base", "lidar", (0, 0, 0)), ("lidar", "imu", (0, 0, 0)))
+    with pytest.raises(DataError, match=r"a circle of frames, .*; expected a tree"):
+        open_drive(ros.write(tmp_path / "circle", rig))
+
+
+def test_fixes_without_fix_or_covariance_are_counted(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.fix(START_NS + 50_000_000, status=-1)
+    for k in range(2):
+        rig.fix(START_NS + 60_000_000 + k, kind=0)
+    bag = ros.write(tmp_path / "drive", rig)
+    log = open_drive(bag)
+    assert {skip.reason: skip.frames for skip in log.skips} == {
+        "1 messages: no fix": 1,
+        "2 messages: its covariance is unknown": 2,
+    }
+    assert log.gnss is not None
+    assert len(log.gnss) == 5
+    rig_yaml(bag, gnss={"topic": "/fix", "stddevs_m": [1, 1, 2]})
+    again = open_drive(bag).gnss
+    assert again is not None
+    assert len(again) == 7
+
+
+def test_a_bag_without_imu_lists_what_it_has(tmp_path: Path) -> None:
+    rig = ros.drive()
+    bag = ros.write(tmp_path / "drive", rig, keep=lambda one: one[0] != "/imu")
+    with pytest.raises(DataError, match=r"no topic of an IMU \(sensor_msgs/Imu\); it has /fix"):
+        open_drive(bag)

@@ -8,7 +8,7 @@ PYTEST := $(BIN)/pytest -n auto --dist loadfile
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 
-.PHONY: test test-unit test-slow test-faults check demo notebooks clean
+.PHONY: test test-unit test-slow test-faults check demo notebooks package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -33,6 +33,14 @@ notebooks: $(TOOLS)
 
 demo: $(PACKAGE)
 	$(BIN)/gnss-sem-map demo
+
+# Wheel and sdist, and a short demo from the wheel: an empty environment, an empty folder, no torch.
+package: $(TOOLS)
+	rm -rf dist && $(BIN)/python -m build --outdir dist
+	set -e; place=$$(mktemp -d); trap 'rm -rf $$place' EXIT; \
+	$(PYTHON) -m venv $$place/venv; \
+	$$place/venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
+	mkdir $$place/empty; cd $$place/empty; ../venv/bin/gnss-sem-map demo --seconds 3
 
 test-slow: $(TOOLS)
 	$(PYTEST) -m slow

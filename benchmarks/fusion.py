@@ -169,7 +169,7 @@ def compare(excerpts: list[Excerpt], folder: Path) -> dict[str, dict[str, Score]
 def opened(excerpt: Excerpt) -> Drive:
     """The drive, with the trajectory that a run would use."""
     log, settings = open_drive(excerpt.drive), Settings()
-    network = open_segmenter(excerpt.segmenter, URBAN, expected_size=log.calibration.image_size)
+    network = open_segmenter(excerpt.segmenter, URBAN, sizes=log.calibration.image_sizes)
     trajectory, _ = pipeline.estimate_trajectory(log, settings, pipeline.RunStats())
     return Drive(log, trajectory, network, settings)
 

@@ -78,7 +78,7 @@ class Race:
 def open_job(drive: Path, spec: str, scans: int) -> Drive:
     """A drive with the trajectory that its own navigation system reports, and so many scans from all along it."""
     log = open_drive(drive)
-    segmenter = open_segmenter(spec, URBAN, expected_size=log.calibration.image_size)
+    segmenter = open_segmenter(spec, URBAN, sizes=log.calibration.image_sizes)
     trajectory = log.given or log.reference
     if trajectory is None:
         raise SystemExit(f"{drive}: has no trajectory of its own")
@@ -96,21 +96,22 @@ def image_of(job: Drive, scan: Scan) -> tuple[Image, ClassImage]:
     image = job.log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)
     assert image is not None
     assert job.segmenter is not None
-    assert job.log.calibration.image_size is not None
     look = job.segmenter.kept if isinstance(job.segmenter, KeepsLabels) else job.segmenter
     seen = look(image)
-    return image, class_image(seen, job.segmenter.class_names, URBAN, job.log.calibration.image_size, "")
+    return image, class_image(
+        seen, job.segmenter.class_names, URBAN, job.log.calibration.camera().image_size, ""
+    )
 
 
 def whole_chain(job: Drive) -> Figures:
     """Read, deskew, project, occlusion, fuse: compiled against numpy, with decoded labels and with decoding them."""
     race, log = Race(), job.log
     table, plain = VoxelTable(SIZE, URBAN), numpy_chain.NumpyMap(SIZE, URBAN)
-    views = labelled_scans.Views(job, RunStats())
+    looks = labelled_scans.Looks(job, RunStats())
     points = 0
 
     def compiled(scan: Scan, image: Image, classes: ClassImage) -> None:
-        seen = labelled_scans._see(job, scan, scan.read(), (image, classes), views, RunStats())
+        seen = labelled_scans._see(job, scan, scan.read(), [(image, classes)], looks, RunStats())
         assert seen is not None
         table.add(seen.keys, seen.pixels, seen.classes, seen.heights)
 
@@ -194,7 +195,7 @@ def against_peers(job: Drive, seen: list[LabelledScan]) -> tuple[Figures, list[s
 
 def _keys(job: Drive, seen: LabelledScan, points: Points) -> NDArray[np.int64]:
     placed = labelled_scans._see(
-        job, seen.scan, points, None, labelled_scans.Views(job, RunStats()), RunStats()
+        job, seen.scan, points, [], labelled_scans.Looks(job, RunStats()), RunStats()
     )
     assert placed is not None
     return placed.keys

@@ -248,7 +248,7 @@ def removed_in_all(drive: Drive, chunks: list[MappedChunk]) -> Points:
 def mapped(drive: Drive) -> list[MappedChunk]:
     """What every chunk of a drive says."""
     with tempfile.TemporaryDirectory() as folder:
-        return list(map_chunks(drive, range(len(chunks_of(drive))), Path(folder)))
+        return list(map_chunks(drive, range(len(chunks_of(drive))), Path(folder), Path(folder)))
 
 
 def timed_mapping(drive: Drive) -> tuple[list[MappedChunk], dict[str, float]]:

@@ -3,8 +3,9 @@
     python benchmarks/scale.py DRIVE PROBABILITIES [--work FOLDER] [--only memory reads ...]
 
 DRIVE is a long simulated drive in KITTI raw format (`gnss-sem-map simulate --seconds 600 --seed 7`), PROBABILITIES its
-class probabilities (`gnss-sem-map segment`). It is cut into shorter drives (`cut_drive.py`). Prints the figures and
-writes benchmarks/results/scale.json. Every run is a process of its own.
+class probabilities (`gnss-sem-map segment`, or `simulation.write_corrupted_labels`, which takes a tenth of the time).
+It is cut into shorter drives (`cut_drive.py`). Prints the figures and writes benchmarks/results/scale.json. Every run
+is a process of its own.
 """
 
 from __future__ import annotations
@@ -58,21 +59,20 @@ TILED = ("trajectory", "mapping", "refinement")
 DASK = Path(sys.executable).with_name("dask")
 
 
-def run(words: Sequence[str | Path], *, program: str | None = None, threads: int | None = None) -> Figures:
-    """Run `gnss-sem-map` with these words: wall and CPU seconds, peak memory in MB, and what it said."""
+def run(words: Sequence[str | Path], *, program: str | None = None, cores: int | None = None) -> Figures:
+    """Run `gnss-sem-map` with these words: wall and CPU seconds, peak memory in MB, and what it said.
+
+    On so many `cores`, by default all: a limit of threads is none of cores, as files are read by threads of their own.
+    """
     command = [sys.executable, "-c", program] if program else [sys.executable, "-m", "gnss_sem_map.cli"]
-    environment = dict(os.environ)
-    if threads is not None:
-        environment |= {
-            name: str(threads) for name in ("GNSS_SEM_MAP_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
-        }
+    if cores is not None:
+        command = ["taskset", "--cpu-list", f"0-{cores - 1}", *command]
     begun = time.perf_counter()
     process = subprocess.Popen(
         [*command, *map(str, words)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment,
     )
     assert process.stderr is not None
     said = process.stderr.read()
@@ -189,7 +189,7 @@ def disk(drives: Drives, out: Path) -> Figures:
 
 
 def refinement(drives: Drives, out: Path) -> Figures:
-    """Microseconds per voxel of a refinement alone, on one thread."""
+    """Microseconds per voxel of a refinement alone, on one core."""
     run(drives.words(drives.of(30)[:1], out / "refined", "--workers", "1"))
     program = (
         "import shutil, sys, time\n"
@@ -209,20 +209,21 @@ def refinement(drives: Drives, out: Path) -> Figures:
         "        took = time.process_time() - begun\n"
         "print('TOOK', took, file=sys.stderr)\n"
     )
-    told = run([out / "refined"], program=program, threads=1)["said"]
+    told = run([out / "refined"], program=program, cores=1)["said"]
     voxels = json.loads((out / "refined/map/map.json").read_text())["voxels"]
     return {"refinement_us_per_voxel": 1e6 * float(told.rpartition("TOOK ")[2]) / voxels}
 
 
 def stages(drives: Drives, out: Path) -> Figures:
-    """A long drive on one process and on two, of one thread each: whole run, and its stages; the same bytes."""
+    """A long drive by one worker on one core and by two on two: whole run, and its stages; the same bytes."""
     found: Figures = {}
     for count in (1, 2):
         words = drives.words(drives.of(480)[:1], out / f"{count}", "--workers", f"{count}")
-        figures = run(words, threads=1)
+        figures = run(words, cores=count)
         seconds = json.loads((out / f"{count}" / "run.json").read_text())["seconds"]
         found |= {
             f"wall_s_{count}": figures["wall_s"],
+            f"cpu_s_{count}": figures["cpu_s"],
             f"real_time_factor_{count}": 480 / figures["wall_s"],
             f"seconds_by_stage_{count}": seconds,
         }
@@ -239,12 +240,12 @@ def workers(drives: Drives, out: Path) -> Figures:
     found: Figures = {"drives": len(some)}
     sums = {}
     with _dask(2) as (address, _):
-        for name, how in (
-            ("1", ["--workers", "1"]),
-            ("2", ["--workers", "2"]),
-            ("dask", ["--scheduler", address]),
+        for name, cores, how in (
+            ("1", 1, ["--workers", "1"]),
+            ("2", 2, ["--workers", "2"]),
+            ("dask", 2, ["--scheduler", address]),
         ):
-            figures = run(drives.words(some, out / name, *how), threads=1)
+            figures = run(drives.words(some, out / name, *how), cores=cores)
             found[f"wall_s_{name}"] = figures["wall_s"]
             sums[name] = checksums(out / name)
     found["two_workers_over_one"] = found["wall_s_1"] / found["wall_s_2"]

@@ -39,7 +39,7 @@ from gnss_sem_map.dynamics.visibility import hits_and_misses
 from gnss_sem_map.evaluation.changes import ChangeSettings
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
 from gnss_sem_map.evaluation.score_run import read_tum
-from gnss_sem_map.export.utm import from_utm
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.passes import LocatedDrive, bind_passes
@@ -245,7 +245,7 @@ def changes(days: Sequence[Day], drives: Sequence[Path], out: Path) -> Figures:
 def _voxels_of_changes(out: Path, frame: LocalFrame) -> list[Array]:
     """The voxels of every object that was found, (n, 3) m in the map, from the file that users get."""
     points = laspy.read(out / "changes.laz")
-    places = from_utm(frame, np.column_stack([points.x, points.y, points.z]))
+    places = Georeference(frame).to_map(np.column_stack([points.x, points.y, points.z]))
     numbers = np.asarray(points.point_source_id, np.int64)
     return [places[numbers == n] for n in range(numbers.max(initial=-1) + 1)]
 

@@ -37,6 +37,21 @@ PAPER: dict[str, float | bool] = {
 """What `fusion: paper` sets. The floor is the least that keeps one observation from deciding for ever."""
 
 
+class DeliverySettings(BaseModel):
+    """Coordinates of the files that a map is exported to; the map itself stays in its own frame."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    crs: int | None = Field(
+        None, description="EPSG code of a projected CRS in metres; null: UTM (WGS 84) at the map's origin."
+    )
+    geoid: Path | None = Field(
+        None,
+        description="Grid of geoid heights as PROJ reads it (.tif, .gtx): heights are orthometric; null: they are"
+        " above the WGS 84 ellipsoid.",
+    )
+
+
 class Settings(BaseModel):
     """Everything that can be chosen about a run; each part stands beside the stage that it drives."""
 
@@ -66,6 +81,7 @@ class Settings(BaseModel):
     refinement: RefinementSettings = Field(
         default_factory=RefinementSettings, description="Batch refinement, step by step."
     )
+    delivery: DeliverySettings = Field(DeliverySettings(), description="Coordinates of exported files.")
 
     @model_validator(mode="before")
     @classmethod

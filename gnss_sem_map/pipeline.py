@@ -35,6 +35,7 @@ from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_m
 from gnss_sem_map.mapping.trajectory import (
     DriveTrajectory,
     Matcher,
+    RegistrarOf,
     check_georeference,
     estimate_trajectory,
     in_frame,
@@ -113,6 +114,7 @@ def run(
     origin: LocalFrame | None = None,
     resume: bool = False,
     match: Matcher | None = None,
+    registrar_of: RegistrarOf | None = None,
     elsewhere: Elsewhere | None = None,
     labels_from: str = "",
     force: bool = False,
@@ -123,10 +125,10 @@ def run(
 
     Without a segmenter, or without images, the map has no labels. The frame of the map is that of the drive, or
     `origin`. Intermediate results are kept in the folder `work` until the caller removes it, and used with `resume`;
-    for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` `mapping.trajectory.locate`. With `force`, a
-    red pre-flight does not stop the run. `correction`: how the trajectory moves in the frame `origin` because the drive
-    is bound to others; without one, the drive is bound to itself only. `write` gets the trajectory before anything is
-    mapped, and what the map does not need of it is not held any longer.
+    for this and `elsewhere` see `mapping.fusion.map_scans`, for `match` and `registrar_of`
+    `mapping.trajectory.locate`. With `force`, a red pre-flight does not stop the run. `correction`: how the trajectory
+    moves in the frame `origin` because the drive is bound to others; without one, the drive is bound to itself only.
+    `write` gets the trajectory before anything is mapped, and what the map does not need of it is not held any longer.
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
@@ -134,7 +136,7 @@ def run(
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
     page, found, sharpness = _checked_and_located(
-        log, segmenter, settings, stats, progress, force, match, bound=correction is None
+        log, segmenter, settings, stats, progress, force, match, registrar_of, bound=correction is None
     )
     located = _in_map(log, found, origin, correction)
     passes, from_lidar_odometry = found.passes, found.from_lidar_odometry
@@ -171,12 +173,15 @@ def _checked_and_located(
     progress: Progress,
     force: bool,
     match: Matcher | None,
+    registrar_of: RegistrarOf | None,
     bound: bool,
 ) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
     """All that comes before the map; the sweeps that the check has read are not read again."""
     sweeps = KeptSweeps()
     page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
-    found, sharpness = _located(sweeps.taking(log), settings, stats, progress, page.solution, match, bound)
+    found, sharpness = _located(
+        sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, bound
+    )
     return replace(page, solution=None), found, sharpness
 
 
@@ -187,13 +192,14 @@ def _located(
     progress: Progress,
     first: Solution | None,
     match: Matcher | None,
+    registrar_of: RegistrarOf | None,
     bound: bool,
 ) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
     """The trajectory of a drive, and how sharp a map it makes; the sweeps that tell it are not held any longer."""
     sample = SweepSample(log)
     with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
-        found = locate(sample.listening(), settings, stats, progress, first, match, bound)
+        found = locate(sample.listening(), settings, stats, progress, first, match, bound, registrar_of)
         progress("trajectory", 1, 1)
     with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
@@ -271,8 +277,8 @@ def check_drive(
 
 def _remembered(drive: Drive, work: Path, resume: bool, labels_from: str) -> Drive:
     """The drive with a network whose answers are kept in `work`: --resume segments no image twice."""
-    size = drive.log.calibration.image_size
-    if drive.segmenter is None or size is None or isinstance(drive.segmenter, CachedLabels):
+    if drive.segmenter is None or not drive.log.cameras or isinstance(drive.segmenter, CachedLabels):
         return drive
-    folder = probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume)
-    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, size, folder))
+    sizes = drive.log.calibration.image_sizes
+    folder = probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume, sizes)
+    return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, sizes, folder))

@@ -62,11 +62,11 @@ def pixels_seen(
     settings: LabellingSettings,
 ) -> NDArray[np.int32]:
     """Row of the class image that each point sees, -1 for none: z-buffer, then the minimum over the window."""
-    assert calibration.image_size is not None
-    width, height = calibration.image_size
+    camera = calibration.camera()
+    width, height = camera.image_size
     T_map_imu = trajectory.at(np.array([exposure_stamp(image, calibration, settings)]), EXTRAPOLATE_S)[0]
-    T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
-    P = calibration.K @ T_camera_map[:3]
+    T_camera_map = camera.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
+    P = camera.K @ T_camera_map[:3]
     x, y, z = p_map.T
     w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
     ahead = np.flatnonzero(w > NEAREST_DEPTH_M)

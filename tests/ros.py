@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -135,18 +135,24 @@ class Rig:
         self.messages.append((topic, ns, message))
 
     def info(
-        self, ns: int, focal: float = 100.0, d: float = 0.0, shift: float = 0.0, topic: str = "/camera_info"
+        self,
+        ns: int,
+        focal: float = 100.0,
+        d: Sequence[float] = (0.0,) * 5,
+        shift: float = 0.0,
+        topic: str = "/camera_info",
+        model: str = "plumb_bob",
     ) -> None:
         K = np.array([[focal, 0, 3.0 * (focal > 0)], [0, focal, 2.0 * (focal > 0)], [0, 0, float(focal > 0)]])
         P = np.column_stack([K, [shift, 0, 0]])
         names = ("K", "R", "P", "D") if self.is_ros1 else ("k", "r", "p", "d")
-        values = dict(zip(names, (K.ravel(), np.eye(3).ravel(), P.ravel(), np.full(5, d)), strict=True))
+        values = dict(zip(names, (K.ravel(), np.eye(3).ravel(), P.ravel(), np.array(d)), strict=True))
         region = self.make(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         message = self.make(
             "sensor_msgs/msg/CameraInfo",
-            header=self.header(ns, "camera"), height=4, width=6, distortion_model="plumb_bob", binning_x=0, binning_y=0,
+            header=self.header(ns, "camera"), height=4, width=6, distortion_model=model, binning_x=0, binning_y=0,
             roi=region, **values,
         )  # fmt: skip
         self.messages.append((topic, ns, message))

@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import geopandas
 import laspy
 import numpy as np
+import pyogrio
 import pytest
 import street
 import street_drives
@@ -18,6 +20,7 @@ from plyfile import PlyData
 from street import Street
 
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.voxels.semantic_map import State
 
 URBAN = open_label_set()
 RAW_IDS = np.array([40, 48, 10, 50, 70, 0])
@@ -90,6 +93,10 @@ def test_the_map_lies_where_the_drive_was(raw_run: Path, small_drive: Street) ->
         )
     )
     assert np.linalg.norm(xyz[:, :2].mean(axis=0) - start) < 30
+    assert not (np.asarray(las["state"]) == State.REMOVED).any()
+    assert (np.asarray(laspy.read(raw_run / "removed.laz")["state"]) == State.REMOVED).all()
+    assert len(pyogrio.raw.read(raw_run / "map.gpkg", layer="road")[2]) > 0
+    assert len(geopandas.read_parquet(raw_run / "trajectory_wgs84.parquet")) > 10
     ply = PlyData.read(raw_run / "map.ply")["vertex"]
     wall = ply["label"] == URBAN.index("building")
     north = np.asarray(ply["y"], float)[wall]

@@ -102,10 +102,9 @@ def truth(
 
 def in_image(p_lidar: NDArray[np.float64], calibration: Calibration) -> NDArray[np.bool_]:
     """Which points (n, 3) the camera could show."""
-    uvw = (
-        p_lidar @ calibration.T_camera_lidar[:3, :3].T + calibration.T_camera_lidar[:3, 3]
-    ) @ calibration.K.T
-    width, height = calibration.image_size
+    camera = calibration.camera()
+    uvw = (p_lidar @ camera.T_camera_lidar[:3, :3].T + camera.T_camera_lidar[:3, 3]) @ camera.K.T
+    width, height = camera.image_size
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = uvw[:, 0] / uvw[:, 2], uvw[:, 1] / uvw[:, 2]
     return (uvw[:, 2] > 0.5) & (u >= 0) & (u < width) & (v >= 0) & (v < height)

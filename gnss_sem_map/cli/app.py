@@ -6,6 +6,7 @@ import io
 import os
 import sys
 import warnings
+from typing import Annotated
 
 import typer
 
@@ -38,9 +39,29 @@ COMMANDS = (
 app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="From a drive log (GNSS, IMU, LiDAR, camera) to a clean, georeferenced, semantic 3D map.",
     epilog="Example: gnss-sem-map run 2011_09_26/2011_09_26_drive_0005_sync --segmenter labels:probabilities -o out",
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"gnss-sem-map {version('gnss-sem-map')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _all_commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
 for _command in COMMANDS:
     app.command()(_command)
 

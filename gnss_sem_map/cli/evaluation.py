@@ -112,7 +112,7 @@ def check(
     network = None
     if segmenter not in (None, "none"):
         label_set = open_label_set(settings.classes)
-        network = open_segmenter(str(segmenter), label_set, expected_size=log.calibration.image_size)
+        network = open_segmenter(str(segmenter), label_set, sizes=log.calibration.image_sizes)
     page = preflight.check(log, settings, network)
     write_check_page(out, log.name, page)
     if as_json:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from gnss_sem_map.cli.console import print_merged, print_run, progress_bars
-from gnss_sem_map.cli.options import Device, Json, Set
+from gnss_sem_map.cli.options import Crs, Device, Geoid, Json, Set, delivered_in
 
 Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
 Other = Annotated[
@@ -17,12 +17,19 @@ Other = Annotated[
 ]
 
 
-def refine(run: Finished, set_: Set = None, out: Other = None, as_json: Json = False) -> None:
+def refine(
+    run: Finished,
+    set_: Set = None,
+    out: Other = None,
+    crs: Crs = None,
+    geoid: Geoid = None,
+    as_json: Json = False,
+) -> None:
     """Refine the map of a run again with other refinement settings; scans are not matched or segmented again."""
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
-    again = finished.refine(finished.settings.changed(*(set_ or ())), out)
+    again = finished.refine(delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid), out)
     if again.is_merged and not as_json:
         print_merged(again.about, again.folder)
     else:
@@ -51,17 +58,24 @@ def export(
     formats: Annotated[
         str,
         typer.Option(
-            "--format", help="Some of viewer, laz, ply, geotiff, topview, perspective; with commas."
+            "--format",
+            help="Some of viewer, laz, removed, ply, geotiff, geopackage, topview, perspective, copc; with commas.",
         ),
     ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder to write; default: the run.")
     ] = None,
+    crs: Crs = None,
+    geoid: Geoid = None,
 ) -> None:
-    """Write the refined map of a run in some formats."""
+    """Write the refined map of a run in some formats; in other coordinates into a folder of their own."""
     from gnss_sem_map.runs.finished_run import Run
 
-    for file in Run.open(run).export([name.strip() for name in formats.split(",")], out):
+    finished = Run.open(run)
+    delivery = delivered_in(finished.settings, crs, geoid).delivery
+    with progress_bars() as progress:
+        files = finished.export([name.strip() for name in formats.split(",")], out, delivery, progress)
+    for file in files:
         typer.echo(str(file))
 
 

@@ -11,11 +11,13 @@ import typer
 from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
 from gnss_sem_map.cli.options import (
     Config,
+    Crs,
     Device,
     Drive,
     Force,
     Format,
     Frames,
+    Geoid,
     Json,
     Out,
     Segmenter,
@@ -75,6 +77,8 @@ def run(
             help="Also write a class per original LiDAR point; of several drives, in OUT/drives/NAME/."
         ),
     ] = False,
+    crs: Crs = None,
+    geoid: Geoid = None,
     align_to: Annotated[
         Path | None,
         typer.Option(
@@ -90,7 +94,7 @@ def run(
     from gnss_sem_map.runs.run_folder import claimed_run, places_read
     from gnss_sem_map.segmentation import no_segmenter_message
 
-    settings, frame, found = settings_of(config, set_), frame_of(origin), drives_of(drives)
+    settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     if len(found) > 1 or align_to is not None:

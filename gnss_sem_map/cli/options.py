@@ -41,16 +41,42 @@ Segmenter = Annotated[
         " python:MODULE:CALLABLE; none: geometry only. {drive} stands for the name of the drive."
     ),
 ]
+Crs = Annotated[
+    int | None,
+    typer.Option(
+        help="EPSG code of the files' CRS, a projected one in metres; default: UTM (WGS 84) at the map's origin."
+    ),
+]
+Geoid = Annotated[
+    Path | None,
+    typer.Option(
+        help="Grid of geoid heights as PROJ reads it (.tif, .gtx): heights are orthometric; default: above the"
+        " WGS 84 ellipsoid."
+    ),
+]
 Device = Annotated[str, typer.Option(help="Device of a network: auto, cpu, cuda.")]
 Force = Annotated[bool, typer.Option("--force", help="Continue even if the pre-flight (see `check`) is red.")]
 Json = Annotated[bool, typer.Option("--json", help="Print a summary as JSON.")]
 
 
-def settings_of(file: Path | None, overrides: list[str] | None) -> Settings:
-    """The settings of `--config` and `--set`; raises ConfigError."""
+def settings_of(
+    file: Path | None, overrides: list[str] | None, crs: int | None = None, geoid: Path | None = None
+) -> Settings:
+    """The settings of `--config`, `--set`, `--crs` and `--geoid`; raises ConfigError."""
     from gnss_sem_map import config
 
-    return config.load(file, overrides or ())
+    return delivered_in(config.load(file, overrides or ()), crs, geoid)
+
+
+def delivered_in(settings: Settings, crs: int | None, geoid: Path | None) -> Settings:
+    """Settings with the coordinates that are given; raises ConfigError for those that no map can have."""
+    from gnss_sem_map.export.georeference import check_delivery
+
+    new = {"crs": crs, "geoid": None if geoid is None else geoid.resolve()}
+    given = {name: value for name, value in new.items() if value is not None}
+    delivery = settings.delivery.model_copy(update=given)
+    check_delivery(delivery.crs, delivery.geoid)
+    return settings.model_copy(update={"delivery": delivery})
 
 
 def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:

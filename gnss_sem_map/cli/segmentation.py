@@ -32,7 +32,7 @@ def segment(
 
     log = open_log(drive, drive_format, None)
     label_set = open_label_set(classes)
-    network = open_segmenter(segmenter, label_set, device, log.calibration.image_size)
+    network = open_segmenter(segmenter, label_set, device, log.calibration.image_sizes)
     with progress_bars() as progress:
         try:
             report = write_cache(log.images, network, label_set, out, segmenter, batch_size, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -70,16 +71,23 @@ def demo(
     seconds: Annotated[float, typer.Option(min=3.0, help="Length of the simulated drive, s.")] = 30.0,
     seed: Annotated[int, typer.Option(min=0, help="Town and traffic.")] = 0,
     labels: Annotated[
-        Literal["network", "corrupted"],
+        Literal["network", "corrupted"] | None,
         typer.Option(
             help="Class probabilities: from the small network made for this simulator, or the true class images,"
-            " corrupted as a network would."
+            " corrupted as a network would. Default: the network, without torch the latter.",
+            show_default=False,
         ),
-    ] = "network",
+    ] = None,
 ) -> None:
     """Simulate a drive, map it, score it against the exact truth, and list the pictures."""
     from gnss_sem_map.cli.demo import LABELS, demonstrate
 
+    if labels is None:
+        labels = "network" if find_spec("torch") and find_spec("safetensors") else "corrupted"
+        if labels == "corrupted":
+            warn(
+                ["torch and safetensors are not installed: the demo takes corrupted true labels, no network"]
+            )
     with progress_bars() as progress:
         done = demonstrate(out, seconds, seed, labels, progress)
     warn(done.about["warnings"])

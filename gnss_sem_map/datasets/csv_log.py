@@ -7,7 +7,8 @@
                                                        or by `speed_unit` in log.yaml
     log.yaml            optional: see `LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
-    images/stamps.csv   number,stamp_s             images/<number>.png    rectified; or .jpg
+    images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg; of several cameras, each has a folder
+                                                                          of its name in images/
 
 Stamps are seconds on one clock.
 """
@@ -47,6 +48,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
@@ -82,6 +84,37 @@ class InitialAttitude(BaseModel):
         return AttitudePrior(np.asarray(R), np.array(self.stddevs_rad))
 
 
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+class CameraFile(BaseModel):
+    """One of several cameras in `log.yaml`; its images are in `images/NAME/`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    K: Matrix3 = Field(description="Intrinsics, px.")
+    image_size: tuple[int, int] = Field(description="Width and height of the images, px.")
+    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to camera; this or T_imu_camera.")
+    T_imu_camera: Matrix4 | None = Field(None, description="Camera to IMU.")
+    distortion: Distortion | None = Field(None, description="Of the lens; default: the images are rectified.")
+    time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
+
+    @model_validator(mode="after")
+    def _has_one_pose(self) -> CameraFile:
+        if (self.T_camera_lidar is None) == (self.T_imu_camera is None):
+            raise ValueError("expected one of T_camera_lidar and T_imu_camera")
+        return self
+
+    def camera(self, T_imu_lidar: Array, name: str) -> Camera:
+        """The same for the log."""
+        if self.T_camera_lidar is not None:
+            T_camera_lidar = np.array(self.T_camera_lidar, np.float64)
+        else:
+            T_camera_lidar = lidar_to_camera(np.array(self.T_imu_camera, np.float64), T_imu_lidar)
+        K = np.array(self.K, np.float64)
+        return Camera(T_camera_lidar, K, self.image_size, self.time_offset_s, self.distortion, name)
+
+
 class LogFile(SensorConventions):
     """Content of `log.yaml`; axes, units and clocks are those of `SensorConventions`."""
 
@@ -92,12 +125,14 @@ class LogFile(SensorConventions):
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
     T_imu_lidar: Matrix4 = Field(IDENTITY, description="LiDAR to IMU.")
-    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to rectified camera.")
-    K: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = (
-        Field(None, description="Intrinsics of the rectified camera, px.")
+    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to the only camera.")
+    K: Matrix3 | None = Field(None, description="Its intrinsics, px.")
+    image_size: tuple[int, int] | None = Field(None, description="Width and height of its images, px.")
+    distortion: Distortion | None = Field(None, description="Of its lens; default: its images are rectified.")
+    camera_time_offset_s: float = Field(0.0, description="Moment of its exposure minus image stamp.")
+    cameras: dict[str, CameraFile] = Field(
+        {}, description="Several cameras by name, in place of the keys above."
     )
-    image_size: tuple[int, int] | None = Field(None, description="Width and height of the images, px.")
-    camera_time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
     imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
     initial_attitude: InitialAttitude | None = Field(
         None, description="Attitude at the first row of imu.csv; default: by the motion."
@@ -131,11 +166,12 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     ]
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
     scans, scan_skips = _scans(drive / "lidar", about.lidar_is_compensated)
-    images, image_skips = _images(drive / "images", about.image_size)
+    calibration = _calibration(about, drive / "log.yaml")
+    images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
     return SensorLog(
         name=shown(drive.name),
         epoch_ns=about.epoch_ns,
-        calibration=_calibration(about, drive / "log.yaml"),
+        calibration=calibration,
         scans=scans,
         images=images,
         frame=frame,
@@ -163,19 +199,25 @@ def _about(path: Path) -> LogFile:
 
 
 def _calibration(about: LogFile, path: Path) -> Calibration:
-    camera = (about.T_camera_lidar, about.K, about.image_size)
-    if any(part is None for part in camera) and any(part is not None for part in camera):
+    T_imu_lidar = np.array(about.T_imu_lidar, np.float64)
+    given = about.cameras or _only_camera(about, path)
+    cameras = [one.camera(T_imu_lidar, name if len(given) > 1 else "") for name, one in given.items()]
+    return Calibration(T_imu_lidar, tuple(cameras), np.array(about.p_imu_antenna, np.float64))
+
+
+def _only_camera(about: LogFile, path: Path) -> dict[str, CameraFile]:
+    """The camera that is described by keys of its own; none if there is none."""
+    if about.T_camera_lidar is None and about.K is None and about.image_size is None:
+        return {}
+    if about.T_camera_lidar is None or about.K is None or about.image_size is None:
         raise DataError(
             f"{path}: a camera needs all of T_camera_lidar, K and image_size; found only some of them"
         )
-    return Calibration(
-        T_imu_lidar=np.array(about.T_imu_lidar, np.float64),
-        T_camera_lidar=None if about.T_camera_lidar is None else np.array(about.T_camera_lidar, np.float64),
-        K=None if about.K is None else np.array(about.K, np.float64),
-        image_size=about.image_size,
-        p_imu_antenna=np.array(about.p_imu_antenna, np.float64),
-        camera_time_offset_s=about.camera_time_offset_s,
-    )
+    only = CameraFile(
+        K=about.K, image_size=about.image_size, T_camera_lidar=about.T_camera_lidar,
+        distortion=about.distortion, time_offset_s=about.camera_time_offset_s,
+    )  # fmt: skip
+    return {"": only}
 
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, list[Skip]]:
@@ -293,7 +335,21 @@ def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.Sta
     return Points(rows[:, :3], rows[:, 3], stamp + after)
 
 
-def _images(folder: Path, size: tuple[int, int] | None) -> tuple[tuple[Image, ...], list[Skip]]:
-    found, skips = _stamped("image", folder, *frames.IMAGE_SUFFIXES)
-    images = [Image(n, t, partial(frames.read_image, path, size)) for n, t, path in found]
-    return in_order("image", images, skips), skips
+def _images(
+    folder: Path, folders: list[str], cameras: tuple[Camera, ...]
+) -> tuple[tuple[Image, ...], list[Skip]]:
+    """The images of all cameras; `folders` are those of several, or empty."""
+    places = (
+        [(folder / name, camera) for name, camera in zip(folders, cameras, strict=True)]
+        if folders
+        else [(folder, cameras[0] if cameras else None)]
+    )
+    images: list[Image] = []
+    skips: list[Skip] = []
+    for place, camera in places:
+        size, name = (None, "") if camera is None else (camera.image_size, camera.name)
+        found, lost = _stamped("image", place, *frames.IMAGE_SUFFIXES)
+        of_camera = [Image(n, t, partial(frames.read_image, path, size), name) for n, t, path in found]
+        images += in_order("image", of_camera, lost)
+        skips += lost
+    return tuple(sorted(images, key=lambda image: image.stamp)), skips

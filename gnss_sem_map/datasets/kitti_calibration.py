@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
-from gnss_sem_map.sensor_log import is_rigid
+from gnss_sem_map.sensor_log.cameras import is_rigid
 
 Array = NDArray[np.float64]
 

@@ -20,6 +20,7 @@ from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
 
@@ -53,9 +54,7 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     image_files = frames.numbered("image", sequence / "image_2", *frames.IMAGE_SUFFIXES)
     size = _image_size(image_files.files)
     K, T_camera_camera0 = kitti_calibration.split_projection(rows["P2"], f"{shown(file)}: P2")
-    calibration = Calibration(
-        T_imu_lidar=np.eye(4), T_camera_lidar=T_camera_camera0 @ Tr, K=K, image_size=size
-    )
+    cameras = () if size is None else (Camera(T_camera_camera0 @ Tr, K, size),)
     skips = [
         *_left_out("scan", sequence / "velodyne", len(poses), scan_files),
         *_left_out("image", sequence / "image_2", len(poses), image_files),
@@ -63,7 +62,7 @@ def read(sequence: Path, with_imu: bool = True) -> SensorLog:
     return SensorLog(
         name=f"sequence {shown(sequence.name)}",
         epoch_ns=0,
-        calibration=calibration,
+        calibration=Calibration(np.eye(4), cameras),
         scans=tuple(
             Scan(
                 path.stem,

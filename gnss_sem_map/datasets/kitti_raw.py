@@ -26,6 +26,7 @@ from gnss_sem_map.datasets.stamps import in_order, sweep_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
@@ -92,7 +93,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         _imu_rows(drive, epoch_ns, stamps, oxts) if with_imu else (stamps, oxts, [])
     )
     scans, scan_skips = _scans(drive, epoch_ns)
-    images, image_skips = _images(drive, epoch_ns, calibration.image_size)
+    images, image_skips = _images(drive, epoch_ns, calibration.image_sizes.get(""))
     return SensorLog(
         name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
@@ -121,13 +122,8 @@ def _calibration(date: Path, has_images: bool) -> Calibration:
     if not has_images:
         return Calibration(T_imu_lidar)
     T_camera_lidar, K, size = camera_from_lidar(date)
-    return Calibration(
-        T_imu_lidar=T_imu_lidar,
-        T_camera_lidar=kitti_calibration.exact(T_camera_lidar),
-        K=K,
-        image_size=size,
-        camera_time_offset_s=CAMERA_TIME_OFFSET_S,
-    )
+    camera = Camera(kitti_calibration.exact(T_camera_lidar), K, size, CAMERA_TIME_OFFSET_S)
+    return Calibration(T_imu_lidar, (camera,))
 
 
 def camera_from_lidar(date: Path) -> tuple[Array, Array, tuple[int, int]]:

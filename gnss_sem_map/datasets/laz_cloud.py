@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
@@ -27,8 +29,6 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
     Raises DataError for a file that is no LAS, has no coordinate system, or lies far from the origin.
     """
     import laspy
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
 
     parts: list[NDArray[np.float64]] = [np.empty((0, 3))]
     try:
@@ -38,7 +38,7 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
                 raise DataError(
                     f"{shown(path)}: has no coordinate system; expected a georeferenced LAS or LAZ"
                 )
-            to_wgs84 = Transformer.from_crs(crs.to_3d(), WGS84_3D_EPSG, always_xy=True)
+            to_wgs84 = _to_wgs84(crs, path)
             for points in reader.chunk_iterator(CHUNK):
                 some = (
                     points[~np.asarray(points.withheld, np.bool_)] if hasattr(points, "withheld") else points
@@ -56,6 +56,19 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
             f" {frame.lon_deg:.4f}; expected a cloud of the same place"
         )
     return BaseCloud(path.name, one_per_cube(points, CUBE_M))
+
+
+def _to_wgs84(crs: CRS, path: Path) -> Transformer:
+    """To degrees and heights above the ellipsoid; raises DataError for heights above a geoid that PROJ has not."""
+    if not crs.is_compound:
+        return Transformer.from_crs(crs.to_3d(), WGS84_3D_EPSG, always_xy=True)
+    try:  # else PROJ would take such heights for ellipsoidal ones, 50 m off
+        return Transformer.from_crs(crs, WGS84_3D_EPSG, always_xy=True, allow_ballpark=False, only_best=True)
+    except ProjError:
+        raise DataError(
+            f"{shown(path)}: its heights are those of {crs.sub_crs_list[-1].name}, and PROJ has no grid for them;"
+            " expected heights above the ellipsoid"
+        ) from None
 
 
 def _is_near(placed: NDArray[np.float64]) -> NDArray[np.bool_]:

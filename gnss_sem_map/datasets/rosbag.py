@@ -26,7 +26,6 @@ from gnss_sem_map.datasets.ros.bag import SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.rig import (
-    CameraTopic,
     GnssTopic,
     ImuTopic,
     LidarTopic,
@@ -39,6 +38,7 @@ from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
     scans, scan_skips = _scans(bag, rig, epoch_ns)
-    images, image_skips = _images(bag, rig, epoch_ns, calibration.image_size)
+    images, image_skips = _images(bag, rig, epoch_ns, calibration.cameras)
     return SensorLog(
         name=shown(drive.name or drive.resolve().name),
         epoch_ns=epoch_ns,
@@ -218,26 +218,30 @@ def _read_scan(
 
 
 def _images(
-    bag: Bag, rig: Rig, epoch_ns: int, size: tuple[int, int] | None
+    bag: Bag, rig: Rig, epoch_ns: int, cameras: tuple[Camera, ...]
 ) -> tuple[tuple[Image, ...], list[Skip]]:
-    if not rig.cameras:
-        return (), []
-    about: CameraTopic
-    [about] = rig.cameras.values()
-    messages = bag.messages(about.topic)
-    said, believed, skips = stamps_of(bag, messages, about.stamps)
-    images = [
-        Image(
-            k,
-            (int(said[k]) - epoch_ns) * 1e-9,
-            partial(_read_image, bag.file_of(messages, k), bag, messages, k, size),
-        )
-        for k in np.flatnonzero(believed).tolist()
-    ]
-    return in_order("image", images, skips), skips
+    images: list[Image] = []
+    skips: list[Skip] = []
+    for about, camera in zip(
+        rig.cameras.values(), cameras, strict=False
+    ):  # without a LiDAR there is no camera
+        messages = bag.messages(about.topic)
+        said, believed, lost = stamps_of(bag, messages, about.stamps)
+        of_camera = [
+            Image(
+                k,
+                (int(said[k]) - epoch_ns) * 1e-9,
+                partial(_read_image, bag.file_of(messages, k), bag, messages, k, camera.image_size),
+                camera.name,
+            )
+            for k in np.flatnonzero(believed).tolist()
+        ]
+        images += in_order("image", of_camera, lost)
+        skips += lost
+    return tuple(sorted(images, key=lambda image: image.stamp)), skips
 
 
 def _read_image(
-    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None
+    _file: Path, bag: Bag, messages: Messages, k: int, size: tuple[int, int]
 ) -> NDArray[np.uint8]:
     return pictures.read_image(bag, messages, k, size)

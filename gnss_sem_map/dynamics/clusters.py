@@ -60,8 +60,11 @@ class PointSets:
 
         A point stands for half of the gap (n,) m between the rings above and below it.
         """
-        ones, half = np.ones(len(p_map), np.int32), np.outer(gaps_m, (0.0, 0.0, 0.5))
-        return cls(ones, is_object.astype(np.int32), p_map, p_map - half, p_map + half).merged(part, count)
+        ones, named = np.ones(len(p_map), np.int32), is_object.astype(np.int32)
+        if not gaps_m.any():
+            return cls(ones, named, p_map, p_map, p_map).merged(part, count)
+        half = np.outer(gaps_m, (0.0, 0.0, 0.5))
+        return cls(ones, named, p_map, p_map - half, p_map + half).merged(part, count)
 
     def merged(self, whole: NDArray[np.integer], count: int) -> PointSets:
         """Unions of these sets: `whole` (p,) is the union of each set, 0 to `count` - 1, or -1 for none."""

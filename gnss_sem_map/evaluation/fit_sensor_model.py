@@ -150,7 +150,7 @@ def _open(out: Path, drive: Path | None, segmenter: str | None) -> tuple[Drive, 
             f"{shown(out)}: its run.json names no drive and segmenter; give --drive and --segmenter"
         )
     log, label_set = open_drive(drive), open_label_set(settings.classes)
-    network = open_segmenter(segmenter, label_set, expected_size=log.calibration.image_size)
+    network = open_segmenter(segmenter, label_set, sizes=log.calibration.image_sizes)
     trajectory = Trajectory.load(out / "trajectory.parquet")
     return Drive(log, trajectory, network, settings), tiles.read(out / "map", label_set).voxels
 

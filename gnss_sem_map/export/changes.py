@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.evaluation.changes import ChangedObject
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.point_cloud import colours, las_header
-from gnss_sem_map.export.utm import to_utm
-from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.files.atomic import link_or_copy, replacing
 from gnss_sem_map.labels.label_set import LabelSet
 
 DEGREE_DIGITS = 9
@@ -54,12 +54,47 @@ class Change:
         }
 
 
-def write_changes(changes: Sequence[Change], frame: LocalFrame, label_set: LabelSet, folder: Path) -> None:
+def write_changes(
+    changes: Sequence[Change], georeference: Georeference, label_set: LabelSet, folder: Path
+) -> None:
     """Write `changes.geojson` (RFC 7946: the footprint of every box) and `changes.laz`; raises DataError."""
+    frame = georeference.frame
     with replacing(folder / GEOJSON) as file:
         features = [_feature(change, frame, label_set) for change in changes]
         file.write(json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
-    _write_laz(changes, frame, label_set, folder / LAZ)
+    _write_laz(changes, georeference, label_set, folder / LAZ)
+
+
+def copy_changes(
+    run: Path, folder: Path, before: Georeference, after: Georeference, label_set: LabelSet
+) -> None:
+    """Take over the changes of a run into another folder, in other coordinates where these differ."""
+    for name in (GEOJSON, LAZ):
+        if not (run / name).is_file():
+            continue
+        if name == GEOJSON or before == after:
+            link_or_copy(run / name, folder / name)
+        else:
+            _place_again(run / name, folder / name, before, after, label_set)
+
+
+def _place_again(
+    file: Path, target: Path, before: Georeference, after: Georeference, label_set: LabelSet
+) -> None:
+    """Write a small LAZ in other coordinates."""
+    import laspy
+
+    known = laspy.read(file)
+    header = las_header(label_set, after)
+    points = laspy.ScaleAwarePointRecord.zeros(len(known.points), header=header)
+    for name in set(points.point_format.dimension_names) - {"X", "Y", "Z"}:
+        points[name] = known[name]
+    points.x, points.y, points.z = after.from_map(before.to_map(np.asarray(known.xyz))).T
+    with (
+        replacing(target) as out,
+        laspy.open(out, mode="w", header=header, do_compress=True, closefd=False) as writer,
+    ):
+        writer.write_points(points)
 
 
 def box_corners(centre: ArrayLike, size: ArrayLike, yaw: float) -> NDArray[np.float64]:
@@ -88,13 +123,15 @@ def _feature(change: Change, frame: LocalFrame, label_set: LabelSet) -> dict[str
     }
 
 
-def _write_laz(changes: Sequence[Change], frame: LocalFrame, label_set: LabelSet, path: Path) -> None:
+def _write_laz(
+    changes: Sequence[Change], georeference: Georeference, label_set: LabelSet, path: Path
+) -> None:
     """The voxels of all objects: class and colour of each, `user_data` 1 appeared or 2 vanished, `point_source_id` the
     number of the object in the GeoJSON file.
     """
     import laspy
 
-    header = las_header(label_set, frame)
+    header = las_header(label_set, georeference)
     with (
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
@@ -103,7 +140,7 @@ def _write_laz(changes: Sequence[Change], frame: LocalFrame, label_set: LabelSet
             thing = change.thing
             labels = np.full(len(thing.voxels), thing.label, np.int8)
             points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
-            points.x, points.y, points.z = to_utm(frame, thing.voxels.centres).T
+            points.x, points.y, points.z = georeference.from_map(thing.voxels.centres).T
             points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)
             points.return_number[:] = 1
             points.number_of_returns[:] = 1

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import TiledMap
 
@@ -27,6 +29,14 @@ class Exported:
     title: str | None = None
     changes: Sequence[Mapping[str, Any]] = ()
     """What changed between drives, as `Change.about` tells it."""
+    epsg: int | None = None
+    """CRS of the files, see `Georeference`."""
+    geoid: Path | None = None
+
+    @cached_property
+    def georeference(self) -> Georeference | None:
+        """None for a map in its drive's own poses."""
+        return None if self.map.frame is None else Georeference(self.map.frame, self.epsg, self.geoid)
 
     @cached_property
     def extent(self) -> Extent:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
+from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.geopackage import write_geopackage
 from gnss_sem_map.export.pictures import write_perspective, write_topview
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.memory import release_memory
+from gnss_sem_map.run_stats import Progress, silent
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,9 @@ class Format:
     file: str
     what: str
     write: Callable[[Exported, Path], None]
+    needs_georeference: bool = False
+    on_demand: bool = False
+    """Written by `gnss-sem-map export` alone."""
 
 
 SMALL = 1_000_000
@@ -34,33 +40,47 @@ FORMATS = (
     ),
     Format(
         "laz", "map.laz",
-        "every voxel as LAS 1.4 in UTM, with ASPRS codes, confidence and state, for QGIS and CloudCompare",
+        "the map as LAS 1.4, a point per voxel, with ASPRS codes, confidence and state, for QGIS and CloudCompare",
         write_laz,
     ),
+    Format("removed", "removed.laz", "the voxels of moving objects that are not in map.laz", write_removed),
     Format("ply", "map.ply", "the labelled voxels in map metres, coloured by class", write_ply),
     Format(
-        "geotiff", "topview_class.tif", "the classes from above as GeoTIFF in UTM, for QGIS",
-        write_topview_geotiff,
+        "geotiff", "topview_class.tif", "the classes from above as cloud-optimised GeoTIFF, for QGIS",
+        write_topview_geotiff, needs_georeference=True,
+    ),
+    Format(
+        "geopackage", "map.gpkg",
+        "areas of road and sidewalk, kerb lines, outlines of buildings and vehicles, for QGIS and ArcGIS",
+        write_geopackage, needs_georeference=True,
     ),
     Format("topview", "topview.png", "the map from above, north up", write_topview),
     Format(
         "perspective", "perspective.png", "the map as a camera behind the vehicle would see it",
         write_perspective,
     ),
+    Format(
+        "copc", "map.copc.laz", "map.laz as an octree that is read in parts, for streaming and web viewers",
+        write_copc, on_demand=True,
+    ),
 )  # fmt: skip
 
 
-def write_exports(exported: Exported, folder: Path) -> None:
-    """All files that can be written of a map: two at a time of a small one, as each takes memory with its size."""
+def write_exports(exported: Exported, folder: Path, progress: Progress = silent) -> None:
+    """All files that are made of every map: two at a time of a small one, as each takes memory with its size."""
 
     def write(one: Format) -> None:
         one.write(exported, folder / one.file)
         release_memory()  # 50 MB of each
 
-    possible = [each for each in FORMATS if exported.map.frame is not None or each.name != "geotiff"]
+    is_georeferenced = exported.georeference is not None
+    possible = [
+        each for each in FORMATS if not each.on_demand and (is_georeferenced or not each.needs_georeference)
+    ]
     _ = exported.extent  # once, before both threads ask for it
     with ThreadPoolExecutor(2 if exported.extent.count < SMALL else 1) as pool:
         # the last takes longest, so it begins
         writing = [pool.submit(write, one) for one in reversed(possible)]
-    for each in writing:
-        each.result()
+        for done, each in enumerate(as_completed(writing), 1):
+            each.result()
+            progress("export", done, len(writing))

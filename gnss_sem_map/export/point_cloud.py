@@ -1,4 +1,4 @@
-"""The map as a point cloud, one point per voxel: PLY for viewing, LAZ with UTM coordinates and class codes."""
+"""The map as a point cloud, one point per voxel: PLY for viewing, LAZ with a CRS and class codes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.exported import Exported
-from gnss_sem_map.export.utm import to_utm
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -30,6 +29,8 @@ UNLABELLED_COLOUR = (150, 150, 150)
 LAZ_SCALE_M = 0.001
 LAZ_CHUNK = 250_000
 """Points converted at a time."""
+TEXT_AREA = 3
+"""Record of the LAS specification for a text that people read."""
 NEVER_CLASSIFIED, UNCLASSIFIED = 0, 1  # ASPRS codes: nobody looked, and looked without a result
 EXTRA_BYTES = (
     ("sem_label", "uint16", "SemanticKITTI raw id, 0: none"),
@@ -93,43 +94,56 @@ def _plain(name: str) -> str:
 
 
 def write_laz(exported: Exported, path: Path | str) -> None:
-    """Write every voxel as LAZ (LAS 1.4, point format 7) in the UTM zone of the map's origin.
+    """Write the map as LAZ (LAS 1.4, point format 7): every voxel that was not removed.
 
-    Heights are above the WGS 84 ellipsoid; a map without a frame stays in its own metres, without a CRS.
-    `classification` holds the class set's ASPRS codes, 0 where no camera looked and 1 where looking gave no class;
-    removed voxels keep their class and are flagged `withheld`. Extra bytes: `sem_label` (SemanticKITTI raw id),
-    `confidence`, `hits`, `state`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15
-    (coordinate system as OGC WKT 1).
+    Coordinates are those of the delivery (see `Georeference`), and a text in the header says which; a map without a
+    frame stays in its own metres, without a CRS. `classification` holds the class set's ASPRS codes, 0 where no camera
+    looked and 1 where looking gave no class; colours are those of the classes. Extra bytes: `sem_label` (SemanticKITTI
+    raw id), `confidence`, `hits`, `state`. `gps_time` and `intensity` are 0: a map is a sum, of which drives and moving
+    objects can be taken out again, and neither the last moment nor the median of what was taken out is known. Raises
+    DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system as OGC WKT 1).
     """
+    _write_points(exported, path, removed=False)
+
+
+def write_removed(exported: Exported, path: Path | str) -> None:
+    """Write the removed voxels, those of moving objects, as `write_laz` does; they are flagged `withheld` as well."""
+    _write_points(exported, path, removed=True)
+
+
+def _write_points(exported: Exported, path: Path | str, removed: bool) -> None:
     import laspy
 
-    frame = exported.map.frame
-    header = las_header(exported.map.label_set, frame)
+    georeference = exported.georeference
+    header = las_header(exported.map.label_set, georeference)
     with (
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
     ):
         for piece in exported.map:
-            for start in range(0, len(piece), LAZ_CHUNK):
-                part = piece[np.arange(start, min(start + LAZ_CHUNK, len(piece)))]
-                writer.write_points(_las_points(part, frame, header))
+            chosen = np.flatnonzero((piece.states == State.REMOVED) == removed)
+            for start in range(0, len(chosen), LAZ_CHUNK):
+                part = piece[chosen[start : start + LAZ_CHUNK]]
+                writer.write_points(las_points(part, georeference, header))
 
 
-def las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader:
+def las_header(label_set: LabelSet, georeference: Georeference | None) -> laspy.LasHeader:
     """The header of a file of voxels: coordinate system, names of the classes, extra bytes."""
     import laspy
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
-    from pyproj import CRS
 
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"
     header.scales = np.full(3, LAZ_SCALE_M)
-    header.offsets = np.floor(_placed(np.zeros((1, 3)), frame)[0])
+    header.offsets = np.floor(_placed(np.zeros((1, 3)), georeference)[0])
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in EXTRA_BYTES])
     header.global_encoding.wkt = True
-    if frame is not None:
+    if georeference is not None:
         # LAS 1.4 asks for WKT 1; laspy's own add_crs writes WKT 2, which older readers refuse
-        header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(frame.utm_epsg).to_wkt("WKT1_GDAL")))
+        header.vlrs.append(WktCoordinateSystemVlr(georeference.crs.to_wkt("WKT1_GDAL")))
+        header.vlrs.append(
+            laspy.VLR("LASF_Spec", TEXT_AREA, "CRS and heights", _plain(georeference.words).encode())
+        )
     lookup = ClassificationLookupVlr()
     for code, name in zip(label_set.asprs_codes.tolist(), label_set.names, strict=True):
         lookup[code] = _plain(name)[:15]
@@ -137,19 +151,20 @@ def las_header(label_set: LabelSet, frame: LocalFrame | None) -> laspy.LasHeader
     return header
 
 
-def _placed(p_map: NDArray[np.float64], frame: LocalFrame | None) -> NDArray[np.float64]:
-    """Map points in the coordinates of the file: UTM, or map frame if the map is not georeferenced."""
-    return p_map if frame is None else to_utm(frame, p_map)
+def _placed(p_map: NDArray[np.float64], georeference: Georeference | None) -> NDArray[np.float64]:
+    """Map points in the coordinates of the file: the map frame if the map is not georeferenced."""
+    return p_map if georeference is None else georeference.from_map(p_map)
 
 
-def _las_points(
-    piece: SemanticMap, frame: LocalFrame | None, header: laspy.LasHeader
+def las_points(
+    piece: SemanticMap, georeference: Georeference | None, header: laspy.LasHeader
 ) -> laspy.ScaleAwarePointRecord:
+    """One point for every voxel."""
     import laspy
 
     labels, states, label_set = piece.labels, piece.states, piece.voxels.label_set
     points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
-    points.x, points.y, points.z = _placed(piece.voxels.centres, frame).T
+    points.x, points.y, points.z = _placed(piece.voxels.centres, georeference).T
     points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
     points.return_number[:] = 1
     points.number_of_returns[:] = 1

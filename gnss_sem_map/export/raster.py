@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.exported import NO_VOXELS, Exported, Extent
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.point_cloud import UNLABELLED_COLOUR
-from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.voxels.tile_files import TILE_BITS
@@ -108,7 +107,7 @@ def _seen_in_rows(
 
 
 def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
-    """Write the top view as a GeoTIFF of class indices in the UTM zone of the map's origin.
+    """Write the top view as a cloud-optimised GeoTIFF of class indices in the CRS of the delivery.
 
     uint8 with a colour table: 254 is mapped but unlabelled, 255 no data; tags name the classes. Every pixel takes
     the cell under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide, or more
@@ -116,36 +115,39 @@ def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
     or when the file cannot be written.
     """
     import rasterio
+    import rasterio.shutil
     from rasterio.enums import Resampling
 
-    frame, label_set = exported.map.frame, exported.map.label_set
-    if frame is None:
+    georeference, label_set = exported.georeference, exported.map.label_set
+    if georeference is None:
         raise DataError(
             f"{exported.title}: a GeoTIFF needs a georeference; this map is in its drive's own poses"
         )
     cells = _Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
-    grid = _Grid.over(cells, exported, frame)
+    grid = _Grid.over(cells, exported, georeference)
     profile = {
         "driver": "GTiff", "dtype": "uint8", "count": 1, "nodata": GEOTIFF_NODATA, "compress": "deflate",
         "tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "width": grid.columns, "height": grid.rows,
-        "crs": f"EPSG:{frame.utm_epsg}",
+        "crs": f"EPSG:{georeference.horizontal_epsg}",
         "transform": rasterio.Affine(grid.cell_m, 0, grid.west, 0, -grid.cell_m, grid.north),
     }  # fmt: skip
     # GDAL would notice a full disk too late, and keep a twentieth of the memory full of blocks
     with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_BYTES), rasterio.MemoryFile() as memory:
         with memory.open(**profile) as tiff:
-            for corner, block in _blocks(exported, cells, grid, frame):
+            for corner, block in _blocks(exported, cells, grid, georeference):
                 tiff.write(block, 1, window=tuple(zip(corner, np.add(corner, block.shape), strict=True)))
             tiff.write_colormap(1, _colour_table(label_set))
             tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.names)})
             tiff.build_overviews(_overviews(grid), Resampling.mode)
-        with replacing(path) as file:
-            file.write(memory.getbuffer())
+        # the driver for cloud-optimised files writes no blocks, it only puts those of another file in order
+        with rasterio.MemoryFile() as ordered, replacing(path) as file:
+            rasterio.shutil.copy(memory.name, ordered.name, driver="COG", compress="deflate", blocksize=BLOCK)
+            file.write(ordered.getbuffer())
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The pixels of the GeoTIFF: upper left corner in UTM m, size, and the height at which they are transformed."""
+    """The pixels of the GeoTIFF: upper left corner, m, size, and the height at which they are transformed."""
 
     cell_m: float
     west: float
@@ -155,13 +157,13 @@ class _Grid:
     alt_m: float
 
     @classmethod
-    def over(cls, cells: _Cells, exported: Exported, frame: LocalFrame) -> _Grid:
+    def over(cls, cells: _Cells, exported: Exported, georeference: Georeference) -> _Grid:
         """Pixels as wide as the cells, over all of these."""
         voxel_m = exported.map.voxel_size_m
         cell_m, height = cells.per_cell * voxel_m, exported.extent.mean[2] * voxel_m
         u, v = map(np.ravel, np.meshgrid(np.linspace(0, cells.columns, 9), np.linspace(0, cells.rows, 9)))
         east, north = (cells.west + u) * cell_m, (cells.north - v) * cell_m
-        box = to_utm(frame, np.column_stack([east, north, np.full(len(u), height)]))
+        box = georeference.from_map(np.column_stack([east, north, np.full(len(u), height)]))
         low = np.floor(box[:, :2].min(axis=0) / cell_m).astype(int)
         high = np.ceil(box[:, :2].max(axis=0) / cell_m).astype(int)
         columns, rows = (high - low).tolist()
@@ -169,7 +171,7 @@ class _Grid:
 
 
 def _blocks(
-    exported: Exported, cells: _Cells, grid: _Grid, frame: LocalFrame
+    exported: Exported, cells: _Cells, grid: _Grid, georeference: Georeference
 ) -> Iterator[tuple[tuple[int, int], NDArray[np.uint8]]]:
     """Row and column of the upper left pixel of every block of the GeoTIFF, and the block.
 
@@ -180,10 +182,10 @@ def _blocks(
     rows = np.append(np.arange(0, grid.rows, BLOCK), grid.rows)
     columns = np.append(np.arange(0, grid.columns, BLOCK), grid.columns)
     v, u = np.meshgrid(rows, columns, indexing="ij")
-    utm = np.stack(
+    corners = np.stack(
         [grid.west + u * grid.cell_m, grid.north - v * grid.cell_m, np.full(u.shape, grid.alt_m)], -1
     )
-    east, north, _ = np.moveaxis(from_utm(frame, utm), -1, 0)
+    east, north, _ = np.moveaxis(georeference.to_map(corners), -1, 0)
     # corners of the blocks, in cells from the view's upper left corner
     corners = np.stack([cells.north - north / grid.cell_m, east / grid.cell_m - cells.west], axis=-1)
     for i in range(0, len(rows) - 1, BLOCKS_AT_ONCE):

@@ -30,11 +30,12 @@ FILES = {
     "trajectory_covariance.tum": "the same with the covariance of every pose, for smfeval",
     "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
+    "trajectory_wgs84.parquet": "the track in WGS 84 with time, speed and standard deviations, as GeoParquet",
     "map": "the map before refinement, with all evidence, as Parquet tiles",
     "refined": "the refined map as Parquet tiles",
     "drives": "map, evidence, trajectory and report of each of several drives",
     "changes.geojson": "what changed between drives, as boxes in WGS 84, for web maps and QGIS",
-    "changes.laz": "the voxels of what changed, in UTM; user_data 1: appeared, 2: vanished",
+    "changes.laz": "the voxels of what changed, as map.laz; user_data 1: appeared, 2: vanished",
     "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",
@@ -156,6 +157,8 @@ def _facts(run: Mapping[str, Any]) -> str:
         )
     else:
         facts.append("not georeferenced")
+    if delivery := run.get("delivery"):
+        facts.append(f"files in {delivery['crs']} (EPSG:{delivery['epsg']}), heights {delivery['heights']}")
     return f'<p class="facts">{escape(" · ".join(facts))}</p>'
 
 

@@ -1,4 +1,4 @@
-"""The trajectory for evo (TUM, KITTI) and for maps in the browser and in QGIS (GeoJSON)."""
+"""The trajectory for evo (TUM, KITTI) and for maps in the browser and in QGIS (GeoJSON, GeoParquet)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import shapely
+from pyproj import CRS
 
 from factor_graphs import tum
 from factor_graphs.geodesy import LocalFrame
@@ -13,6 +15,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.files.atomic import replacing
 
 DEGREE_DIGITS = 9  # 0.1 mm of latitude
+WGS84_3D_EPSG = 4979
 
 
 def write_tum(trajectory: Trajectory, path: Path | str) -> None:
@@ -59,3 +62,46 @@ def write_geojson(trajectory: Trajectory, frame: LocalFrame, path: Path | str) -
     }
     with replacing(path) as file:
         file.write(json.dumps({"type": "FeatureCollection", "features": [feature]}).encode())
+
+
+def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, path: Path | str) -> None:
+    """Write a point per pose as GeoParquet 1.1: WGS 84 (EPSG:4979), heights above the ellipsoid.
+
+    Columns: `time` (UTC), `stamp_s`, `heading_deg` from north over east, `speed_mps` where velocities are known,
+    `stddev_east_m`, `stddev_north_m`, `stddev_up_m` where covariances are, and `geometry` (WKB). Raises DataError when
+    the file cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    lat_deg, lon_deg, alt_m = frame.to_geodetic(trajectory.positions)
+    points = shapely.points(np.column_stack([lon_deg, lat_deg, alt_m]))
+    forward = trajectory.T_map_imu[:, :2, 0]
+    columns = {
+        "time": pa.array(
+            epoch_ns + np.round(1e9 * trajectory.stamps).astype(np.int64), pa.timestamp("ns", "UTC")
+        ),
+        "stamp_s": trajectory.stamps,
+        "heading_deg": np.degrees(np.arctan2(*forward.T)) % 360,
+    }
+    if trajectory.velocities is not None:
+        columns["speed_mps"] = np.linalg.norm(trajectory.velocities, axis=1)
+    if trajectory.covariances is not None:
+        names = (f"stddev_{axis}_m" for axis in ("east", "north", "up"))
+        columns |= dict(zip(names, trajectory.position_stddevs.T, strict=True))
+    columns["geometry"] = pa.array(shapely.to_wkb(points, byte_order=1).tolist(), pa.binary())
+    about = {
+        "version": "1.1.0",
+        "primary_column": "geometry",
+        "columns": {
+            "geometry": {
+                "encoding": "WKB",
+                "geometry_types": ["Point Z"],
+                "crs": CRS.from_epsg(WGS84_3D_EPSG).to_json_dict(),
+                "bbox": [f(c) for f in (np.min, np.max) for c in (lon_deg, lat_deg, alt_m)],
+            }
+        },
+    }
+    table = pa.table(columns).replace_schema_metadata({"geo": json.dumps(about)})
+    with replacing(path) as file:
+        pq.write_table(table, file, compression="zstd")

@@ -2,8 +2,10 @@
 
 .OUT.work/.gnss-sem-map.json     says that we made this folder
           chunks.json, 0/, 1/    mapped chunks of scans (`mapping.checkpoints`)
+          edges/                 what the edges of ranges of chunks tell of motion (`mapping.edge_windows`)
           job.json, trajectory.npz   what other processes need to map chunks (`runs.drive_job`)
           matches/               LiDAR odometry of sections of the drive (`runs.match_tasks`)
+          revisits/              places that are passed again, registered (`runs.revisit_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
           bound/NAME/            where these were driven, and how they are bound (`runs.bound_drives`)
@@ -23,17 +25,17 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, MATCHES, ANSWERS, DRIVES = "chunks.json", "matches", "answers", "drives"
-BOUND, TILES, PART, OLD = "bound", "tiles", "part", "old"
+CHUNKS, MATCHES, REVISITS, ANSWERS, DRIVES = "chunks.json", "matches", "revisits", "answers", "drives"
+BOUND, TILES, EDGES, PART, OLD = "bound", "tiles", "edges", "part", "old"
 JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
-    r"|\.\d+\.\d+\.waiting/(\d+\.npy)?"
+    r"|\.\d+\.\d+\.waiting/(\d+\.npy)?|edges/(\d+\.npz|\.[^/]+\.\d+\.part)?"
 )
 OURS = re.compile(
-    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|\d+\.npz|\.[^/]+\.\d+\.part)?"
-    r"|matches/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
+    r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"
+    r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -71,7 +73,7 @@ def holds_work(folder: Path) -> bool:
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
     return done or any(
         any((folder / place).glob(files))
-        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "*.npz"), (DRIVES, "*/run.json"))
+        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"))
     )
 
 
@@ -100,8 +102,9 @@ def remove_drives(folder: Path) -> None:
 
 
 def remove_matches(folder: Path) -> None:
-    """Remove saved LiDAR odometry; raises OSError."""
+    """Remove saved LiDAR odometry, and what was registered along it; raises OSError."""
     _remove_known(folder, folder / MATCHES)
+    _remove_known(folder, folder / REVISITS)
 
 
 def remove_answers(folder: Path) -> None:

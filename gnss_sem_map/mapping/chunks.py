@@ -8,6 +8,7 @@ decided elsewhere: the map is the same for any division of the chunks among proc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSel
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import edge_windows
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_scan
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
 from gnss_sem_map.mapping.waiting_points import WaitingPoints
@@ -67,11 +69,12 @@ def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
 
 
 def map_chunks(
-    drive: Drive, numbers: range, folder: Path, progress: Progress = silent
+    drive: Drive, numbers: range, folder: Path, work: Path, progress: Progress = silent
 ) -> Iterator[MappedChunk]:
     """Map consecutive chunks; each scan of them is read once. `folder` is for points that wait for a decision.
 
-    Raises DataError when the stamps of the scans do not increase, or `folder` cannot be written.
+    What its first window tells of motion is saved in the folder `work`, for the process that maps the chunk before.
+    Raises DataError when the stamps of the scans do not increase, or a folder cannot be written.
     """
     chunks, window = chunks_of(drive), drive.settings.dynamics.window_scans
     start = sum(map(len, chunks[: numbers.start]))
@@ -87,17 +90,34 @@ def map_chunks(
         for place, seen in enumerate(_observed(drive, chunks[number], chunk.stats, chunk.put_aside), 1):
             if seen is not None:
                 chunk.add(*seen)
-            if undecided is not None and place == window:
+            if place == window and undecided is not None:
                 yield undecided.decided(before, chunk.observations)
                 before, undecided = undecided.last_images, None
+            elif place == window and number > 0 and is_sought:
+                with writing_to(work):
+                    edge_windows.save(chunk.observations, work, number)
             done += 1
             progress("mapping", done, total)
             if done % RELEASED_EVERY == 0:
                 release_memory()
         undecided = chunk
     if undecided is not None:
-        after = chunks[numbers.stop][:window] if numbers.stop < len(chunks) and is_sought else []
-        yield undecided.decided(before, _observations(drive, after))
+        is_followed = numbers.stop < len(chunks) and is_sought
+        after = edge_windows.read(work, numbers.stop, drive.image_rows) if is_followed else []
+        if after is None:
+            after = _observations(drive, chunks[numbers.stop][:window])
+        yield undecided.decided(before, after)
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """An OSError becomes a DataError that names the folder."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+        ) from None
 
 
 Seen = tuple[LabelledScan, Observation | None]
@@ -112,7 +132,7 @@ def _observed(
     Threads call `put_aside` with the points that may have moved.
     """
     is_sought = drive.settings.dynamics.enabled
-    labelled = label_each_scan(drive, scans, stats, keep_points=is_sought)
+    labelled = label_each_scan(drive, scans, stats)
     if not is_sought:
         return (None if seen is None else (seen, None) for seen in labelled)
 
@@ -147,12 +167,8 @@ class _Chunk:
 
     def put_aside(self, seen: LabelledScan, near: NearPoints) -> None:
         """Write the points that may have moved; raises DataError."""
-        try:
+        with writing_to(self._folder):
             WaitingPoints.of(seen, near).write(self._waiting(seen.scan.number))
-        except OSError as error:
-            raise DataError(
-                f"{self._folder}: cannot be written ({error.strerror}); free the disk, then --resume"
-            ) from None
 
     def add(self, seen: LabelledScan, observation: Observation | None) -> None:
         self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)

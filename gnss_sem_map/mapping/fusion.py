@@ -22,7 +22,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.chunks import chunks_of, map_chunks, writing_to
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -87,14 +87,10 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
     """Map some chunks in a row and save each when it is done; raises DataError when the disk is full."""
     # not named after the process: those of two containers may have one number
     waiting = store.folder / f".{numbers.start}.{secrets.randbelow(1 << 60)}{WAITING}"
-    try:
+    with writing_to(waiting):
         waiting.mkdir()
-    except OSError as error:
-        raise DataError(
-            f"{waiting}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
     try:
-        for chunk in map_chunks(drive, numbers, waiting, progress):
+        for chunk in map_chunks(drive, numbers, waiting, store.folder, progress):
             store.write(chunk)
             del chunk  # the next one needs its memory
     finally:
@@ -104,7 +100,7 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
 def _warn(drive: Drive, stats: RunStats) -> None:
     if drive.segmenter is None:
         stats.warnings.append("no segmenter: the map shows geometry only")
-    elif not _has_camera(drive):
+    elif not drive.log.cameras:
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
     if drive.settings.dynamics.enabled and drive.is_too_sparse:
         stats.warnings.append(
@@ -117,13 +113,9 @@ def _check(drive: Drive, stats: RunStats) -> None:
     if not stats.counts["scans"]:
         why = _first_reason(stats, "scan")
         raise DataError(f"{drive.log.name}: none of {len(drive.log.scans)} scans can be used{why}")
-    if drive.segmenter is not None and _has_camera(drive) and not stats.counts["points labelled"]:
+    if drive.segmenter is not None and drive.log.cameras and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
         stats.warnings.append(f"no point got a label, and the map shows geometry only{why}")
-
-
-def _has_camera(drive: Drive) -> bool:
-    return bool(drive.log.images) and drive.log.calibration.has_camera
 
 
 def _first_reason(stats: RunStats, what: str) -> str:
@@ -144,8 +136,8 @@ def fingerprint(drive: Drive, labels_from: str) -> str:
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
         [(scan.name, scan.number, scan.stamp, state_of(scan)) for scan in log.scans],
-        [(image.number, image.stamp, state_of(image)) for image in log.images], _states(labels_from),
-        log.calibration.image_size, log.calibration.camera_time_offset_s,
+        [(image.camera, image.number, image.stamp, state_of(image)) for image in log.images], _states(labels_from),
+        [(camera.name, camera.image_size, camera.time_offset_s) for camera in log.calibration.cameras],
     ]  # fmt: skip
     digest = hashlib.sha256(repr(said).encode())
     for array in _arrays(drive):
@@ -158,8 +150,8 @@ def probabilities_fingerprint(drive: Drive, labels_from: str) -> str:
     log = drive.log
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
-        log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_size,
-        [(image.number, state_of(image)) for image in log.images], _states(labels_from),
+        log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_sizes,
+        [(image.camera, image.number, state_of(image)) for image in log.images], _states(labels_from),
     ]  # fmt: skip
     return hashlib.sha256(repr(said).encode()).hexdigest()
 
@@ -175,8 +167,9 @@ def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
     place = Path(labels_from.partition(":")[2].partition("?")[0])
     if not labels_from.partition(":")[2] or not place.exists():
         return []
-    files = sorted(path for path in place.iterdir() if path.is_file()) if place.is_dir() else [place]
-    return [(path.name, _size_and_time(path)) for path in files]
+    folders = [place, *sorted(path for path in place.iterdir() if path.is_dir())] if place.is_dir() else []
+    files = [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()] or [place]
+    return [(str(path.relative_to(place)), _size_and_time(path)) for path in files]
 
 
 def _size_and_time(path: Path) -> tuple[int, int] | None:
@@ -193,6 +186,7 @@ def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
     if learnt is not None:
         yield learnt.log_likelihoods
     yield from (trajectory.stamps, trajectory.T_map_imu, calibration.T_imu_lidar)
-    for array in (trajectory.velocities, calibration.T_camera_lidar, calibration.K):
-        if array is not None:
-            yield array
+    for camera in calibration.cameras:
+        yield from (camera.T_camera_lidar, camera.K, camera.lens)
+    if trajectory.velocities is not None:
+        yield trajectory.velocities

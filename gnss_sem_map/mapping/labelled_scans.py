@@ -1,4 +1,4 @@
-"""Scans with labels: every point in the map at its own stamp, and the pixel that shows it.
+"""Scans with labels: every point in the map at its own stamp, and what the images say that show it.
 
 A thread reads and decodes files a few scans ahead.
 """
@@ -27,8 +27,6 @@ from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_ma
 from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
-    NEAREST_DEPTH_M,
-    NO_VIEW,
     ClassImage,
     View,
     class_image,
@@ -38,6 +36,7 @@ from gnss_sem_map.scans.projection import (
 )
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.voxels.voxel_map import MappingSettings, keys_of
 
 READ_AHEAD = 4
@@ -102,7 +101,7 @@ def _sample(scans: Sequence[Scan]) -> list[NDArray[np.float32]]:
 
 @dataclass(frozen=True, eq=False)
 class LabelledScan:
-    """The usable points of one scan (m of n) in the map, with the labels of its image."""
+    """The usable points of one scan (m of n) in the map, with the labels of its images."""
 
     drive: Drive
     scan: Scan
@@ -114,62 +113,40 @@ class LabelledScan:
     """(m,) the voxel of each."""
     heights: NDArray[np.uint8]
     """(m,) how high each lies in its voxel, see `VoxelMap.heights`."""
+    p_map: NDArray[np.float64]
+    """(m, 3) m."""
     pixels: NDArray[np.int32]
-    """(m,) row of `classes` for each point, -1 if the image does not show it."""
+    """(m,) row of `classes` for each point, -1 if no image shows it."""
     classes: NDArray[np.uint8]
     """(p, c + 1) class probabilities, `other` last."""
-    kept: NDArray[np.float64] | None = None
-    """(m, 3) m, `p_map` if it was computed beforehand (`keep_points`)."""
-
-    @cached_property
-    def p_map(self) -> NDArray[np.float64]:
-        """Positions (m, 3) m, computed on first use: the map needs only the voxel."""
-        drive = self.drive
-        if self.kept is not None:
-            return self.kept
-        return map_points(self.points, self.scan, drive.trajectory, drive.log, drive.settings.mapping)[0]
 
     @property
     def labels(self) -> NDArray[np.int8]:
-        """(m,) class of the pixel of each point, c for `other`, -1 if the image does not show it."""
+        """(m,) class that the images give each point, c for `other`, -1 if none shows it."""
         of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED).astype(np.int8)  # -1 is the last
         return of_pixel.take(self.pixels)
 
 
-def labelled_scans(
-    drive: Drive, stats: RunStats | None = None, keep_points: bool = False
-) -> Iterator[LabelledScan]:
-    """Every usable scan in time order, with its points in the map and their labels.
-
-    `keep_points` computes every `p_map` in the same pass, which takes less time than computing it later.
-    """
+def labelled_scans(drive: Drive, stats: RunStats | None = None) -> Iterator[LabelledScan]:
+    """Every usable scan in time order, with its points in the map and their labels."""
     stats = stats or RunStats()
-    return (seen for seen in label_each_scan(drive, drive.log.scans, stats, keep_points) if seen is not None)
+    return (seen for seen in label_each_scan(drive, drive.log.scans, stats) if seen is not None)
 
 
-def label_each_scan(
-    drive: Drive, scans: Sequence[Scan], stats: RunStats, keep_points: bool = False
-) -> Iterator[LabelledScan | None]:
+def label_each_scan(drive: Drive, scans: Sequence[Scan], stats: RunStats) -> Iterator[LabelledScan | None]:
     """Every scan, or None for one that cannot be used; the reason is in `stats`."""
-    read, views = _Read(drive.log, drive.segmenter, drive.settings, stats), Views(drive, stats)
-    for scan, (points, classes) in prefetch(read, scans, under_way=READ_AHEAD):
-        yield None if points is None else _see(drive, scan, points, classes, views, stats, keep_points)
+    read, looks = _Read(drive.log, drive.segmenter, drive.settings, stats), Looks(drive, stats)
+    for scan, (points, images) in prefetch(read, scans, under_way=READ_AHEAD):
+        yield None if points is None else _see(drive, scan, points, images, looks, stats)
 
 
 def _see(
-    drive: Drive,
-    scan: Scan,
-    points: Points,
-    image: tuple[Image, ClassImage] | None,
-    views: Views,
-    stats: RunStats,
-    keep_points: bool = False,
+    drive: Drive, scan: Scan, points: Points, images: Sequence[Labelled], looks: Looks, stats: RunStats
 ) -> LabelledScan | None:
-    """Deskew one scan, find its voxels and its labels, in one pass over its points."""
-    log, n = drive.log, len(points.xyz)
-    mapping, labelling = drive.settings.mapping, drive.settings.labelling
+    """Deskew one scan, find its voxels and its labels."""
+    log, n, mapping = drive.log, len(points.xyz), drive.settings.mapping
     valid, keys, heights = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(n, np.uint8)
-    p_map = np.empty(3 * n if keep_points else 0)
+    at = np.empty(3 * n)
     try:
         stamps, knots = knots_of(
             points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
@@ -177,51 +154,76 @@ def _see(
     except MeasurementError as error:
         stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
         return None
-    view = views.of(image, n)
-    count, inside = kernels.place(
+    count = kernels.place(
         points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
-        mapping.voxel_size_m, view.P, NEAREST_DEPTH_M, labelling.occlusion_columns_px // 2,
-        valid, keys, heights, p_map, *view.inside, view.nearest,
+        mapping.voxel_size_m, valid, keys, heights, at,
     )  # fmt: skip
     if count == 0:
         stats.skips.append(Skip("scan", f"frame {scan.number}", f"no usable point of {n}"))
         return None
-    pixels = np.full(count, -1, np.int32)
-    classes = np.empty((0, len(drive.label_set.names) + 1), np.uint8)
-    if image is not None and view is not NO_VIEW:
-        looking, seen = visible(view, inside, image[1], labelling)
-        classes = image[1].at(seen)
-        pixels[looking] = np.arange(len(looking))
+    p_map = at[: 3 * count].reshape(-1, 3)
+    pixels, classes = pooled(
+        [looks.of(image, p_map) for image in images], count, len(drive.label_set.names) + 1
+    )
     stats.counts["scans"] += 1
     stats.counts["points"] += n
     stats.counts["points left out"] += n - count
     stats.counts["points labelled"] += len(classes)
     stats.counts["points unlabelled"] += count - len(classes)
-    kept = p_map[: 3 * count].reshape(-1, 3) if keep_points else None
-    seen_scan = LabelledScan(drive, scan, points, valid, keys[:count], heights[:count], pixels, classes, kept)
-    if not seen_scan.keys.all():
-        keys_of(seen_scan.p_map, mapping.voxel_size_m)  # its error names the point
-    return seen_scan
+    if not keys[:count].all():
+        keys_of(p_map, mapping.voxel_size_m)  # its error names the point
+    return LabelledScan(drive, scan, points, valid, keys[:count], heights[:count], p_map, pixels, classes)
 
 
-class Views:
-    """Camera views of the images of a drive, one after another; each view reuses the memory of the last."""
+Labelled = tuple[Image, ClassImage]
+Look = tuple[NDArray[np.int32], NDArray[np.uint8]]
+"""The points that an image shows (p,), and their class probabilities (p, c + 1)."""
+
+
+def pooled(looks: Sequence[Look], count: int, channels: int) -> Look:
+    """Row of the class probabilities of each point (count,), -1 where no image shows it, and these rows.
+
+    What several cameras show of one point is one observation, the mean of what they say: they look at one surface at
+    one moment, and a network is wrong about it in all of them. Void pixels say nothing.
+    """
+    rows = np.full(count, -1, np.int32)
+    for points, _ in looks:
+        rows[points] = 0
+    shown = np.flatnonzero(rows == 0)
+    rows[shown] = np.arange(len(shown))
+    if len(looks) == 1:
+        return rows, looks[0][1]
+    sums, voices = np.zeros((len(shown), channels), np.uint16), np.zeros((len(shown), 1), np.uint16)
+    for points, classes in looks:
+        sums[rows[points]] += classes
+        voices[rows[points]] += classes.any(axis=1, keepdims=True)
+    voices = np.maximum(voices, 1)
+    return rows, np.asarray((sums + voices // 2) // voices, np.uint8)
+
+
+class Looks:
+    """What the images of a drive show of scans; each look of a camera reuses the memory of its last one."""
 
     def __init__(self, drive: Drive, stats: RunStats) -> None:
-        self._drive, self._stats, self._last = drive, stats, NO_VIEW
+        self._drive, self._stats = drive, stats
+        self._last: dict[str, View] = {}
 
-    def of(self, image: tuple[Image, ClassImage] | None, n: int) -> View:
-        """Camera view of an image for n points; NO_VIEW without an image, or outside the trajectory."""
-        if image is None:
-            return NO_VIEW
-        log, trajectory = self._drive.log, self._drive.trajectory
-        exposed = exposure_stamp(image[0], log.calibration, self._drive.settings.labelling)
+    def of(self, labelled: Labelled, p_map: NDArray[np.float64]) -> Look:
+        """The points in the map (m, 3) that an image shows; none for one that was exposed outside the trajectory."""
+        image, classes = labelled
+        calibration, labelling = self._drive.log.calibration, self._drive.settings.labelling
+        exposed = exposure_stamp(image, calibration, labelling)
         try:
-            self._last = view_at(exposed, trajectory, log.calibration, n, over=self._last)
+            view = view_at(
+                exposed, self._drive.trajectory, calibration.T_imu_lidar, calibration.camera(image.camera),
+                len(p_map), self._last.get(image.camera),
+            )  # fmt: skip
         except MeasurementError as error:
-            self._stats.skips.append(Skip("labels", f"frame {image[0].number}", str(error)))
-            return NO_VIEW
-        return self._last
+            self._stats.skips.append(Skip("labels", f"frame {image.frame}", str(error)))
+            return np.empty(0, np.int32), classes.at(np.empty(0, np.int32))
+        self._last[image.camera] = view
+        points, seen = visible(p_map, view, classes, labelling)
+        return points, classes.at(seen)
 
 
 def map_points(
@@ -234,7 +236,7 @@ def map_points(
 
 
 class _Read:
-    """Reads a scan and segments its image; what is missing is counted."""
+    """Reads a scan and segments its images; what is missing is counted."""
 
     def __init__(
         self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats
@@ -243,30 +245,29 @@ class _Read:
         self._within_s = settings.labelling.image_within_s
         self._label_set = open_label_set(settings.classes)
 
-    def __call__(self, scan: Scan) -> tuple[Points | None, tuple[Image, ClassImage] | None]:
+    def __call__(self, scan: Scan) -> tuple[Points | None, list[Labelled]]:
         try:
             points = scan.read()
         except DataError as error:
             self._stats.skips.append(Skip("scan", f"frame {scan.number}", str(error)))
-            return None, None
-        size = self._log.calibration.image_size
-        if self._segmenter is None or size is None or not self._log.images:
-            return points, None
-        image = self._log.image_at(scan.stamp, self._within_s)
+            return None, []
+        if self._segmenter is None:
+            return points, []
+        seen = [self._labelled(camera, scan, self._segmenter) for camera in self._log.cameras]
+        return points, [one for one in seen if one is not None]
+
+    def _labelled(self, camera: Camera, scan: Scan, segmenter: Segmenter) -> Labelled | None:
+        image = self._log.image_at(scan.stamp, self._within_s, camera.name)
         if image is None:
-            self._stats.skips.append(Skip("labels", f"frame {scan.number}", "no image near its stamp"))
-            return points, None
+            of = f" of {camera.name}" if camera.name else ""
+            self._stats.skips.append(Skip("labels", f"frame {scan.number}", f"no image{of} near its stamp"))
+            return None
         try:
-            where = f"labels of image {image.number}"
-            seen = (
-                self._segmenter.kept(image)
-                if isinstance(self._segmenter, KeepsLabels)
-                else self._segmenter(image)
-            )
-            names = self._segmenter.class_names
-            return points, (image, class_image(seen, names, self._label_set, size, where))
+            seen = segmenter.kept(image) if isinstance(segmenter, KeepsLabels) else segmenter(image)
+            where = f"labels of image {image.frame}"
+            return image, class_image(seen, segmenter.class_names, self._label_set, camera.image_size, where)
         except WriteError:
             raise
         except DataError as error:  # only this image has no labels
-            self._stats.skips.append(Skip("labels", f"frame {image.number}", str(error)))
-            return points, None
+            self._stats.skips.append(Skip("labels", f"frame {image.frame}", str(error)))
+            return None

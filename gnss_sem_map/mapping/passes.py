@@ -16,6 +16,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.revisits import (
+    Registrar,
     Revisits,
     RevisitSettings,
     pass_of,
@@ -65,15 +66,19 @@ class Together:
 
 
 def bind_passes(
-    drives: Sequence[LocatedDrive], settings: RevisitSettings, base: BaseCloud | None = None
+    drives: Sequence[LocatedDrive],
+    settings: RevisitSettings,
+    base: BaseCloud | None = None,
+    registrar: Registrar | None = None,
 ) -> Together:
     """Find what the drives passed again, and bind those together that have a place in common.
 
     A `base` stands, and counts as one more drive. Of several drives, one that only passes its own places again is left
-    to bind itself.
+    to bind itself. `registrar`: see `register_passes`.
     """
     passes = [pass_of(drive.log, drive.trajectory, drive.condensed, settings) for drive in drives]
-    revisits, condensed = register_passes(passes, settings), [drive.condensed for drive in drives]
+    revisits = register_passes(passes, settings, registrar)
+    condensed = [drive.condensed for drive in drives]
     names = [drive.name for drive in drives]
     if base is not None:
         revisits += register_to_base(base, len(drives), passes, settings)

@@ -16,8 +16,8 @@ from gnss_sem_map.voxels.reuse import Made, of_work
 from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.tiles import z_order
 
-VOXELS_PER_TASK = 1 << 20
-"""About as many are in the tiles of one task: some seconds of work, and of progress that is shown at a time."""
+VOXELS_PER_TASK = 1 << 18
+"""About as many are in the tiles of one task: seconds of work, so workers end together, and progress is shown often."""
 
 
 def on_tiles(

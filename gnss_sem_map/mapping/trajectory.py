@@ -18,6 +18,7 @@ from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, co
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
+from gnss_sem_map.scans.revisits import Registrar
 from gnss_sem_map.sensor_log import SensorLog
 
 MATCHED_SHARE = 0.95
@@ -25,6 +26,8 @@ MATCHED_SHARE = 0.95
 
 Matcher = Callable[[SensorLog, Trajectory, Settings, Progress], ScanMatches]
 """LiDAR odometry with a first trajectory."""
+RegistrarOf = Callable[[SensorLog, Trajectory, Settings], Registrar]
+"""Who registers the places that a drive passes again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +63,21 @@ def locate(
     first: Solution | None = None,
     match: Matcher | None = None,
     bound: bool = True,
+    registrar_of: RegistrarOf | None = None,
 ) -> DriveTrajectory:
     """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
     `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
-    default `match_scans` in this process. If not `bound`, places that are passed again stay as they are.
+    default `match_scans` in this process. If not `bound`, places that are passed again stay as they are; else they are
+    registered by threads of this process, or as `registrar_of` says.
     """
     if log.given is not None:
         return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
-    found = first if first is not None else smooth_log(log, settings.trajectory)
+    with_lidar = settings.trajectory.lidar_odometry and bool(log.scans)
+    found = first if first is not None else smooth_log(log, _plain(settings.trajectory, with_lidar))
     from_lidar_odometry, without_lidar = False, None
-    if settings.trajectory.lidar_odometry and log.scans:
+    if with_lidar:
         matches = (match or _in_this_process)(log, found.trajectory, settings, progress)
         release_memory()  # of the local map
         stats.counts.update(matches.counts)
@@ -81,18 +87,34 @@ def locate(
         if len(matches.relative_poses):
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
+        elif first is None:
+            found = smooth_log(log, settings.trajectory)
     stats.warnings.extend(found.notes)
     located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
-    return _bound(located, log, settings, stats) if bound else located
+    return _bound(located, log, settings, stats, registrar_of) if bound else located
 
 
-def _bound(found: DriveTrajectory, log: SensorLog, settings: Settings, stats: RunStats) -> DriveTrajectory:
+def _plain(settings: TrajectorySettings, with_lidar: bool) -> TrajectorySettings:
+    """How a drive is smoothed first: before LiDAR odometry, only the motion within a sweep counts."""
+    if not with_lidar:
+        return settings
+    return settings.model_copy(update={"vehicle_constraint": "off", "estimate_time_offset": False})
+
+
+def _bound(
+    found: DriveTrajectory,
+    log: SensorLog,
+    settings: Settings,
+    stats: RunStats,
+    registrar_of: RegistrarOf | None,
+) -> DriveTrajectory:
     """The trajectory, bound to itself where it comes to a place again."""
     if found.solution is None or found.solution.condensed is None:
         return found
     release_memory()  # of the graph
     located = LocatedDrive(log.name, log, found.trajectory, found.solution.condensed)
-    together = bind_passes([located], settings.trajectory.revisits)
+    registrar = None if registrar_of is None else registrar_of(log, found.trajectory, settings)
+    together = bind_passes([located], settings.trajectory.revisits, registrar=registrar)
     count_passes(together, stats)
     solution, correction = replace(found.solution, condensed=None), together.corrections[0]
     found = replace(found, solution=solution, passes=together.passes)

@@ -78,9 +78,11 @@ def _opened(work: str, fingerprint: str) -> tuple[Drive, ChunkStore]:
     """The drive of a job: opened once for all tasks of a worker."""
     about, source, settings, log, trajectory = read_job(Path(work))
     label_set = open_label_set(settings.classes)
-    network, size = source.open_network(settings, log), log.calibration.image_size
-    if about["probabilities"] and network is not None and size is not None:
-        network = CachedSegmenter(network, label_set, size, Path(about["probabilities"]))
+    network = source.open_network(settings, log)
+    if about["probabilities"] and network is not None:
+        network = CachedSegmenter(
+            network, label_set, log.calibration.image_sizes, Path(about["probabilities"])
+        )
     drive = Drive(log, trajectory, network, settings, from_lidar_odometry=about["from_lidar_odometry"])
     if not fusion.fingerprint(drive, source.labels_from) == about["fingerprint"] == fingerprint:
         raise other_drive(source)

@@ -16,12 +16,13 @@ from numpy.typing import ArrayLike
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config, pipeline
-from gnss_sem_map.config import Settings
+from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.export.changes import CHANGES
+from gnss_sem_map.export.changes import copy_changes
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
+from gnss_sem_map.export.georeference import check_delivery
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.ownership import amend_all
@@ -38,6 +39,7 @@ from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
@@ -78,21 +80,24 @@ def run(
     source = source_of(drive, segmenter, frames, drive_format, device)
     with run_folder.claimed_run(out, run_folder.places_read(drive, settings, source.segmenter)) as claim:
         log = log or source.open_log()
+        run_folder.georeference_of(settings, origin or log.frame)
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
         with new_folder(out) as folder:
             with executor_of(workers, scheduler, claim.work) as executor:
                 match = SavedMatches(source, claim.work, executor, resume)
+                register = None if executor is None else RevisitTasks(source, claim.work, executor)
                 elsewhere = None if executor is None else ChunkTasks(source, executor)
                 mapped = pipeline.run(
                     log, network, settings, folder, claim.work, progress,
-                    origin=origin, resume=resume, match=match, elsewhere=elsewhere, labels_from=source.labels_from,
-                    force=force, write=partial(run_folder.write_trajectory_files, folder),
+                    origin=origin, resume=resume, match=match, registrar_of=register, elsewhere=elsewhere,
+                    labels_from=source.labels_from, force=force,
+                    write=partial(run_folder.write_trajectory_files, folder),
                 )  # fmt: skip
                 refined = pipeline.refine(
                     folder, settings, mapped.stats, progress, executor=executor, work=claim.work
                 )
-            run_folder.write_run(folder, source, mapped, refined, settings, write_labels)
+            run_folder.write_run(folder, source, mapped, refined, settings, write_labels, progress)
     return Run(out)
 
 
@@ -149,9 +154,11 @@ class Run:
     def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
         """Refine the map again with other settings, in place or into `out`; nothing is matched or segmented again.
 
-        Scans are read only if the run has point labels. Raises ConfigError if other settings differ too.
+        The coordinates of the files may be others as well. Scans are read only if the run has point labels. Raises
+        ConfigError if other settings differ too.
         """
         _check_same_map(self.settings, settings)
+        georeference = run_folder.georeference_of(settings, self.frame)
         stats = RunStats()
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
@@ -164,8 +171,9 @@ class Run:
                     )
             refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
-                for file in self.folder.glob(f"{CHANGES}.*"):
-                    link_or_copy(file, folder / file.name)
+                before = run_folder.georeference_of(self.settings, self.frame)
+                if before is not None and georeference is not None:
+                    copy_changes(self.folder, folder, before, georeference, self.label_set)
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
                 for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
@@ -195,7 +203,7 @@ class Run:
         """
         self._refuse_merged("relabelling")
         log, settings = self.drive(), self.settings
-        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_size)
+        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
         inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}
@@ -219,23 +227,51 @@ class Run:
             )
         return Run(self.folder if out is None else Path(out))
 
-    def export(self, formats: Iterable[str], to: Path | str | None = None) -> list[Path]:
-        """Write the map in formats (`laz`, `ply`, ...; see `export.formats`), into the run or the folder `to`."""
+    def export(
+        self,
+        formats: Iterable[str],
+        to: Path | str | None = None,
+        delivery: DeliverySettings | None = None,
+        progress: Progress = silent,
+    ) -> list[Path]:
+        """Write the map in formats (`laz`, `ply`, ...; see `export.formats`), into the run or the folder `to`.
+
+        `delivery`: in other coordinates than those of the run, into a folder of their own. Raises ConfigError for an
+        unknown format or CRS, and DataError for files that are there already.
+        """
         known = {each.name: each for each in FORMATS}
         chosen = list(formats)
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
         refined = tiles.open_map(self.folder / "refined", self.label_set)
         about = self.about
-        exported = Exported(refined, tracks_of(self.folder), str(about["name"]), about.get("changes", ()))
+        if to is None and delivery not in (None, self.settings.delivery):
+            raise ConfigError(
+                "export: other coordinates than those of the run need a folder of their own: -o DIR"
+            )
+        delivery = delivery or self.settings.delivery
+        check_delivery(delivery.crs, delivery.geoid)
+        exported = Exported(
+            refined,
+            tracks_of(self.folder),
+            str(about["name"]),
+            about.get("changes", ()),
+            delivery.crs,
+            delivery.geoid,
+        )
         if to is None:
-            return [self._amended(known[name], exported) for name in chosen]
+            written = []
+            for done, name in enumerate(chosen, 1):
+                written.append(self._amended(known[name], exported))
+                progress("export", done, len(chosen))
+            return written
         files = [Path(to) / known[name].file for name in chosen]
         if there := [file for file in files if file.exists()]:
             raise DataError(f"{shown(there[0])}: exists; move it away or choose another folder")
         Path(to).mkdir(parents=True, exist_ok=True)
-        for name, file in zip(chosen, files, strict=True):
+        for done, (name, file) in enumerate(zip(chosen, files, strict=True), 1):
             known[name].write(exported, file)
+            progress("export", done, len(files))
         return files
 
     def _amended(self, format_: Format, exported: Exported) -> Path:
@@ -270,11 +306,11 @@ class Run:
 
 def _check_same_map(before: Settings, after: Settings) -> None:
     """Raise ConfigError if settings other than those of the refinement differ."""
-    same = after.model_copy(update={"refinement": before.refinement})
+    same = after.model_copy(update={"refinement": before.refinement, "delivery": before.delivery})
     if same == before:
         return
     differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
     raise ConfigError(
-        f"refine: {', '.join(differ)} differ from those of the run; refine changes only refinement settings:"
+        f"refine: {', '.join(differ)} differ from those of the run; refine changes those of refinement and delivery:"
         " run the drive again"
     )

@@ -31,6 +31,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.changes import write_changes
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files import ownership, work_folder
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import Claim, new_folder
@@ -116,6 +117,9 @@ def run_drives(
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
+        Georeference(
+            frame, settings.delivery.crs, settings.delivery.geoid
+        )  # refuses what cannot be delivered
         sources = [how.source(drive) for drive in drives]
         file = _begin(claim, settings, how)
         tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
@@ -275,7 +279,12 @@ def _write(
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
-            write_changes(changes, frame, label_set, folder)
+            write_changes(
+                changes,
+                Georeference(frame, settings.delivery.crs, settings.delivery.geoid),
+                label_set,
+                folder,
+            )
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],
@@ -289,7 +298,7 @@ def _write(
             "changes": [change.about(label_set) for change in changes or ()],
             "map": run_folder.about_map(folder, refined.report),
         }
-        write_merged(folder, settings, about)
+        write_merged(folder, settings, about, progress)
     return about
 
 
@@ -321,6 +330,7 @@ def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     frame = read_frame(out / MAP)
     if frame is None:
         raise DataError(f"{shown(out)}: its map has no georeference, so no other drive fits to it")
+    run_folder.georeference_of(settings, frame)
     if is_folder(out / DRIVES):
         return settings, frame, {path.name: path for path in sorted((out / DRIVES).iterdir())}
     if "merged" in about:

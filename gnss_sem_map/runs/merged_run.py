@@ -15,6 +15,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.merging import Alignment, merge_runs
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.mapping.refining import refine_map
+from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_map_files
 from gnss_sem_map.runs.tracks import keep_tracks, tracks_of
 
@@ -53,9 +54,13 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
     return about
 
 
-def write_merged(folder: Path, settings: Settings, about: dict[str, Any]) -> None:
+def write_merged(
+    folder: Path, settings: Settings, about: dict[str, Any], progress: Progress = silent
+) -> None:
     """Write the files of a run of several drives beside its maps and tracks, which are there already."""
-    write_map_files(folder, tracks_of(folder), str(about["name"]), about.get("changes", ()))
+    write_map_files(
+        folder, tracks_of(folder), str(about["name"]), settings.delivery, about.get("changes", ()), progress
+    )
     write_about(folder, settings, about, {})
 
 

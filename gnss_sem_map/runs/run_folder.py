@@ -15,15 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.trajectory_plot import write_trajectory_plot
-from gnss_sem_map.config import Settings
+from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
+from gnss_sem_map.export.georeference import Georeference, check_delivery
 from gnss_sem_map.export.report import FILES, write_report
-from gnss_sem_map.export.trajectories import write_covariance_tum, write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectories import (
+    write_covariance_tum,
+    write_geojson,
+    write_geoparquet,
+    write_kitti,
+    write_tum,
+)
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
@@ -36,7 +44,7 @@ from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.pipeline import Located, Mapped
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.steps import RefinementReport
-from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -81,12 +89,14 @@ def write_run(
     refined: Refined,
     settings: Settings,
     write_labels: bool,
+    progress: Progress = silent,
 ) -> None:
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
     refined = replace(refined, report=with_objects(refined.report, mapped))
     with mapped.stats.stage("export"):
         write_plot(folder, mapped.log, mapped.solution)
-        write_map_files(folder, [_while_mapping(mapped.trajectory, mapped.log)], mapped.log.name)
+        track = _while_mapping(mapped.trajectory, mapped.log)
+        write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
         if write_labels:
             write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
     about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
@@ -143,7 +153,7 @@ def write_again(
     for file in source.glob("trajectory*"):
         shutil.copyfile(file, folder / file.name)
     with stats.stage("export"):
-        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]))
+        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]), settings.delivery)
         if log is not None:
             write_point_labels(folder, log, trajectory, refined.kerbs, settings, known_raw)
     tracked = about["map"]["refinement"]
@@ -159,14 +169,30 @@ def write_again(
 
 
 def write_map_files(
-    folder: Path, tracks: Sequence[Trajectory], title: str, changes: Sequence[Mapping[str, Any]] = ()
+    folder: Path,
+    tracks: Sequence[Trajectory],
+    title: str,
+    delivery: DeliverySettings,
+    changes: Sequence[Mapping[str, Any]] = (),
+    progress: Progress = silent,
 ) -> None:
     """Write the refined map of a run folder in all formats."""
-    write_exports(Exported(tiles.open_map(folder / REFINED), tracks, title, changes), folder)
+    refined = tiles.open_map(folder / REFINED)
+    write_exports(Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid), folder, progress)
+
+
+def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeference | None:
+    """Coordinates of the files of a map with this frame; raises ConfigError, so ask it before the work."""
+    delivery = settings.delivery
+    check_delivery(delivery.crs, delivery.geoid)
+    return None if frame is None else Georeference(frame, delivery.crs, delivery.geoid)
 
 
 def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:
     """Write settings, run.json, metrics.json and the report."""
+    frame = about.get("local_frame")
+    georeference = georeference_of(settings, None if frame is None else LocalFrame(**frame))
+    about = about | {"delivery": None if georeference is None else georeference.about()}
     (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
     _write_json(folder / "run.json", about)
     _write_json(folder / "metrics.json", metrics)
@@ -217,6 +243,7 @@ def write_trajectory_files(folder: Path, located: Located) -> None:
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
     if frame is not None:
         write_geojson(trajectory, frame, folder / "trajectory.geojson")
+        write_geoparquet(trajectory, frame, located.log.epoch_ns, folder / "trajectory_wgs84.parquet")
 
 
 def write_plot(folder: Path, log: SensorLog, solution: Solution | None) -> None:

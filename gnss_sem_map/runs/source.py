@@ -54,8 +54,8 @@ class Source:
         """The segmenter for the images of this log; None for geometry only. Raises DataError and ConfigError."""
         if self.segmenter in (None, "none"):
             return None
-        label_set, size = open_label_set(settings.classes), log.calibration.image_size
-        return open_segmenter(str(self.segmenter), label_set, self.device, size)
+        label_set, sizes = open_label_set(settings.classes), log.calibration.image_sizes
+        return open_segmenter(str(self.segmenter), label_set, self.device, sizes)
 
 
 def source_of(

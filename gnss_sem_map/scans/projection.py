@@ -1,4 +1,4 @@
-"""Projection of map points into the image at its moment of exposure, with occlusion (eq. 3 to 5)."""
+"""Projection of map points into an image at its moment of exposure, with occlusion (eq. 3 to 5)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gnss_sem_map.labels.probabilities import LabelImage
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.sensor_log import Calibration, Image
+from gnss_sem_map.sensor_log.cameras import Camera
 
 NEAREST_DEPTH_M = 0.5
 LARGEST_SHRINK = 8
@@ -96,27 +97,13 @@ class View:
     """Camera at the moment of exposure, with the buffers of the projection: see `kernels.project`."""
 
     P: NDArray[np.float64]
-    """(3, 4): projection from the map to pixels."""
+    """(3, 4): what takes points of the map to the camera, see `Camera.projection`."""
+    lens: NDArray[np.float64]
+    """What comes after it, see `Camera.lens`."""
     inside: tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]
     """Points, columns, lines, depths: (n,) each, partly filled."""
     nearest: NDArray[np.float32]
-    """(h, w) m; empty where there is no image."""
-
-
-def view_of(P: NDArray[np.float64], size: tuple[int, int], n: int, over: View | None = None) -> View:
-    """Buffers for the `n` points of a scan in an image of (width, height); those of `over` are reused if large
-    enough.
-    """
-    if over is not None and over.nearest.shape == size[::-1] and len(over.inside[0]) >= n:
-        over.nearest.fill(np.inf)
-        return View(P, over.inside, over.nearest)
-    points, columns, lines = (np.empty(n, np.int32) for _ in range(3))
-    nearest = np.full(size[::-1], np.inf, np.float32)
-    return View(P, (points, columns, lines, np.empty(n, np.float32)), nearest)
-
-
-NO_VIEW = view_of(np.zeros((3, 4)), (0, 0), 0)
-"""View without an image."""
+    """(h, w) m."""
 
 
 def class_image(
@@ -163,33 +150,46 @@ def _shrink(shape: tuple[int, ...], image_size: tuple[int, int], where: str) -> 
 def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSettings) -> float:
     """Moment at which the image was exposed, s."""
     offset = settings.camera_time_offset_s
-    return image.stamp + (calibration.camera_time_offset_s if offset is None else offset)
+    return image.stamp + (calibration.camera(image.camera).time_offset_s if offset is None else offset)
 
 
 def view_at(
-    stamp: float, trajectory: Trajectory, calibration: Calibration, n: int, over: View | None = None
+    stamp: float,
+    trajectory: Trajectory,
+    T_imu_lidar: NDArray[np.float64],
+    camera: Camera,
+    n: int,
+    over: View | None,
 ) -> View:
-    """Camera at the moment `stamp`, with buffers for `n` points; raises DataError for a drive without camera.
+    """A camera at the moment `stamp`, with buffers for the `n` points of a scan.
 
-    The buffers of the earlier view `over` are reused: allocating memory costs more than the projection.
+    Those of the earlier view `over` are reused if large enough: allocating memory costs more than the projection.
     """
-    if calibration.T_camera_lidar is None or calibration.K is None or calibration.image_size is None:
-        raise DataError("the drive has no camera calibration; expected T_camera_lidar, K and image_size")
     T_map_imu = trajectory.at(np.array([stamp]), EXTRAPOLATE_S)[0]
-    T_camera_map = calibration.T_camera_lidar @ np.linalg.inv(T_map_imu @ calibration.T_imu_lidar)
-    return view_of(np.ascontiguousarray(calibration.K @ T_camera_map[:3]), calibration.image_size, n, over)
+    P = camera.projection(camera.T_camera_lidar @ np.linalg.inv(T_map_imu @ T_imu_lidar))
+    shape = camera.image_size[::-1]
+    if over is not None and over.nearest.shape == shape and len(over.inside[0]) >= n:
+        over.nearest.fill(np.inf)
+        return View(P, camera.lens, over.inside, over.nearest)
+    points, columns, lines = (np.empty(n, np.int32) for _ in range(3))
+    nearest = np.full(shape, np.inf, np.float32)
+    return View(P, camera.lens, (points, columns, lines, np.empty(n, np.float32)), nearest)
 
 
 def visible(
-    view: View, inside: int, classes: ClassImage, settings: LabellingSettings
+    p_map: NDArray[np.float64], view: View, classes: ClassImage, settings: LabellingSettings
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The visible ones (p,) of the `inside` points in the image, and the pixel of `classes` of each.
+    """The points (p,) of the m in the map (m, 3) that the image shows, and the pixel of `classes` of each.
 
     A point is occluded when another point of the same scan, in a window around its pixel, is nearer by more than the
     tolerance. The window fits the spacing of the LiDAR, which is sparser than the image (7 x 5 px, 5 % + 0.3 m on real
     data). Eq. 5 keeps the nearest point of each pixel instead.
     """
     (height, width), (class_height, class_width) = view.nearest.shape, classes.size
+    inside = kernels.project(
+        p_map.reshape(-1), view.P, view.lens, NEAREST_DEPTH_M, settings.occlusion_columns_px // 2,
+        *view.inside, view.nearest,
+    )  # fmt: skip
     points, columns, lines, depths = view.inside
     pixels = np.empty(inside, np.int32)
     kept = kernels.visible(
@@ -208,14 +208,11 @@ def pixels_seen(
     calibration: Calibration,
     classes: ClassImage,
     settings: LabellingSettings,
+    camera: str = "",
 ) -> NDArray[np.int32]:
     """For every map point (n, 3) m its flattened pixel in `classes` at `stamp`, or -1 if not visible: see `visible`."""
-    view = view_at(stamp, trajectory, calibration, len(p_map))
-    x, y, z = np.ascontiguousarray(p_map.T)
-    inside = kernels.project(
-        x, y, z, 0, view.P, NEAREST_DEPTH_M, settings.occlusion_columns_px // 2, *view.inside, 0, view.nearest
-    )
-    points, seen = visible(view, inside, classes, settings)
+    view = view_at(stamp, trajectory, calibration.T_imu_lidar, calibration.camera(camera), len(p_map), None)
+    points, seen = visible(np.ascontiguousarray(p_map), view, classes, settings)
     pixels = np.full(len(p_map), -1, np.int32)
     pixels[points] = seen
     return pixels

@@ -7,7 +7,7 @@ is metres away. What the pairs are worth in the end, the graph decides (`factor_
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -82,8 +82,12 @@ def pass_of(
     return Pass(anchors, stamps, trajectory.at(stamps), LocalMaps(log, trajectory, stamps))
 
 
-def candidates(passes: Sequence[Pass], settings: RevisitSettings) -> Iterator[tuple[int, int, int, int]]:
-    """Pairs to register: drive and place of an earlier pass, then of a later one.
+Pair = tuple[int, int, int, int]
+"""Drive and place of an earlier pass, then of a later one."""
+
+
+def candidates(passes: Sequence[Pass], settings: RevisitSettings) -> Iterator[Pair]:
+    """Pairs to register.
 
     A place is paired with the nearest place of every earlier pass, of the nearest `passes`. Drives come in their order;
     in one drive, another pass is what lies `apart_s` before, and each time that the vehicle comes again.
@@ -153,21 +157,49 @@ class Revisits:
         return found
 
 
-def register_passes(passes: Sequence[Pass], settings: RevisitSettings) -> Revisits:
-    """Register all places that were passed again."""
+class Found(NamedTuple):
+    """A pair that was registered: T_first_second (4, 4), its covariance (6, 6), and points of the second local map."""
 
-    def registered(pair: tuple[int, int, int, int]) -> _Found | None:
+    T: Array
+    covariance: Array
+    sample: tuple[Array, Array]
+
+
+Registrar = Callable[[Sequence[Pass], Sequence[Pair]], Iterable[Found | None]]
+"""Registers pairs, see `register_pair`; gives the results in their order."""
+
+
+def register_passes(
+    passes: Sequence[Pass], settings: RevisitSettings, registrar: Registrar | None = None
+) -> Revisits:
+    """Register all places that were passed again: here on threads, or by a registrar."""
+    pairs = list(candidates(passes, settings))
+    if registrar is not None:
+        found = registrar(passes, pairs)
+    else:
+        made = prefetch(lambda pair: register_pair(passes, pair, settings), pairs, THREADS)
+        found = (result for _, result in made)
+
+    def row(pair: Pair, result: Found | None) -> _Row | None:
         earlier, i, later, j = pair
-        first, second = passes[earlier], passes[later]
-        guess = registration.rigid(registration.inverse(first.T_map_imu[i]) @ second.T_map_imu[j])
-        surfaces = second.maps.at(j)
-        match = register(first.maps.at(i), surfaces, guess, settings)
-        if match is None:
-            return None
-        anchors = int(first.anchors[i]), int(second.anchors[j])
-        return _Found((earlier, later), anchors, *match, guess, _sample(surfaces))
+        anchors = int(passes[earlier].anchors[i]), int(passes[later].anchors[j])
+        return None if result is None else _Row((earlier, later), anchors, *result, _guess(passes, pair))
 
-    return _revisits([found for _, found in prefetch(registered, candidates(passes, settings), THREADS)])
+    return _revisits([row(pair, result) for pair, result in zip(pairs, found, strict=True)])
+
+
+def register_pair(passes: Sequence[Pass], pair: Pair, settings: RevisitSettings) -> Found | None:
+    """Register the local maps of two places; None where they do not match."""
+    earlier, i, later, j = pair
+    surfaces = passes[later].maps.at(j)
+    match = register(passes[earlier].maps.at(i), surfaces, _guess(passes, pair), settings)
+    return None if match is None else Found(*match, _sample(surfaces))
+
+
+def _guess(passes: Sequence[Pass], pair: Pair) -> Array:
+    earlier, i, later, j = pair
+    first, second = passes[earlier].T_map_imu[i], passes[later].T_map_imu[j]
+    return registration.rigid(registration.inverse(first) @ second)
 
 
 def register_to_base(
@@ -175,7 +207,7 @@ def register_to_base(
 ) -> Revisits:
     """Register all places to a cloud that stands: it has one anchor, at the origin, and this number as a drive."""
 
-    def registered(place: tuple[int, int, small_gicp.PointCloud]) -> _Found | None:
+    def registered(place: tuple[int, int, small_gicp.PointCloud]) -> _Row | None:
         later, j, around = place
         surfaces = passes[later].maps.at(j)
         match = register(around, surfaces, np.eye(4), settings)
@@ -183,8 +215,8 @@ def register_to_base(
             return None
         (T_here, covariance), T = match, passes[later].T_map_imu[j]
         anchors = 0, int(passes[later].anchors[j])
-        return _Found(
-            (number, later), anchors, registration.rigid(T @ T_here), covariance, T, _sample(surfaces)
+        return _Row(
+            (number, later), anchors, registration.rigid(T @ T_here), covariance, _sample(surfaces), T
         )
 
     places = (
@@ -196,16 +228,16 @@ def register_to_base(
     return _revisits([found for _, found in prefetch(registered, places, THREADS)])
 
 
-class _Found(NamedTuple):
+class _Row(NamedTuple):
     drives: tuple[int, int]
     anchors: tuple[int, int]
     T: Array
     covariance: Array
-    guess: Array
     sample: tuple[Array, Array]
+    guess: Array
 
 
-def _revisits(results: Sequence[_Found | None]) -> Revisits:
+def _revisits(results: Sequence[_Row | None]) -> Revisits:
     found = [one for one in results if one is not None]
     pairs = AnchorPairs(
         np.array([one.drives for one in found], np.intp).reshape(-1, 2),

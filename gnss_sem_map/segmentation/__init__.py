@@ -6,7 +6,7 @@ Cheap to import: torch, transformers and onnxruntime are imported by the segment
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
@@ -83,12 +83,12 @@ def no_segmenter_message(drive: str) -> str:
 
 
 def open_segmenter(
-    spec: str, label_set: LabelSet, device: str = "auto", expected_size: tuple[int, int] | None = None
+    spec: str, label_set: LabelSet, device: str = "auto", sizes: Mapping[str, tuple[int, int]] | None = None
 ) -> Segmenter:
     """Open a segmenter from its SPEC; as much as possible is checked before the run starts.
 
-    `spec` is one of `SCHEMES`; `expected_size` (width, height) is the camera's, px; `device` is auto, cpu, cuda or a
-    torch device. Raises ConfigError for a wrong description, DataError for wrong or damaged files.
+    `spec` is one of `SCHEMES`; `sizes` (width, height), px, are those of the images by camera; `device` is auto, cpu,
+    cuda or a torch device. Raises ConfigError for a wrong description, DataError for wrong or damaged files.
     """
     scheme, place, options = _parse(spec)
     match scheme:
@@ -96,7 +96,7 @@ def open_segmenter(
             from gnss_sem_map.segmentation.cached import CachedLabels
 
             _only(options, spec, "ids", "taxonomy")
-            return CachedLabels(Path(place), label_set, expected_size, **options)
+            return CachedLabels(Path(place), label_set, sizes, **options)
         case "refinenet":
             _only(options, spec, "classes", "scale", "shrink")
             with _needs("segmentation", spec):

@@ -1,4 +1,4 @@
-"""Class probabilities on disk: one file per frame, written once and read by all later runs as `labels:FOLDER`."""
+"""Class probabilities on disk: one file per image, written once and read by all later runs as `labels:FOLDER`."""
 
 from __future__ import annotations
 
@@ -82,13 +82,16 @@ def write_cache(
 ) -> CacheReport:
     """Segment every image that has no file in `folder` yet, and write `<number>.npz`: 8 bits per class and pixel.
 
+    Of several cameras, each has a folder of its name in it.
+
     Classes are summed by name into those of `label_set` and `other`. A KITTI image at half its size takes 70 to 130 kB.
     Files are written atomically, so an interrupted call can be repeated. `description` (the segmenter's SPEC) must be
     that of the first call for the folder. Frames with a damaged image are skipped and reported.
     Raises ConfigError for a folder of another segmenter, DataError when it cannot be written or nothing was segmented.
     """
     with _for_us_alone(folder):
-        _claim(folder, {"segmenter": description, "class_names": [*label_set.names, OTHER]})
+        about: dict[str, object] = {"segmenter": description, "class_names": [*label_set.names, OTHER]}
+        _claim(folder, about, sorted({image.camera for image in images}))
         return _write_all(images, segmenter, label_set, folder, batch_size, progress)
 
 
@@ -149,9 +152,9 @@ def _segment(
         try:
             yield image, ask(image)
         except MissingLabels as error:
-            skips.append(Skip("labels", f"frame {image.number}", str(error)))
+            skips.append(Skip("labels", f"frame {image.frame}", str(error)))
         except DataError as error:
-            skips.append(Skip("image", f"frame {image.number}", str(error)))
+            skips.append(Skip("image", f"frame {image.frame}", str(error)))
 
 
 @contextmanager
@@ -166,7 +169,7 @@ def _for_us_alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def _claim(folder: Path, about: dict[str, object]) -> None:
+def _claim(folder: Path, about: dict[str, object], cameras: Sequence[str]) -> None:
     file = folder / ABOUT
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -177,9 +180,11 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
                     f"cache {folder}: found {strange[0]} but no {ABOUT}; choose an empty folder"
                 )
             write_whole(file, (json.dumps(about) + "\n").encode())
-        for path in folder.iterdir():
-            if PARTIAL.fullmatch(path.name):
-                path.unlink()  # of a call that was killed
+        for inside in (folder / camera for camera in {"", *cameras}):
+            inside.mkdir(exist_ok=True)
+            for path in inside.iterdir():
+                if PARTIAL.fullmatch(path.name):
+                    path.unlink()  # of a call that was killed
     except OSError as error:
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
     found = read_json(file)
@@ -190,7 +195,7 @@ def _claim(folder: Path, about: dict[str, object]) -> None:
 
 
 def _file(folder: Path, image: Image) -> Path:
-    return folder / f"{image.number:010d}.npz"
+    return folder / image.camera / f"{image.number:010d}.npz"
 
 
 def write_probabilities(path: Path, probabilities: NDArray[np.uint8], class_names: Sequence[str]) -> int:

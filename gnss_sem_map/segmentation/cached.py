@@ -1,7 +1,8 @@
-"""Segmenter that reads class probabilities from disk: one file per frame, found by the frame number in its name."""
+"""Segmenter that reads class probabilities from disk: one file per image, found by the frame number in its name."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,20 +31,21 @@ class CachedLabels:
     An `.npz` holds `probabilities` (h, w, c), uint8 as round(255 p) or floating in 0..1, and `class_names` (c,). A
     PNG holds one 8-bit id per pixel, named by `ids` of `taxonomy`: the class gets HARD_LABEL_PROBABILITY, every other
     class an equal share of the rest, and a void pixel no evidence at all. Frame numbers may be padded with zeros to
-    any width. The classes of the first valid file are expected in all others. Raises ConfigError or DataError for
-    another folder, or if none of several files from the whole folder is valid.
+    any width. Of several cameras, each has a folder of its name. The classes of the first valid file are expected in
+    all others. Raises ConfigError or DataError for another folder, or if none of several files from the whole folder is
+    valid.
     """
 
     def __init__(
         self,
         folder: Path,
         label_set: LabelSet,
-        expected_size: tuple[int, int] | None = None,
+        sizes: Mapping[str, tuple[int, int]] | None = None,
         ids: str | None = None,
         taxonomy: str = "cityscapes",
     ) -> None:
-        self._folder, self._size = folder, expected_size
-        self._files, suffix = _label_files(folder)
+        self._folder, self._sizes = folder, sizes or {}
+        self._files, suffix = _label_files(folder, list(self._sizes) or [""])
         self._evidence: NDArray[np.uint8] | None = None
         if suffix == ".png":
             self._ids = ids or _default_ids(taxonomy)
@@ -64,24 +66,25 @@ class CachedLabels:
 
     def kept(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
         """The result of `__call__`, with a label image not expanded: most of its pixels are never used."""
-        path = self._files.get(image.number)
+        path = self._files.get((image.camera, image.number))
         if path is None:
             raise MissingLabels(
-                f"{self._folder}: no labels of frame {image.number}; {len(self._files)} frames have some"
+                f"{self._folder}: no labels of frame {image.frame}; {len(self._files)} frames have some"
             )
-        return self._read(path)
+        return self._read(path, self._sizes.get(image.camera))
 
     def _try(self, label_set: LabelSet) -> None:
         """Find a valid file and its classes; raises DataError if none of the tried files is valid."""
-        files = list(self._files.values())
+        files = list(self._files.items())
         tried = files[:: -(-len(files) // MOST_TRIED)]
         refused: list[DataError] = []
-        for path in tried:
+        for (camera, _), path in tried:
+            size = self._sizes.get(camera)
             try:
                 if self._evidence is not None:
-                    self._read_ids(path)
+                    self._read_ids(path, size)
                 else:
-                    self.class_names = read_probabilities(path, self._size)[1]
+                    self.class_names = read_probabilities(path, size)[1]
                     label_set.table_from(self.class_names)  # refuses an unknown name
                 return
             except DataError as error:
@@ -90,21 +93,23 @@ class CachedLabels:
             raise DataError(f"{refused[0]}; none of {len(tried)} label files that were tried can be used")
         raise refused[0]
 
-    def _read(self, path: Path) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
+    def _read(
+        self, path: Path, size: tuple[int, int] | None
+    ) -> NDArray[np.uint8] | NDArray[np.float32] | LabelImage:
         if self._evidence is not None:
-            return LabelImage(self._read_ids(path), self._evidence)
-        probabilities, names = read_probabilities(path, self._size)
+            return LabelImage(self._read_ids(path, size), self._evidence)
+        probabilities, names = read_probabilities(path, size)
         if names != self.class_names:
             raise DataError(
                 f"{path}: found classes {list(names)}, expected {list(self.class_names)} as in the first file"
             )
         return probabilities
 
-    def _read_ids(self, path: Path) -> NDArray[np.uint8]:
+    def _read_ids(self, path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
         import cv2
 
         ids = read_class_ids(path)
-        check_size(ids.shape, self._size, str(path))
+        check_size(ids.shape, size, str(path))
         if cv2.LUT(ids, self._unknown.view(np.uint8)).any():  # many times faster than indexing
             unknown = np.unique(ids[self._unknown[ids]]).tolist()
             raise DataError(
@@ -137,11 +142,16 @@ def read_class_ids(path: Path) -> NDArray[np.uint8]:
     return read_ids(path)
 
 
-def _label_files(folder: Path) -> tuple[dict[int, Path], str]:
+def _label_files(folder: Path, cameras: Sequence[str]) -> tuple[dict[tuple[str, int], Path], str]:
+    """The files by camera and frame number, and their ending."""
     if not is_folder(folder):
         raise DataError(f"labels {shown(folder)}: no such folder")
     paths = inside(folder)
-    found = {suffix: _numbered(paths, suffix) for suffix in (".npz", ".png")}
+    found: dict[str, dict[tuple[str, int], Path]] = {".npz": {}, ".png": {}}
+    for camera in cameras:
+        of_camera = paths if not camera else inside(folder / camera) if is_folder(folder / camera) else []
+        for suffix, files in found.items():
+            files |= {(camera, number): path for number, path in _numbered(of_camera, suffix).items()}
     if all(found.values()):
         raise DataError(
             f"labels {shown(folder)}: found both .npz and .png; expected one kind, keep them in two folders"
@@ -151,7 +161,8 @@ def _label_files(folder: Path) -> tuple[dict[int, Path], str]:
             return files, suffix
     folders = [shown(path.name) for path in paths if path.is_dir()]
     hint = f"; did you mean one of its folders {folders[:8]}?" if folders else ""
-    raise DataError(f"labels {shown(folder)}: found no <frame number>.npz or .png in it{hint}")
+    where = "it" if "" in cameras else f"the folders of the cameras, {', '.join(cameras)}"
+    raise DataError(f"labels {shown(folder)}: found no <frame number>.npz or .png in {where}{hint}")
 
 
 def _numbered(paths: list[Path], suffix: str) -> dict[int, Path]:

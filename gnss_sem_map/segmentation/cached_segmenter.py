@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,8 +29,8 @@ class CachedSegmenter:
 
     segmenter: Segmenter
     label_set: LabelSet
-    image_size: tuple[int, int]
-    """(width, height) of the camera, px."""
+    image_sizes: Mapping[str, tuple[int, int]]
+    """(width, height) by camera, px."""
     folder: Path
 
     @property
@@ -39,20 +40,20 @@ class CachedSegmenter:
 
     def __call__(self, image: Image) -> NDArray[np.uint8]:
         """Probabilities (h, w, c + 1), round(255 p), the same at every call; raises what the segmenter raises."""
-        file = self.folder / f"{image.number}.npz"
+        file = self.folder / image.camera / f"{image.number}.npz"
         try:
             return np.asarray(read_probabilities(file)[0], np.uint8)
         except DataError:
             pass  # not saved yet, or damaged
         seen = class_image(
-            self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_size,
-            f"labels of image {image.number}",
+            self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_sizes[image.camera],
+            f"labels of image {image.frame}",
         )  # fmt: skip
         write_probabilities(file, seen.probabilities, self.class_names)
         return seen.probabilities
 
 
-def probabilities_folder(work: Path, fingerprint: str, resume: bool) -> Path:
+def probabilities_folder(work: Path, fingerprint: str, resume: bool, cameras: Iterable[str]) -> Path:
     """Folder for a network's probabilities; with `resume`, those of an interrupted run with this fingerprint are kept.
 
     Raises DataError when it cannot be written.
@@ -62,7 +63,8 @@ def probabilities_folder(work: Path, fingerprint: str, resume: bool) -> Path:
     try:
         if not (resume and _fingerprint(folder / ABOUT) == fingerprint):
             work_folder.remove_answers(work)
-        folder.mkdir(exist_ok=True)
+        for camera in ("", *cameras):
+            (folder / camera).mkdir(exist_ok=True)
         write_whole(folder / ABOUT, json.dumps({"fingerprint": fingerprint}).encode())
     except OSError as error:
         raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None

@@ -22,6 +22,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.sensor_log.cameras import Camera, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
@@ -87,9 +88,16 @@ class Image:
     number: int
     """Frame number, from the file name."""
     stamp: float
-    """s since the log's epoch, as the camera reports it (see `Calibration.camera_time_offset_s`)."""
+    """s since the log's epoch, as the camera reports it (see `Camera.time_offset_s`)."""
     read: Callable[[], NDArray[np.uint8]] = field(repr=False)
     """The RGB pixels, (h, w, 3); raises DataError when the file is damaged."""
+    camera: str = ""
+    """Name of its camera; empty where the log has but one."""
+
+    @property
+    def frame(self) -> str:
+        """Its number in words, with its camera where there are several."""
+        return f"{self.number} of {self.camera}" if self.camera else str(self.number)
 
 
 def file_of(item: Scan | Image) -> Path | None:
@@ -105,46 +113,37 @@ def file_of(item: Scan | Image) -> Path | None:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration: poses of the sensors and camera intrinsics."""
+    """Calibration: poses of the sensors, and the cameras."""
 
     T_imu_lidar: NDArray[np.float64]
     """(4, 4)."""
-    T_camera_lidar: NDArray[np.float64] | None = None
-    """(4, 4); the camera looks along z, x right, y down. None: no camera."""
-    K: NDArray[np.float64] | None = None
-    """(3, 3) intrinsics of the rectified camera, px."""
-    image_size: tuple[int, int] | None = None
-    """(width, height), px."""
+    cameras: tuple[Camera, ...] = ()
+    """Several have names, all different."""
     p_imu_antenna: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """(3,) m: the GNSS antenna in the imu frame."""
-    camera_time_offset_s: float = 0.0
-    """Moment of exposure minus image stamp."""
 
     def __post_init__(self) -> None:
-        for name, value in (("T_imu_lidar", self.T_imu_lidar), ("T_camera_lidar", self.T_camera_lidar)):
-            if value is not None and not is_rigid(value):
-                raise DataError(
-                    f"calibration: {name} is no rigid transform (found shape {np.shape(value)},"
-                    " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
-                )
-        if self.K is not None and (self.K.shape != (3, 3) or self.K[0, 0] <= 0 or self.K[1, 1] <= 0):
+        if not is_rigid(self.T_imu_lidar):
             raise DataError(
-                f"calibration: found intrinsics {self.K.tolist()}, expected 3 x 3 with positive focal lengths"
+                f"calibration: T_imu_lidar is no rigid transform (found shape {np.shape(self.T_imu_lidar)},"
+                " expected 4 x 4, rotation orthonormal to 1e-3); check the calibration file"
             )
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) < len(names) or (len(names) > 1 and "" in names):
+            raise DataError(f"calibration: found cameras {names}, expected names, all different")
+
+    def camera(self, name: str = "") -> Camera:
+        """The camera of this name; the only one has none. Raises DataError."""
+        found = next((camera for camera in self.cameras if camera.name == name), None)
+        if found is None:
+            there = ", ".join(camera.name for camera in self.cameras) or "none"
+            raise DataError(f"calibration: found cameras {there}, expected {name or 'one without a name'}")
+        return found
 
     @property
-    def has_camera(self) -> bool:
-        """Whether points can be projected into an image."""
-        return self.T_camera_lidar is not None and self.K is not None and self.image_size is not None
-
-
-def is_rigid(T: NDArray[np.float64], tolerance: float = 1e-3) -> bool:
-    """Whether a matrix is a 4 x 4 rigid transform: finite, orthonormal rotation of determinant +1."""
-    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], (0, 0, 0, 1)):
-        return False
-    R = T[:3, :3]
-    with np.errstate(all="ignore"):  # of numbers that are no rotation's
-        return bool(np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
+    def image_sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) of the images by the names of their cameras, px."""
+        return {camera.name: camera.image_size for camera in self.cameras}
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ class SensorLog:
     scans: tuple[Scan, ...]
     """Sorted by stamp."""
     images: tuple[Image, ...]
-    """Sorted by stamp; empty for a drive without a camera."""
+    """Of all cameras, sorted by stamp; empty for a drive without a camera."""
     frame: LocalFrame | None = None
     """Origin of the map; None when the drive has no georeference."""
     imu: ImuSamples | None = None
@@ -189,9 +188,11 @@ class SensorLog:
     """Axes, units and clocks of the drive's sensors, as the drive declares them; None: all are ours."""
 
     def __post_init__(self) -> None:
-        for what, items in (("scans", self.scans), ("images", self.images)):
-            stamps = [item.stamp for item in items]
-            if any(b <= a for a, b in pairwise(stamps)):
+        stamps = {"scans": [scan.stamp for scan in self.scans]}
+        for name, found in self._image_stamps.items():
+            stamps[f"images of {name}" if name else "images"] = found
+        for what, some in stamps.items():
+            if any(b <= a for a, b in pairwise(some)):
                 raise DataError(
                     f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first"
                 )
@@ -229,15 +230,31 @@ class SensorLog:
             conventions=None,
         )
 
-    @cached_property
-    def _image_stamps(self) -> list[float]:
-        return [image.stamp for image in self.images]
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those that have images."""
+        return tuple(camera for camera in self.calibration.cameras if camera.name in self._images_of)
 
-    def image_at(self, stamp: float, within_s: float) -> Image | None:
-        """The image nearest in time to `stamp`, or None when none is within `within_s` seconds."""
-        stamps = self._image_stamps
+    def images_of(self, camera: str = "") -> tuple[Image, ...]:
+        """The images of one camera, sorted by stamp."""
+        return self._images_of.get(camera, ())
+
+    @cached_property
+    def _images_of(self) -> dict[str, tuple[Image, ...]]:
+        found: dict[str, list[Image]] = {}
+        for image in self.images:
+            found.setdefault(image.camera, []).append(image)
+        return {name: tuple(images) for name, images in found.items()}
+
+    @cached_property
+    def _image_stamps(self) -> dict[str, list[float]]:
+        return {name: [image.stamp for image in images] for name, images in self._images_of.items()}
+
+    def image_at(self, stamp: float, within_s: float, camera: str = "") -> Image | None:
+        """The camera's image nearest in time to `stamp`, or None when none is within `within_s` seconds."""
+        images, stamps = self.images_of(camera), self._image_stamps.get(camera, [])
         after = bisect.bisect_left(stamps, stamp)
-        near = [self.images[i] for i in (after - 1, after) if 0 <= i < len(stamps)]
+        near = [images[i] for i in (after - 1, after) if 0 <= i < len(stamps)]
         best = min(near, key=lambda image: abs(image.stamp - stamp), default=None)
         return best if best is not None and abs(best.stamp - stamp) <= within_s else None
 

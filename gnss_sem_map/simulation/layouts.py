@@ -89,16 +89,15 @@ def _write_table(drive: Path, log: SensorLog, out: Path, progress: Callable[[int
 
 def _about_table(drive: Path, log: SensorLog) -> dict[str, Any]:
     calibration, noise = log.calibration, log.imu_noise
-    assert calibration.T_camera_lidar is not None
-    assert calibration.K is not None
+    camera = calibration.camera()
     assert noise is not None
     return {
         "epoch_ns": log.epoch_ns,
         "T_imu_lidar": calibration.T_imu_lidar.tolist(),
-        "T_camera_lidar": calibration.T_camera_lidar.tolist(),
-        "K": calibration.K.tolist(),
-        "image_size": calibration.image_size,
-        "camera_time_offset_s": calibration.camera_time_offset_s,
+        "T_camera_lidar": camera.T_camera_lidar.tolist(),
+        "K": camera.K.tolist(),
+        "image_size": camera.image_size,
+        "camera_time_offset_s": camera.time_offset_s,
         "imu_noise": noise.model_dump(),
         "initial_attitude": {
             "quaternion_xyzw": kitti_raw.quaternions(_imu_rows(drive)[1][:1])[0].tolist(),
@@ -142,7 +141,7 @@ def _write_bag(
         "cameras": {
             "camera": {
                 "topic": "/camera/image_rect_color/compressed", "info": "/camera/camera_info",
-                "time_offset_s": calibration.camera_time_offset_s,
+                "time_offset_s": calibration.camera().time_offset_s,
             }
         },
     }  # fmt: skip

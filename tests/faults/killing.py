@@ -108,8 +108,8 @@ def street_drive(drive: Path, probabilities: Path) -> Any:
     from gnss_sem_map.segmentation import open_segmenter
 
     log = open_drive(drive)
-    spec, size = f"labels:{probabilities}", log.calibration.image_size
-    segmenter = open_segmenter(spec, open_label_set(), expected_size=size)
+    spec, size = f"labels:{probabilities}", log.calibration.image_sizes
+    segmenter = open_segmenter(spec, open_label_set(), sizes=size)
     assert log.reference is not None
     settings = Settings.model_validate({"dynamics": {"window_scans": 2}})
     return Drive(log, log.reference, segmenter, settings)

@@ -77,15 +77,14 @@ def _save(path: Path, header: str, rows: np.ndarray) -> None:
 
 def _write_about(log: SensorLog, path: Path) -> None:
     calibration, noise = log.calibration, log.imu_noise
-    assert calibration.T_camera_lidar is not None
-    assert calibration.K is not None
+    camera = calibration.camera()
     about = {
         "epoch_ns": log.epoch_ns,
         "T_imu_lidar": calibration.T_imu_lidar.tolist(),
-        "T_camera_lidar": calibration.T_camera_lidar.tolist(),
-        "K": calibration.K.tolist(),
-        "image_size": calibration.image_size,
-        "camera_time_offset_s": calibration.camera_time_offset_s,
+        "T_camera_lidar": camera.T_camera_lidar.tolist(),
+        "K": camera.K.tolist(),
+        "image_size": camera.image_size,
+        "camera_time_offset_s": camera.time_offset_s,
         "p_imu_antenna": calibration.p_imu_antenna.tolist(),
         "imu_noise": None if noise is None else noise.model_dump(),
     }
@@ -98,9 +97,8 @@ def as_odometry(drive: Path, folder: Path, trajectory: Trajectory) -> Path:
     for name in ("velodyne", "image_2"):
         (sequence / name).mkdir(parents=True)
     calibration = log.calibration
-    assert calibration.T_camera_lidar is not None
-    assert calibration.K is not None
-    Tr, poses, images = calibration.T_camera_lidar, [], {image.number: image for image in log.images}
+    camera = calibration.camera()
+    Tr, poses, images = camera.T_camera_lidar, [], {image.number: image for image in log.images}
     for k, scan in enumerate(log.scans):
         points = scan.read()
         xyz, T_map_lidar = usable_points_at_stamp(
@@ -115,7 +113,7 @@ def as_odometry(drive: Path, folder: Path, trajectory: Trajectory) -> Path:
     T_camera0_k = Tr @ np.linalg.inv(T_map_lidar[0]) @ T_map_lidar @ np.linalg.inv(Tr)
     np.savetxt(sequence / "poses.txt", T_camera0_k[:, :3].reshape(-1, 12), fmt="%.9e")
     np.savetxt(sequence / "times.txt", [scan.stamp for scan in log.scans], fmt="%.9e")
-    rows_of = {"P2": np.column_stack([calibration.K, np.zeros(3)]), "Tr": Tr[:3]}
+    rows_of = {"P2": np.column_stack([camera.K, np.zeros(3)]), "Tr": Tr[:3]}
     lines = [f"{name}: " + " ".join(f"{v:.12e}" for v in np.ravel(row)) for name, row in rows_of.items()]
     (sequence / "calib.txt").write_text("\n".join(lines) + "\n")
     return sequence

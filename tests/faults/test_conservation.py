@@ -87,9 +87,7 @@ class Place:
     def segmenter(self, log: SensorLog) -> Segmenter | None:
         if self.labels is None:
             return None
-        return open_segmenter(
-            f"labels:{self.labels}", open_label_set(), expected_size=log.calibration.image_size
-        )
+        return open_segmenter(f"labels:{self.labels}", open_label_set(), sizes=log.calibration.image_sizes)
 
 
 @dataclass

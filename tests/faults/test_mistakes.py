@@ -51,9 +51,7 @@ def page_of(drive: Path) -> tuple[Preflight | None, str]:
         segmenter = None
         if folder is not None:
             label_set = open_label_set(settings.classes)
-            segmenter = open_segmenter(
-                f"labels:{folder}", label_set, expected_size=log.calibration.image_size
-            )
+            segmenter = open_segmenter(f"labels:{folder}", label_set, sizes=log.calibration.image_sizes)
         return preflight.check(log, settings, segmenter), ""
     except SemMapError as error:
         return None, str(error)

@@ -135,7 +135,7 @@ def test_workers_use_and_fill_the_cache_of_a_network(
     (tmp_path / "network_of_this_test.py").write_text(NETWORK.format(asked=str(tmp_path / "asked")))
     monkeypatch.syspath_prepend(tmp_path)
     live = replace(source, segmenter="python:network_of_this_test:look")
-    network, size = live.open_network(drive.settings, drive.log), drive.log.calibration.image_size
+    network, size = live.open_network(drive.settings, drive.log), drive.log.calibration.image_sizes
     assert network is not None
     assert size is not None
     (tmp_path / "cache").mkdir()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pyogrio
 import pytest
 from street import Street
 
@@ -167,3 +168,25 @@ def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run, tmp_path: Pa
     write_moving_points({log.scans[0].number: np.array([10**6])}, moved)
     with pytest.raises(DataError, match="make the run again"):
         list(label_points(log, finished.trajectory, maps, finished.settings, [moved]))
+
+
+def test_the_coordinates_of_all_files_change_together_and_the_map_stays(
+    finished: Run, tmp_path: Path
+) -> None:
+    """In place nothing is written in other coordinates than those that config.yaml says."""
+    delivery = finished.settings.changed("delivery.crs=25832").delivery
+    with pytest.raises(ConfigError, match="need a folder of their own"):
+        finished.export(["laz"], delivery=delivery)
+    again = finished.refine(finished.settings.changed("delivery.crs=25832"), tmp_path / "etrs89")
+    assert files(again.folder / "refined") == files(finished.folder / "refined")
+    assert again.about["delivery"]["epsg"] == 25832
+    assert finished.about["delivery"]["heights"] == "above the WGS 84 ellipsoid"
+    for name in ("map.laz", "removed.laz"):
+        assert laspy.read(again.folder / name).header.parse_crs().to_epsg() == 25832
+        assert laspy.read(finished.folder / name).header.parse_crs().to_epsg() == 32632
+    assert pyogrio.read_info(again.folder / "map.gpkg", layer="road")["crs"] == "EPSG:25832"
+    [copc] = again.export(["copc"])
+    assert copc == again.folder / "map.copc.laz"
+    assert len(laspy.read(copc).points) == len(laspy.read(again.folder / "map.laz").points)
+    with pytest.raises(ConfigError, match=r"EPSG:27700 is for"):
+        finished.refine(finished.settings.changed("delivery.crs=27700"), tmp_path / "elsewhere")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.decoding import decode
@@ -14,6 +15,7 @@ from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_tr
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.sensor_log import Calibration, Skip
+from gnss_sem_map.sensor_log.cameras import COEFFICIENTS, Camera, Distortion, lidar_to_camera
 
 Array = NDArray[np.float64]
 
@@ -32,17 +34,20 @@ def calibration_of(bag: Bag, rig: Rig) -> tuple[Calibration, list[Skip]]:
     T_imu_lidar = matrix(lidar.T_imu_lidar)
     if T_imu_lidar is None:
         T_imu_lidar = _found(bag, transforms, imu, frame, "T_imu_lidar")
-    if not rig.cameras:
-        return Calibration(T_imu_lidar, p_imu_antenna=antenna), skips
-    [camera] = rig.cameras.values()
-    K, size, T_shift = _intrinsics(bag, camera)
-    T_camera_lidar = matrix(camera.T_camera_lidar)
-    if T_camera_lidar is None:
-        T_camera_lidar = _found(
-            bag, transforms, camera.frame or _frame_in(bag, camera.topic), frame, "T_camera_lidar"
-        )
-        T_camera_lidar = T_camera_lidar if T_shift is None else np.asarray(T_shift @ T_camera_lidar)
-    return Calibration(T_imu_lidar, T_camera_lidar, K, size, antenna, camera.time_offset_s), skips
+    cameras = []
+    for name, camera in rig.cameras.items():
+        K, size, T_shift, distortion = _intrinsics(bag, camera)
+        T_camera_lidar, T_imu_camera = matrix(camera.T_camera_lidar), matrix(camera.T_imu_camera)
+        if T_camera_lidar is None and T_imu_camera is not None:
+            T_camera_lidar = lidar_to_camera(T_imu_camera, T_imu_lidar)
+        if T_camera_lidar is None:
+            T_camera_lidar = _found(
+                bag, transforms, camera.frame or _frame_in(bag, camera.topic), frame, "T_camera_lidar"
+            )
+            T_camera_lidar = T_camera_lidar if T_shift is None else np.asarray(T_shift @ T_camera_lidar)
+        called = name if len(rig.cameras) > 1 else ""
+        cameras.append(Camera(T_camera_lidar, K, size, camera.time_offset_s, distortion, called))
+    return Calibration(T_imu_lidar, tuple(cameras), antenna), skips
 
 
 def _frame_in(bag: Bag, topic: str) -> str:
@@ -78,10 +83,12 @@ def _antenna(bag: Bag, gnss: GnssTopic, imu: str, transforms: StaticTransforms) 
     return np.array(T[:3, 3]), []
 
 
-def _intrinsics(bag: Bag, camera: CameraTopic) -> tuple[Array, tuple[int, int], Array | None]:
-    """K, (width, height), and what comes after the pose of the camera's frame, where its projection has a shift."""
+def _intrinsics(
+    bag: Bag, camera: CameraTopic
+) -> tuple[Array, tuple[int, int], Array | None, Distortion | None]:
+    """K, (width, height), what comes after the pose of the camera's frame where P has a shift, and the distortion."""
     if camera.K is not None and camera.image_size is not None:
-        return np.array(camera.K, np.float64), camera.image_size, None
+        return np.array(camera.K, np.float64), camera.image_size, None, camera.distortion
     info = _info(bag, camera)
     K, P, D = (np.asarray(_any(info, name), np.float64) for name in ("k", "p", "d"))
     K, P = K.reshape(3, 3), P.reshape(3, 4)
@@ -92,20 +99,47 @@ def _intrinsics(bag: Bag, camera: CameraTopic) -> tuple[Array, tuple[int, int], 
             " camera in rig.yaml, or leave it out (cameras: {})"
         )
     is_rectified = "rect" in camera.topic.lower() if camera.rectified is None else camera.rectified
-    if np.any(D) and not is_rectified:
-        raise DataError(
-            f"{camera.topic}: its lens has distortion {D.tolist()[:5]}, and its images are not rectified; take the"
-            " rectified topic (image_proc writes image_rect_color), or set `rectified: true` if they are"
-        )
     if camera.K is not None:
-        return np.array(camera.K, np.float64), size, None
-    if not P.any():
-        return K, size, None
+        return np.array(camera.K, np.float64), size, None, camera.distortion
+    distortion = camera.distortion
+    if distortion is None and not is_rectified:
+        distortion = _distortion(info, D, camera.info)
+    if distortion is not None or not P.any():
+        return K, size, None, distortion
     shift = None
     if P[:, 3].any():
         shift = np.eye(4)
         shift[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
-    return P[:, :3].copy(), size, shift
+    return P[:, :3].copy(), size, shift, None
+
+
+MODELS = {
+    "plumb_bob": "brown", "rational_polynomial": "brown", "equidistant": "fisheye", "fisheye": "fisheye",
+}  # fmt: skip
+"""Our names of the models of CameraInfo."""
+
+
+def _distortion(info: Any, D: Array, topic: str | None) -> Distortion | None:
+    """The distortion of a CameraInfo; None where all coefficients are zero. Raises DataError for an unknown model.
+
+    A fisheye with coefficients of zero is still no pinhole.
+    """
+    model = MODELS.get(str(info.distortion_model))
+    if model != "fisheye" and not D.any():
+        return None
+    most = {"brown": 8, "fisheye": 4}.get(model or "", 0)
+    if model is None or D[most:].any():
+        raise DataError(
+            f"{topic}: found distortion model {info.distortion_model!r} with {len(D)} coefficients, expected"
+            " plumb_bob, rational_polynomial (8) or equidistant (4); set K, image_size and distortion of the camera in"
+            " rig.yaml, or `rectified: true` if its images are"
+        )
+    count = next((count for count in COEFFICIENTS[model] if count >= len(D)), most)
+    try:
+        padded = [*D[:most].tolist(), *[0.0] * (count - len(D[:most]))]
+        return Distortion(model=model, coefficients=tuple(padded))
+    except ValidationError as error:
+        raise DataError(f"{topic}: {error.errors()[0]['msg'][:200]}") from None
 
 
 def _info(bag: Bag, camera: CameraTopic) -> Any:

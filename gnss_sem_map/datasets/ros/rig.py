@@ -15,7 +15,7 @@ from gnss_sem_map.datasets.ros.stamps import Clock
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
-from gnss_sem_map.sensor_log import is_rigid
+from gnss_sem_map.sensor_log.cameras import Distortion, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 NAME = "rig.yaml"
@@ -76,11 +76,14 @@ class LidarTopic(_Topic):
 
 
 class CameraTopic(_Topic):
-    """A camera; its images are rectified."""
+    """A camera."""
 
     info: str | None = Field(None, description="Topic of its CameraInfo.")
     K: Annotated[list[Row3], Field(min_length=3, max_length=3)] | None = Field(
-        None, description="Intrinsics of the rectified camera, px; default: by the CameraInfo."
+        None, description="Intrinsics, px; default: by the CameraInfo."
+    )
+    distortion: Distortion | None = Field(
+        None, description="Of the lens, with K; default: by the CameraInfo, none for rectified images."
     )
     image_size: tuple[int, int] | None = Field(None, description="Width and height, px; default: CameraInfo.")
     rectified: bool | None = Field(
@@ -89,9 +92,10 @@ class CameraTopic(_Topic):
     T_camera_lidar: Pose | None = Field(
         None, description="LiDAR to camera; default: by the static transforms."
     )
+    T_imu_camera: Pose | None = Field(None, description="Camera to IMU, in place of T_camera_lidar.")
     time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
 
-    _rigid = field_validator("T_camera_lidar")(lambda value: _checked(value))
+    _rigid = field_validator("T_camera_lidar", "T_imu_camera")(lambda value: _checked(value))
 
 
 class Rig(SensorConventions):

@@ -91,12 +91,11 @@ def _only(bag: Bag, sensor: str, key: str) -> str | None:
 
 
 def _check(bag: Bag, rig: Rig) -> None:
-    for sensors, plural in ((rig.lidars, "LiDARs"), (rig.cameras, "cameras")):
-        if len(sensors) > 1:
-            raise DataError(
-                f"rig.yaml: names {len(sensors)} {plural}: {', '.join(sensors)}; one is used as yet; leave the"
-                " others out"
-            )
+    if len(rig.lidars) > 1:
+        raise DataError(
+            f"rig.yaml: names {len(rig.lidars)} LiDARs: {', '.join(rig.lidars)}; one is used as yet; leave the others"
+            " out"
+        )
     named: list[tuple[str, str, str | None]] = [
         *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
         *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),

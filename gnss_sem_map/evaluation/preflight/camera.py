@@ -1,21 +1,27 @@
-"""Checks of the camera: matrix, image size, clock; then depth edges against edges of images and labels."""
+"""Checks of the cameras: matrix, image size, clock; then depth edges against edges of images and labels."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from gnss_sem_map.evaluation.preflight import camera_matrix, camera_pose, image_files, labels
+from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.findings import Finding, Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 
 
 def check(sample: Sample) -> Iterator[Finding]:
+    """Every camera that has images; with several, findings name theirs."""
+    for camera in sample.log.cameras:
+        for finding in _check(CameraSample(sample, camera)):
+            yield replace(finding, check=f"{camera.name}: {finding.check}") if camera.name else finding
+
+
+def _check(sample: CameraSample) -> Iterator[Finding]:
     """Cheap checks first; the images of an unusable camera are not checked."""
-    log = sample.log
-    if not log.images or not log.calibration.has_camera:
-        return
     size, files = image_files.check(sample)
-    matrix = camera_matrix.check(log.calibration, size)
+    matrix = camera_matrix.check(sample.camera, size)
     yield from (matrix, *files)
     if any(finding.level is Level.RED for finding in (matrix, *files)):
         return  # what is wrong there is wrong all over the image

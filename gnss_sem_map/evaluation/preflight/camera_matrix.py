@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.sensor_log import Calibration
+from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
 NAME = "K"
@@ -16,13 +16,13 @@ MOST_SKEW = 0.02
 CENTRE, FAR_OFF = (0.3, 0.7), (0.15, 0.85)
 """Where the principal point lies in an image, as parts of its width and height; cropped images reach the second."""
 VIEW_DEG = (15.0, 150.0)
-"""Widths of view of a rectified camera."""
+"""Widths of view of a camera that is no fisheye."""
 
 
-def check(calibration: Calibration, size: tuple[int, int]) -> Finding:
+def check(camera: Camera, size: tuple[int, int]) -> Finding:
     """Figures of K, for images of (width, height)."""
-    assert calibration.K is not None
-    return _form(calibration.K) or _of_images(calibration.K, size)
+    bends = camera.distortion is not None and camera.distortion.model != "brown"
+    return _form(camera.K) or _of_images(camera.K, size, bends)
 
 
 def _form(K: Array) -> Finding | None:
@@ -39,7 +39,7 @@ def _form(K: Array) -> Finding | None:
         return amber(
             NAME,
             f"found a skew of {K[0, 1]:.4g} px at fx {fx:.4g}",
-            "K has a skew, rectified cameras have none",
+            "K has a skew, cameras have none",
             "set the skew in K to 0",
         )
     if abs(np.log(fx / fy)) > SAME_FOCAL:
@@ -52,13 +52,17 @@ def _form(K: Array) -> Finding | None:
     return None
 
 
-def _of_images(K: Array, size: tuple[int, int]) -> Finding:
-    """Whether focal length and principal point are those of images of (width, height)."""
+def _of_images(K: Array, size: tuple[int, int], bends: bool) -> Finding:
+    """Whether focal length and principal point are those of images of (width, height).
+
+    Where the lens `bends`, the focal length is that of its axis, and tells no width of view.
+    """
     fx = float(K[0, 0])
     centre = np.array([K[0, 2] / size[0], K[1, 2] / size[1]])
     view = float(np.degrees(2 * np.arctan(size[0] / (2 * fx))))
+    sees = "" if bends else f" sees {view:.0f} deg"
     found = (
-        f"fx {fx:.4g} px sees {view:.0f} deg; the principal point is at {centre[0]:.2f} of the width,"
+        f"fx {fx:.4g} px{sees}; the principal point is at {centre[0]:.2f} of the width,"
         f" {centre[1]:.2f} of the height"
     )
     if ((centre < CENTRE[0]) | (centre > CENTRE[1])).all() and centre.max() - centre.min() < 0.1 * max(
@@ -79,7 +83,7 @@ def _of_images(K: Array, size: tuple[int, int]) -> Finding:
             "principal point at the edge: K is of other images, or its numbers in another order",
             "check cx and cy of K, and the size of the images",
         )
-    if not VIEW_DEG[0] <= view <= VIEW_DEG[1]:
+    if not bends and not VIEW_DEG[0] <= view <= VIEW_DEG[1]:
         return amber(
             NAME,
             found,

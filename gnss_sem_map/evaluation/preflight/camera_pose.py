@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.depth_edges import Change, Edges
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.projection import NEAREST_DEPTH_M
 
 Array = NDArray[np.float64]
@@ -155,7 +155,7 @@ def _means(tried: Array, given: Array) -> Array:
     return np.where(counts >= max(LEAST_VIEWS, tried.shape[1] / 2), gains, -np.inf)
 
 
-def check(sample: Sample) -> Iterator[Finding]:
+def check(sample: CameraSample) -> Iterator[Finding]:
     """Turned, late, inverted, of another lens: or fine."""
     if _all_behind(sample):
         yield red(
@@ -175,19 +175,19 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield _pose(sample, edges)
 
 
-def _all_behind(sample: Sample) -> bool:
+def _all_behind(sample: CameraSample) -> bool:
     """Whether the first scan that can be read has nothing in front of the camera."""
-    T_camera_lidar = sample.log.calibration.T_camera_lidar
-    if sample.first_points is None or T_camera_lidar is None:
+    T_camera_lidar, first = sample.camera.T_camera_lidar, sample.drive.first_points
+    if first is None:
         return False
-    xyz = sample.first_points[0].xyz
+    xyz = first[0].xyz
     xyz = xyz[np.isfinite(xyz).all(axis=1) & xyz.any(axis=1)]
     return len(xyz) > 0 and bool(
         (xyz @ T_camera_lidar[2, :3] + T_camera_lidar[2, 3] <= NEAREST_DEPTH_M).all()
     )
 
 
-def _pose(sample: Sample, edges: Edges) -> Finding:
+def _pose(sample: CameraSample, edges: Edges) -> Finding:
     given, fine = edges.agreement(), edges.agreement(fine=True)
     seen = float(np.nanmean(fine)) if np.isfinite(fine).any() else float("nan")
     found = (
@@ -220,7 +220,7 @@ def _pose(sample: Sample, edges: Edges) -> Finding:
             "check T_camera_lidar: it takes points from the LiDAR to the camera, x right, y down, z forward",
         )
     if common.mean() < LEAST_COMMON or in_errors(common) < COMMON_SURE:
-        if not sample.is_moving:
+        if not sample.drive.is_moving:
             return green(NAME, f"{found}; not observable further: the vehicle stands")
         return amber(
             NAME,
@@ -231,7 +231,7 @@ def _pose(sample: Sample, edges: Edges) -> Finding:
     return green(NAME, f"{found}; the best {best.family.name} is {best.value:+.2f} off")
 
 
-def _on_other_images(sample: Sample, best: Best) -> tuple[Best | None, int]:
+def _on_other_images(sample: CameraSample, best: Best) -> tuple[Best | None, int]:
     """A suspicion of a few images, that nothing else was looked for in, on all; None where others do not share it."""
     if sample.other_edges is None:
         return None, 0
@@ -244,8 +244,7 @@ def _on_other_images(sample: Sample, best: Best) -> tuple[Best | None, int]:
 
 def _elsewhere(edges: Edges) -> tuple[str, Best] | None:
     """A camera that looks quite elsewhere: inverted, or turned by quarters."""
-    T = edges.calibration.T_camera_lidar
-    assert T is not None
+    T = edges.camera.T_camera_lidar
     given = edges.agreement(fine=True)
     base = np.where(np.isfinite(given), given, 1.0)
     tried = {"inverted: T_lidar_camera was given": np.asarray(np.linalg.inv(T))}
@@ -279,19 +278,24 @@ def _reached(edges: Edges) -> Array:
     return edges.agreement(Change(rotation_deg=(x, y, z)), fine=True)
 
 
-def _named(sample: Sample, best: Best, found: str) -> Finding:
+def _named(sample: CameraSample, best: Best, found: str) -> Finding:
     family, value = best.family, best.value
     level = red if abs(value) > 2 * family.same and best.sigmas > SURE else amber
     found += f", {best.gain:.2f} more with the change (+- {best.gain / best.sigmas:.2f})"
     if family is TIME:
         word = "late" if value < 0 else "early"
-        given = sample.settings.labelling.camera_time_offset_s
-        offset = (sample.log.calibration.camera_time_offset_s if given is None else given) + value
+        given = sample.drive.settings.labelling.camera_time_offset_s
+        offset = (sample.camera.time_offset_s if given is None else given) + value
+        setting = (
+            f"time_offset_s of {sample.camera.name}"
+            if sample.camera.name
+            else "labelling.camera_time_offset_s"
+        )
         return level(
             NAME,
             found,
             f"image stamps are {abs(value):.2f} s {word}",
-            f"set labelling.camera_time_offset_s: {offset:.3f}",
+            f"set {setting}: {offset:.3f}",
         )
     factor = float(np.exp(value))
     if family is FOCAL:

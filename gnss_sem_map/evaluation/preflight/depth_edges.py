@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
 from gnss_sem_map.scans.projection import NEAREST_DEPTH_M
-from gnss_sem_map.sensor_log import Calibration, Points
+from gnss_sem_map.sensor_log import Points
+from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
 Strength = NDArray[np.float32]
@@ -73,7 +75,8 @@ class Edges:
 
     views: tuple[View, ...]
     trajectory: Trajectory | None
-    calibration: Calibration
+    T_imu_lidar: Array
+    camera: Camera
 
     def agreement(self, change: Change = UNCHANGED, fine: bool = False, shift: int = 0) -> Array:
         """Strength of the images' edges at the depth edges (k,), NaN where too few are seen.
@@ -98,21 +101,21 @@ class Edges:
 
     def with_camera(self, T_camera_lidar: Array) -> Edges:
         """The same, for a camera elsewhere."""
-        return replace(self, calibration=replace(self.calibration, T_camera_lidar=T_camera_lidar))
+        return replace(self, camera=replace(self.camera, T_camera_lidar=T_camera_lidar))
 
     def _pixels(self, change: Change) -> tuple[Array, Array, Array]:
-        calibration = self.calibration
-        assert calibration.T_camera_lidar is not None
-        assert calibration.K is not None
+        camera = self.camera
         T_lidar_map = self._T_lidar_map if not change.time_s else self._at(change.time_s)
-        T = calibration.T_camera_lidar @ T_lidar_map
+        T = camera.T_camera_lidar @ T_lidar_map
         if any(change.rotation_deg):
             T[:, :3] = Rotation.from_rotvec(change.rotation_deg, degrees=True).as_matrix() @ T[:, :3]
-        x, y, depth = (np.einsum("nij,nj->ni", T[self._of, :3, :3], self._p_map) + T[self._of, :3, 3]).T
-        K = calibration.K
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = change.size * (change.focal * (K[0, 0] * x + K[0, 1] * y) / depth + K[0, 2])
-            v = change.size * (change.focal * K[1, 1] * y / depth + K[1, 2])
+        p_camera = np.einsum("nij,nj->ni", T[self._of, :3, :3], self._p_map) + T[self._of, :3, 3]
+        K = camera.K.copy()
+        K[:2, :2] *= change.focal * change.size
+        K[:2, 2] *= change.size
+        changed, found = replace(camera, K=K), np.empty_like(p_camera)
+        kernels.pixels(p_camera, changed.projection(np.eye(4)), changed.lens, NEAREST_DEPTH_M, found)
+        u, v, depth = found.T
         return u, v, depth
 
     def _at(self, time_s: float) -> Array:
@@ -122,7 +125,7 @@ class Edges:
         stamps = np.array([view.stamp for view in self.views]) + time_s
         start, end = self.trajectory.start - EXTRAPOLATE_S, self.trajectory.end + EXTRAPOLATE_S
         T_map_imu = self.trajectory.at(np.clip(stamps, start, end), EXTRAPOLATE_S)
-        return np.asarray(np.linalg.inv(T_map_imu @ self.calibration.T_imu_lidar))
+        return np.asarray(np.linalg.inv(T_map_imu @ self.T_imu_lidar))
 
     @cached_property
     def _T_lidar_map(self) -> Array:
@@ -134,8 +137,7 @@ class Edges:
         of = np.repeat(np.arange(len(self.views)), [len(view.p_map) for view in self.views])
         p_map = np.concatenate([view.p_map for view in self.views])
         weights = np.concatenate([view.weights for view in self.views])
-        assert self.calibration.T_camera_lidar is not None
-        ahead = (self.calibration.T_camera_lidar @ self._T_lidar_map)[of, 2]
+        ahead = (self.camera.T_camera_lidar @ self._T_lidar_map)[of, 2]
         use = np.flatnonzero(np.einsum("nj,nj->n", ahead[:, :3], p_map) + ahead[:, 3] > -BEHIND_M)
         return of[use], p_map[use], weights[use]
 

@@ -5,26 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from gnss_sem_map.errors import DataError, ImageSizeError
+from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.evaluation.preflight.sample import Sample
-from gnss_sem_map.scans.projection import exposure_stamp
 
 SIZE, CLOCK = "image size", "image stamps"
 LOOKED_AT = 3
 
 
-def check(sample: Sample) -> tuple[tuple[int, int], tuple[Finding, ...]]:
+def check(sample: CameraSample) -> tuple[tuple[int, int], tuple[Finding, ...]]:
     """A few files, all stamps; and the (width, height) that the images really have."""
     size, found = _size(sample)
     return size, (found, _clock(sample))
 
 
-def _size(sample: Sample) -> tuple[tuple[int, int], Finding]:
-    log = sample.log
-    size = log.calibration.image_size
-    assert size is not None
+def _size(sample: CameraSample) -> tuple[tuple[int, int], Finding]:
+    size = sample.camera.image_size
     errors: list[DataError] = []
-    images = log.images[:: max(1, len(log.images) // LOOKED_AT)][:LOOKED_AT]
+    images = sample.images[:: max(1, len(sample.images) // LOOKED_AT)][:LOOKED_AT]
     for image in images:
         try:
             sample.pixels(image)
@@ -49,19 +46,19 @@ def _size(sample: Sample) -> tuple[tuple[int, int], Finding]:
     return size, green(SIZE, f"{size[0]} x {size[1]} pixels")
 
 
-def _clock(sample: Sample) -> Finding:
+def _clock(sample: CameraSample) -> Finding:
     """Whether there are images at the time of the scans."""
-    log, settings = sample.log, sample.settings.labelling
+    log, images, settings = sample.drive.log, sample.images, sample.drive.settings.labelling
     if not log.scans:
-        return green(CLOCK, f"{len(log.images)} images, no scans")
+        return green(CLOCK, f"{len(images)} images, no scans")
     scans = np.array([scan.stamp for scan in log.scans])
-    exposed = np.array([exposure_stamp(image, log.calibration, settings) for image in log.images])
+    exposed = np.array([sample.exposed(image) for image in images])
     after = np.searchsorted(exposed, scans)
     nearest = np.minimum(
         np.abs(exposed[np.maximum(after - 1, 0)] - scans),
         np.abs(exposed[np.minimum(after, len(exposed) - 1)] - scans),
     )
-    share = float((nearest <= settings.image_within_s + abs(exposed[0] - log.images[0].stamp)).mean())
+    share = float((nearest <= settings.image_within_s + abs(exposed[0] - images[0].stamp)).mean())
     found = (
         f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s;"
         f" images are of {exposed[0]:.1f} to {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"

@@ -6,6 +6,7 @@ A network is not asked: that is what takes the time of a run.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,9 @@ from gnss_sem_map.evaluation.preflight.camera_pose import (
     best_change,
     in_errors,
 )
+from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.depth_edges import UNCHANGED, Change, Edges, View, border_strength
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.labels.probabilities import LabelImage
 from gnss_sem_map.segmentation.cached import CachedLabels
 
@@ -34,13 +35,11 @@ LEAST_COMMON = 0.1
 UNKNOWN = -1
 
 
-def check(sample: Sample, against_lidar: bool) -> Iterator[Finding]:
+def check(sample: CameraSample, against_lidar: bool) -> Iterator[Finding]:
     """Only labels from files: what they hold, and whether it fits the scans."""
-    segmenter, edges = sample.segmenter, sample.edges
+    segmenter, edges = sample.drive.segmenter, sample.edges
     if not isinstance(segmenter, CachedLabels) or edges is None:
         return
-    size = sample.log.calibration.image_size
-    assert size is not None
     views: list[View] = []
     seen: list[NDArray[np.int64]] = []
     errors: list[DataError] = []
@@ -51,7 +50,7 @@ def check(sample: Sample, against_lidar: bool) -> Iterator[Finding]:
             errors.append(error)
             continue
         seen.append(classes)
-        coarse, fine = border_strength(classes, size)
+        coarse, fine = border_strength(classes, sample.camera.image_size)
         views.append(View(view.p_map, view.weights, view.stamp, coarse, fine))
     if not seen and errors:
         yield amber(
@@ -65,7 +64,7 @@ def check(sample: Sample, against_lidar: bool) -> Iterator[Finding]:
     content = _content(seen, segmenter.class_names)
     yield content
     if against_lidar and not content.mistake:
-        yield _place(sample, Edges(tuple(views), edges.trajectory, edges.calibration))
+        yield _place(sample, replace(edges, views=tuple(views)))
 
 
 def classes_of(labels: NDArray[np.uint8] | NDArray[np.float32] | LabelImage) -> NDArray[np.int64]:
@@ -102,10 +101,10 @@ def _content(seen: list[NDArray[np.int64]], names: tuple[str, ...]) -> Finding:
     return green(NAME, found)
 
 
-def _place(sample: Sample, edges: Edges) -> Finding:
+def _place(sample: CameraSample, edges: Edges) -> Finding:
     given = edges.agreement()
     common = (given - edges.others())[np.isfinite(given)]
-    if len(common) < LEAST_VIEWS or not sample.is_moving:
+    if len(common) < LEAST_VIEWS or not sample.drive.is_moving:
         return green(PLACE, "not observable: too few labelled scans with depth edges, or the vehicle stands")
     found = (
         f"borders of labels at depth edges of {len(common)} scans: {np.nanmean(given):.2f} times those elsewhere,"
@@ -119,9 +118,7 @@ def _place(sample: Sample, edges: Edges) -> Finding:
         and best.gain > 2 * max(common.mean(), 0.0)
         and _belong_together(edges, best.family.of(best.value))
     ):
-        K = edges.calibration.K
-        assert K is not None
-        pixels = abs(np.tan(np.radians(best.value)) * K[0, 0])
+        pixels = abs(np.tan(np.radians(best.value)) * edges.camera.K[0, 0])
         return red(
             PLACE,
             found,

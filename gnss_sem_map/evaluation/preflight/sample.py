@@ -14,16 +14,14 @@ from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.preflight.depth_edges import Edges, View, depth_edges, edge_strength
 from gnss_sem_map.evaluation.preflight.diagnosis import Diagnosis, diagnose
 from gnss_sem_map.evaluation.preflight.fixes import Fixes, examine
 from gnss_sem_map.evaluation.preflight.lidar_motion import STEPS, Stretch, Surfaces, stretch
 from gnss_sem_map.mapping.trajectory import smooth_log
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, LONGEST_SWEEP_S
-from gnss_sem_map.scans.projection import exposure_stamp
 from gnss_sem_map.scans.registration import inverse
 from gnss_sem_map.segmentation import Segmenter
-from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 Array = NDArray[np.float64]
 LONGEST_S = 60.0
@@ -161,60 +159,8 @@ class Sample:
     def _deskewed(self) -> dict[int, tuple[Array, Surfaces]]:
         return {}
 
-    def pixels(self, image: Image) -> NDArray[np.uint8]:
-        """An image, read once; raises DataError."""
-        if image.number not in self._pixels:
-            self._pixels[image.number] = image.read()
-        return self._pixels[image.number]
-
     @cached_property
-    def _pixels(self) -> dict[int, NDArray[np.uint8]]:
-        return {}
-
-    @property
-    def edges(self) -> Edges | None:
-        """Depth edges of a few scans, and their images; None without a camera."""
-        return self._edges[0] if self._edges is not None else None
-
-    @property
-    def edge_images(self) -> tuple[Image, ...]:
-        """The image of each view of `edges`."""
-        return self._edges[1] if self._edges is not None else ()
-
-    @cached_property
-    def _edges(self) -> tuple[Edges, tuple[Image, ...]] | None:
-        return self._edges_of(self._moving_scans[0])
-
-    @cached_property
-    def other_edges(self) -> Edges | None:
-        """The same of other scans, twice as many: read only where the first ones leave doubt."""
-        found = self._edges_of(self._moving_scans[1])
-        return found[0] if found is not None else None
-
-    def _edges_of(self, scans: list[Scan]) -> tuple[Edges, tuple[Image, ...]] | None:
-        log = self.log
-        if not log.images or not log.calibration.has_camera:
-            return None
-        views, images = [], []
-        for scan in scans:
-            image = log.image_at(scan.stamp, self.settings.labelling.image_within_s)
-            if image is None:
-                continue
-            stamp = exposure_stamp(image, log.calibration, self.settings.labelling)
-            try:
-                points = scan.read()
-                p_map, weights = depth_edges(points, scan.stamp, self.trajectory, log.calibration.T_imu_lidar)
-                coarse, fine = edge_strength(self.pixels(image))
-            except (DataError, FactorGraphError):
-                continue  # counted when the map is built
-            views.append(View(p_map, weights, stamp, coarse, fine))
-            images.append(image)
-        if not views:
-            return None
-        return Edges(tuple(views), self.trajectory, log.calibration), tuple(images)
-
-    @cached_property
-    def _moving_scans(self) -> tuple[list[Scan], list[Scan]]:
+    def moving_scans(self) -> tuple[list[Scan], list[Scan]]:
         """Scans spread over the drive: those that move most, for a moment differs from another there, and the rest."""
         scans = self.log.scans
         if not scans:
@@ -238,7 +184,7 @@ class Sample:
     @property
     def is_moving(self) -> bool:
         """Whether the first and the last scan that are looked at see different places."""
-        scans = self._moving_scans[0]
+        scans = self.moving_scans[0]
         if self.trajectory is None or len(scans) < 2:
             return False
         return _way(*self.trajectory.at([scans[0].stamp, scans[-1].stamp], EXTRAPOLATE_S)) > LEAST_WAY_M

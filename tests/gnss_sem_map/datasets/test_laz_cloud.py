@@ -87,3 +87,13 @@ def test_what_is_no_base_is_refused_by_name(tmp_path: Path) -> None:
     for path in (text, tmp_path / "absent.laz"):
         with pytest.raises(DataError, match=f"{path.name}: cannot be read as LAS or LAZ"):
             read_base(path, FRAME)
+
+
+def test_heights_above_a_geoid_that_is_not_there_are_refused(tmp_path: Path) -> None:
+    """PROJ alone would take them for ellipsoidal ones, and the cloud would stand 47 m too low."""
+    write(tmp_path / "city.laz", around(np.array([[10.0, 5.0, 1.0]])), epsg=None)
+    las = laspy.read(tmp_path / "city.laz")
+    las.header.add_crs(CRS.from_user_input("EPSG:25832+5773"))
+    las.write(tmp_path / "city.laz")
+    with pytest.raises(DataError, match=r"city\.laz: its heights are those of EGM96 height, .* ellipsoid"):
+        read_base(tmp_path / "city.laz", FRAME)

@@ -63,7 +63,7 @@ def truth(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path
 def confused(small_drive: Street) -> Drive:
     """Buildings are called `other`, sidewalks road."""
     log = open_drive(small_drive.drive)
-    honest = open_segmenter(f"labels:{small_drive.labels}", URBAN, expected_size=log.calibration.image_size)
+    honest = open_segmenter(f"labels:{small_drive.labels}", URBAN, sizes=log.calibration.image_sizes)
     assert log.reference is not None
     return Drive(log, log.reference, Confused(honest, (ROAD, ROAD, VEHICLE, OTHER, OTHER, OTHER)), Settings())
 

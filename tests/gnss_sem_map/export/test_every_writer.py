@@ -12,11 +12,13 @@ import pytest
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.geopackage import write_geopackage
 from gnss_sem_map.export.pictures import write_perspective, write_topview
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.export.raster import write_topview_geotiff
-from gnss_sem_map.export.trajectories import write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectories import write_geojson, write_geoparquet, write_kitti, write_tum
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
@@ -26,6 +28,9 @@ Writer = Callable[[SemanticMap, Trajectory, LocalFrame, Path], None]
 WRITERS: dict[str, Writer] = {
     "map.ply": lambda m, t, f, path: write_ply(Exported(in_memory(m, f), [t]), path),
     "map.laz": lambda m, t, f, path: write_laz(Exported(in_memory(m, f), [t]), path),
+    "removed.laz": lambda m, t, f, path: write_removed(Exported(in_memory(m, f), [t]), path),
+    "map.copc.laz": lambda m, t, f, path: write_copc(Exported(in_memory(m, f), [t]), path),
+    "map.gpkg": lambda m, t, f, path: write_geopackage(Exported(in_memory(m, f), [t]), path),
     "topview.png": lambda m, t, f, path: write_topview(Exported(in_memory(m, f), [t]), path),
     "perspective.png": lambda m, t, f, path: write_perspective(Exported(in_memory(m, f), [t]), path),
     "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(Exported(in_memory(m, f), [t]), path),
@@ -33,6 +38,7 @@ WRITERS: dict[str, Writer] = {
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
     "trajectory_kitti.txt": lambda m, t, f, path: write_kitti(t, path),
     "trajectory.geojson": lambda m, t, f, path: write_geojson(t, f, path),
+    "trajectory_wgs84.parquet": lambda m, t, f, path: write_geoparquet(t, f, 10**18, path),
 }
 
 

@@ -1,16 +1,20 @@
 """PLY as plyfile reads it, LAZ as laspy reads it, coordinates as the textbook computes them."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import copclib
 import laspy
 import numpy as np
 import plyfile
 import pytest
 from pyproj import Geod, Proj
+from scipy.spatial import cKDTree
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.exported import Exported
-from gnss_sem_map.export.point_cloud import write_laz, write_ply
+from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
@@ -23,6 +27,12 @@ def as_written(whole: SemanticMap) -> np.ndarray:
     order = np.lexsort((whole.voxels.keys, y // 512, x // 512))
     assert (order != np.arange(len(whole))).any()  # the street lies in more than one tile
     return order
+
+
+def standing(whole: SemanticMap) -> np.ndarray:
+    """Those of them that were not removed."""
+    order = as_written(whole)
+    return order[whole.states[order] != State.REMOVED]
 
 
 def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, tmp_path: Path) -> None:
@@ -68,17 +78,23 @@ def test_class_names_cannot_break_out_of_the_header(street: SemanticMap, tmp_pat
     write_ply(Exported(in_memory(hostile)), tmp_path / "map.ply")
     write_laz(Exported(in_memory(hostile, LocalFrame(49.0, 8.4, 115.0))), tmp_path / "map.laz")
     assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == street.shown.sum()
-    assert len(laspy.read(tmp_path / "map.laz").points) == len(street)
+    assert len(laspy.read(tmp_path / "map.laz").points) == (street.states != State.REMOVED).sum()
 
 
-def test_the_laz_holds_every_voxel_and_reads_back_equal(
-    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+@pytest.mark.parametrize(("write", "removed"), [(write_laz, False), (write_removed, True)])
+def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
+    write: Callable[[Exported, Path], None],
+    removed: bool,
+    street: SemanticMap,
+    karlsruhe: LocalFrame,
+    tmp_path: Path,
 ) -> None:
-    write_laz(Exported(in_memory(street, karlsruhe)), tmp_path / "map.laz")
+    write(Exported(in_memory(street, karlsruhe)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     assert (str(las.header.version), las.header.point_format.id) == ("1.4", 7)
-    assert len(las.points) == len(street)
     order = as_written(street)
+    order = order[(street.states[order] == State.REMOVED) == removed]
+    assert len(las.points) == len(order) > 100
     labels, states = street.labels[order], street.states[order]
     unlabelled = labels < 0
     ids = np.where(unlabelled, 0, street.voxels.label_set.semantic_kitti_ids[labels])
@@ -93,7 +109,21 @@ def test_the_laz_holds_every_voxel_and_reads_back_equal(
         las.red[~unlabelled] >> 8, street.voxels.label_set.colours[labels[~unlabelled], 0]
     )
     assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
-    assert las.header.number_of_points_by_return[0] == len(street)
+    assert las.header.number_of_points_by_return[0] == len(order)
+
+
+def test_a_reader_that_knows_no_flags_sees_no_ghost_in_the_map(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    """By a decoder in C++ that is not the one of laspy: of the car that was removed no point is in the file."""
+    write_laz(Exported(in_memory(street, karlsruhe)), tmp_path / "map.laz")
+    points = copclib.LazReader(str(tmp_path / "map.laz")).GetPoints()
+    found = np.column_stack([points.x, points.y, points.z])
+    removed = street.voxels.centres[street.states == State.REMOVED]
+    ghosts = Georeference(karlsruhe).from_map(removed)
+    nearest, _ = cKDTree(found).query(ghosts)
+    assert len(found) == (street.states != State.REMOVED).sum()
+    assert nearest.min() > 0.1
 
 
 @pytest.mark.parametrize(
@@ -114,7 +144,7 @@ def test_the_laz_lies_in_the_zone_and_hemisphere_of_the_origin(
     assert crs is not None
     assert crs.to_epsg() == epsg
     assert las.header.global_encoding.wkt
-    expected = utm_by_geodesic(street.voxels.centres[as_written(street)], frame, epsg)
+    expected = utm_by_geodesic(street.voxels.centres[standing(street)], frame, epsg)
     np.testing.assert_allclose(las.xyz, expected, atol=0.002)
 
 
@@ -124,7 +154,7 @@ def test_a_map_without_georeference_keeps_its_metres_and_claims_no_crs(
     write_laz(Exported(in_memory(street)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     assert las.header.parse_crs() is None
-    np.testing.assert_allclose(las.xyz, street.voxels.centres[as_written(street)], atol=0.001)
+    np.testing.assert_allclose(las.xyz, street.voxels.centres[standing(street)], atol=0.001)
 
 
 def utm_by_geodesic(p_map: np.ndarray, frame: LocalFrame, epsg: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The map from above, against a dictionary of columns; the GeoTIFF, as rasterio and pyproj see it."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import rasterio
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.raster import (
     GEOTIFF_NODATA,
     GEOTIFF_UNLABELLED,
@@ -17,7 +19,6 @@ from gnss_sem_map.export.raster import (
     top_view,
     write_topview_geotiff,
 )
-from gnss_sem_map.export.utm import from_utm, to_utm
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
 
@@ -63,7 +64,7 @@ def test_rasterio_finds_every_class_where_pyproj_says_it_is(
     rows, columns = np.nonzero(inside_one_class(view.labels))
     assert len(rows) > 5000
     east, north = view.west + (columns + 0.5) * 0.2, view.north - (rows + 0.5) * 0.2
-    utm = to_utm(frame, np.column_stack([east, north, view.heights[rows, columns]]))
+    utm = Georeference(frame).from_map(np.column_stack([east, north, view.heights[rows, columns]]))
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
         assert tiff.crs.to_epsg() == frame.utm_epsg
         found = np.array([value for (value,) in tiff.sample(utm[:, :2])])
@@ -112,10 +113,23 @@ def test_the_geotiff_says_what_its_values_mean(
         assert tiff.res == pytest.approx((0.2, 0.2))
 
 
+def test_the_geotiff_is_a_valid_cog(town: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path) -> None:
+    """As `rio cogeo validate --strict` checks it."""
+    write_topview_geotiff(Exported(in_memory(town, karlsruhe)), tmp_path / "topview_class.tif")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its imports
+        from rio_cogeo import cog_validate
+    assert cog_validate(tmp_path / "topview_class.tif", strict=True) == (True, [], [])
+    with rasterio.open(tmp_path / "topview_class.tif") as tiff:
+        assert len(tiff.overviews(1)) > 1
+        assert tiff.colormap(1)[3][:3] == tuple(town.voxels.label_set.colours[3])
+
+
 def test_utm_there_and_back_is_the_identity(street: SemanticMap) -> None:
     centres = street.voxels.centres[::100]
     for frame in (AT_THE_EDGE_OF_A_ZONE, LocalFrame(-33.9, 151.2, 0)):
-        np.testing.assert_allclose(from_utm(frame, to_utm(frame, centres)), centres, atol=1e-6)
+        utm = Georeference(frame)
+        np.testing.assert_allclose(utm.to_map(utm.from_map(centres)), centres, atol=1e-6)
 
 
 def test_the_blocks_of_a_large_raster_join_without_a_seam(

@@ -4,6 +4,7 @@ import json
 import warnings
 from pathlib import Path
 
+import geopandas
 import numpy as np
 import pytest
 from pyproj import Geod
@@ -15,7 +16,13 @@ from factor_graphs.accuracy import coverage, pose_nees
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.export.trajectories import write_covariance_tum, write_geojson, write_kitti, write_tum
+from gnss_sem_map.export.trajectories import (
+    write_covariance_tum,
+    write_geojson,
+    write_geoparquet,
+    write_kitti,
+    write_tum,
+)
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # evo's imports warn, not we
@@ -109,3 +116,23 @@ def test_one_pose_is_a_point(karlsruhe: LocalFrame, tmp_path: Path) -> None:
     write_geojson(Trajectory(np.zeros(1), np.eye(4)[None]), karlsruhe, tmp_path / "trajectory.geojson")
     (feature,) = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [8.4, 49.0, 115.0]}
+
+
+def test_geopandas_reads_the_geoparquet_back(
+    uncertain: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    epoch_ns = 1_317_000_000_000_000_000
+    write_geoparquet(uncertain, karlsruhe, epoch_ns, tmp_path / "trajectory_wgs84.parquet")
+    table = geopandas.read_parquet(tmp_path / "trajectory_wgs84.parquet")
+    assert table.crs.to_epsg() == 4979
+    lat_deg, lon_deg, alt_m = karlsruhe.to_geodetic(uncertain.positions)
+    points = table.geometry
+    np.testing.assert_allclose(
+        np.column_stack([points.x, points.y, points.z]), np.column_stack([lon_deg, lat_deg, alt_m])
+    )
+    assert str(table["time"].dt.tz) == "UTC"
+    seconds = (table["time"].astype("int64") - epoch_ns) / 1e9
+    np.testing.assert_allclose(seconds, uncertain.stamps, atol=1e-6)
+    np.testing.assert_allclose(table["stddev_up_m"], uncertain.position_stddevs[:, 2])
+    east = np.arctan2(*uncertain.T_map_imu[:, :2, 0].T)
+    np.testing.assert_allclose(np.sin(np.radians(table["heading_deg"])), np.sin(east), atol=1e-9)

@@ -21,7 +21,7 @@ def drive(small_drive: Street) -> Drive:
     """Nothing moves in it, and nothing that does is sought."""
     log = open_drive(small_drive.drive)
     segmenter = open_segmenter(
-        f"labels:{small_drive.labels}", open_label_set(), expected_size=log.calibration.image_size
+        f"labels:{small_drive.labels}", open_label_set(), sizes=log.calibration.image_sizes
     )
     assert log.reference is not None
     return Drive(log, log.reference, segmenter, NOTHING_MOVES)

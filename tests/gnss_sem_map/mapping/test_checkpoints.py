@@ -78,7 +78,7 @@ from gnss_sem_map.segmentation import open_segmenter
 if __name__ == "__main__":
     drive, probabilities, work = map(Path, sys.argv[1:])
     log = open_drive(drive)
-    segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), expected_size=log.calibration.image_size)
+    segmenter = open_segmenter(f"labels:{probabilities}", open_label_set(), sizes=log.calibration.image_sizes)
     job = Drive(log, log.reference, segmenter, Settings(dynamics={"enabled": False, "window_scans": 1}))
     # compiled code is loaded first: the kills fall into the mapping
     fusion.map_scans(job, work.with_suffix(".first"), RunStats())

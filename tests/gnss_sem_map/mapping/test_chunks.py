@@ -53,7 +53,9 @@ def moving() -> Drive:
 @pytest.fixture(scope="module")
 def together(moving: Drive, tmp_path_factory: pytest.TempPathFactory) -> list[MappedChunk]:
     """All chunks, mapped in one go."""
-    return list(map_chunks(moving, range(3), tmp_path_factory.mktemp("waiting")))
+    return list(
+        map_chunks(moving, range(3), tmp_path_factory.mktemp("waiting"), tmp_path_factory.mktemp("work"))
+    )
 
 
 def told(chunk: MappedChunk) -> Iterator[tuple[str, object]]:
@@ -81,18 +83,49 @@ def test_every_chunk_but_the_last_has_two_windows_of_scans_and_one_after_it(movi
         assert len(chunks) == 1 or WINDOW <= len(chunks[-1]) < 3 * WINDOW
 
 
-@pytest.mark.parametrize("ranges", [[range(1), range(1, 2), range(2, 3)], [range(2), range(2, 3)]])
+DIVISIONS = [
+    [range(1), range(1, 2), range(2, 3)],
+    [range(2, 3), range(1, 2), range(1)],  # what the later ones have saved is read
+    [range(2), range(2, 3)],
+    [range(2, 3), range(2)],
+]
+
+
+@pytest.mark.parametrize("ranges", DIVISIONS)
 def test_the_chunks_say_the_same_for_any_division_among_processes(
     moving: Drive, together: list[MappedChunk], ranges: list[range], tmp_path: Path
 ) -> None:
-    apart = [chunk for numbers in ranges for chunk in map_chunks(moving, numbers, tmp_path)]
+    waiting = tmp_path / "waiting"
+    waiting.mkdir()
+    apart = [chunk for numbers in ranges for chunk in map_chunks(moving, numbers, waiting, tmp_path)]
+    apart.sort(key=lambda chunk: chunk.number)
     assert [chunk.number for chunk in apart] == [0, 1, 2]
     assert sum(len(chunk.removed) for chunk in together) > 100
+    assert_same_chunks(apart, together)
+
+
+def assert_same_chunks(apart: list[MappedChunk], together: list[MappedChunk]) -> None:
     for one, other in zip(together, apart, strict=True):
         for (name, a), (same_name, b) in zip(told(one), told(other), strict=True):
             assert name == same_name
             same_value = np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b
             assert same_value, f"chunk {one.number}: {name}"
+
+
+@pytest.mark.parametrize("damage", [None, b"", b"PK\x03\x04 cut off"])
+def test_a_window_that_another_process_has_looked_at_is_not_read_again_unless_it_is_damaged(
+    moving: Drive, together: list[MappedChunk], damage: bytes | None, tmp_path: Path
+) -> None:
+    (waiting := tmp_path / "waiting").mkdir()
+    for _ in map_chunks(moving, range(1, 3), waiting, tmp_path):
+        pass
+    assert [path.name for path in (tmp_path / "edges").iterdir()] == ["1.npz"]
+    if damage is not None:
+        (tmp_path / "edges/1.npz").write_bytes(damage)
+    reads: Counter[int] = Counter()
+    first = list(map_chunks(counting(moving, reads), range(1), waiting, tmp_path))
+    assert_same_chunks(first, together[:1])
+    assert (7 in reads) == (damage is not None), "an odd one, which does not tell the rows"
 
 
 def counting(drive: Drive, reads: Counter[int]) -> Drive:
@@ -117,13 +150,14 @@ def test_a_range_of_chunks_reads_its_scans_and_a_window_on_either_side_once(
     moving: Drive, numbers: range, first: int, last: int, tmp_path: Path
 ) -> None:
     reads: Counter[int] = Counter()
-    for _ in map_chunks(counting(moving, reads), numbers, tmp_path):
+    (waiting := tmp_path / "waiting").mkdir()
+    for _ in map_chunks(counting(moving, reads), numbers, waiting, tmp_path):
         pass
     assert set(range(first, last)) <= reads.keys()
     again = {number for number, times in reads.items() if times > 1}
     assert again <= {DAMAGED}, "those that tell the rows of range images are read once, too"
     assert len(reads.keys() - range(first, last)) <= 2 * SAMPLED_SCANS
-    assert list(tmp_path.iterdir()) == [], "points wait no longer"
+    assert list(waiting.iterdir()) == [], "points wait no longer"
 
 
 def test_every_point_is_static_or_removed_and_the_indices_say_which(
@@ -178,4 +212,4 @@ def test_a_run_folder_holds_what_the_chunks_say(
 
 def test_points_that_cannot_wait_are_an_error_in_one_line(moving: Drive, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere: cannot be written .*--resume"):
-        list(map_chunks(moving, range(3), tmp_path / "nowhere"))
+        list(map_chunks(moving, range(3), tmp_path / "nowhere", tmp_path))

@@ -44,16 +44,6 @@ def test_a_scan_without_an_image_adds_hits_and_no_evidence_and_is_counted(
     assert reasons == [("labels", "no image near its stamp")] * (len(drive.log.scans) - 2)
 
 
-def test_points_that_are_kept_on_the_way_are_those_that_are_found_later(drive: Drive) -> None:
-    on_the_way = list(labelled_scans(drive, keep_points=True))
-    assert len(on_the_way) == len(drive.log.scans)
-    for seen, asked in zip(on_the_way, labelled_scans(drive), strict=True):
-        assert asked.kept is None
-        np.testing.assert_array_equal(seen.p_map, asked.p_map)
-        np.testing.assert_array_equal(seen.keys, asked.keys)
-        np.testing.assert_array_equal(seen.pixels, asked.pixels)
-
-
 def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_scans(
     drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
@@ -85,9 +75,8 @@ def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
 ) -> None:
     """A live network's answers are kept; so is nothing that it refused."""
     assert drive.segmenter is not None
-    size = drive.log.calibration.image_size
-    assert size is not None
-    refusing = CachedSegmenter(Refusing(drive.segmenter, 5), URBAN, size, tmp_path)
+    sizes = drive.log.calibration.image_sizes
+    refusing = CachedSegmenter(Refusing(drive.segmenter, 5), URBAN, sizes, tmp_path)
     for _ in range(2):
         stats = RunStats()
         found = build_maps(replace(drive, segmenter=refusing), stats)
@@ -118,9 +107,8 @@ def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive
 
 def test_a_full_disk_is_no_fault_of_an_image_and_ends_the_run(drive: Drive, tmp_path: Path) -> None:
     assert drive.segmenter is not None
-    size = drive.log.calibration.image_size
-    assert size is not None
-    nowhere = CachedSegmenter(drive.segmenter, URBAN, size, tmp_path / "removed")
+    sizes = drive.log.calibration.image_sizes
+    nowhere = CachedSegmenter(drive.segmenter, URBAN, sizes, tmp_path / "removed")
     with pytest.raises(WriteError, match="cannot be written"):
         build_maps(replace(drive, segmenter=nowhere), RunStats())
 
@@ -149,7 +137,11 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
         assert image is not None
         assert drive.segmenter is not None
         classes = class_image(
-            drive.segmenter(image), drive.segmenter.class_names, URBAN, log.calibration.image_size, ""
+            drive.segmenter(image),
+            drive.segmenter.class_names,
+            URBAN,
+            log.calibration.camera().image_size,
+            "",
         )
         pixels = numpy_chain.pixels_seen(
             p_map, image, drive.trajectory, log.calibration, classes, settings.labelling

@@ -158,7 +158,7 @@ def told(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Told:
     """Setting -> scan -> what the raw map and the refined one say of its points."""
     log = open_drive(street)
     segmenter = open_segmenter(
-        f"labels:{street / 'truth' / 'train_ids'}", URBAN, expected_size=log.calibration.image_size
+        f"labels:{street / 'truth' / 'train_ids'}", URBAN, sizes=log.calibration.image_sizes
     )
     folder, settings = tmp_path_factory.mktemp("run"), config.Settings()
     mapped = pipeline.run(log, segmenter, settings, folder, folder / "work")

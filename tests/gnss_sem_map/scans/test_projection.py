@@ -22,15 +22,13 @@ from gnss_sem_map.scans.projection import (
     pixels_seen,
 )
 from gnss_sem_map.sensor_log import Calibration, Image
+from gnss_sem_map.sensor_log.cameras import Camera
 
 URBAN = open_label_set()
 SETTINGS = LabellingSettings()
 CAMERA = Calibration(
-    T_imu_lidar=street.T_IMU_LIDAR,
-    T_camera_lidar=street.T_CAMERA_LIDAR,
-    K=street.K,
-    image_size=(street.WIDTH, street.HEIGHT),
-    camera_time_offset_s=-street.EXPOSED_BEFORE_STAMP_S,
+    street.T_IMU_LIDAR,
+    (Camera(street.T_CAMERA_LIDAR, street.K, (street.WIDTH, street.HEIGHT), -street.EXPOSED_BEFORE_STAMP_S),),
 )
 
 

@@ -51,7 +51,7 @@ def test_what_comes_back_is_what_was_said_to_half_a_step(tmp_path: Path) -> None
     segmenter = Dice()
     report = write_cache(IMAGES, segmenter, URBAN, tmp_path, "dice")
     assert (report.written, report.kept, report.skips) == (5, 0, ())
-    cached = open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(30, 20))
+    cached = open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (30, 20)})
     assert cached.class_names == (*URBAN.names, "other")
     for one in IMAGES:
         said = segmenter(one) @ URBAN.table_from(CITYSCAPES)

@@ -45,7 +45,7 @@ def some_probabilities(seed: int = 0, shape: tuple[int, ...] = (4, 6, 6)) -> np.
 def test_probabilities_come_back_as_they_were_written(tmp_path: Path) -> None:
     written = some_probabilities()
     write_npz(tmp_path / "000007.npz", written)
-    segment = open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+    segment = open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (13, 9)})
     assert segment.class_names == NAMES
     np.testing.assert_array_equal(segment(frame(7)), written)
 
@@ -174,7 +174,7 @@ def test_what_is_not_right_is_refused_on_opening(
 ) -> None:
     make(tmp_path)
     with pytest.raises(DataError, match=message) as caught:
-        open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+        open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (13, 9)})
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
 
@@ -190,7 +190,7 @@ def test_damaged_files_spoil_their_own_frames_only(tmp_path: Path, suffix: str) 
     files = sorted(tmp_path.iterdir())
     for path in files[:-4]:
         path.write_bytes(path.read_bytes()[:-30])
-    segment = open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+    segment = open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (13, 9)})
     assert segment.class_names == NAMES
     assert segment(frame(49)).shape[2] == 6
     with pytest.raises(DataError, match=r"000003.*damaged"):
@@ -200,7 +200,7 @@ def test_damaged_files_spoil_their_own_frames_only(tmp_path: Path, suffix: str) 
     with pytest.raises(
         DataError, match=r"000000.*damaged.*; none of 17 label files that were tried can be used"
     ):
-        open_segmenter(f"labels:{tmp_path}", URBAN, expected_size=(13, 9))
+        open_segmenter(f"labels:{tmp_path}", URBAN, sizes={"": (13, 9)})
 
 
 def test_files_of_one_folder_agree_on_their_classes(tmp_path: Path) -> None:
@@ -260,8 +260,8 @@ def test_a_class_that_the_map_does_not_know_is_refused_on_opening(tmp_path: Path
 
 def test_real_probabilities_and_real_train_ids_tell_the_same_story(real_data: Path) -> None:
     folder = real_data / "labels" / "kitti_raw_0005"
-    soft = open_segmenter(f"labels:{folder / 'probabilities'}", URBAN, expected_size=(1242, 375))
-    hard = open_segmenter(f"labels:{folder / 'trainids'}", URBAN, expected_size=(1242, 375))
+    soft = open_segmenter(f"labels:{folder / 'probabilities'}", URBAN, sizes={"": (1242, 375)})
+    hard = open_segmenter(f"labels:{folder / 'trainids'}", URBAN, sizes={"": (1242, 375)})
     assert soft.class_names == hard.class_names == NAMES
     for number in (114, 153):
         ids = hard(frame(number))[:374:2, ::2].argmax(2)

@@ -68,7 +68,7 @@ def test_the_written_labels_are_a_segmenter_s_cache(
     folder = write_corrupted_labels(town_drive, tmp_path / "labels")
     assert len(list(folder.glob("*.npz"))) == 12
     size = (simulation.camera.width, simulation.camera.height)
-    cached = CachedLabels(folder, open_label_set("urban"), expected_size=size)
+    cached = CachedLabels(folder, open_label_set("urban"), {"": size})
     assert set(cached.class_names) == set(CLASS_NAMES)
 
 

@@ -48,9 +48,11 @@ def test_our_reader_reads_it_without_a_word(town_drive: Path, simulation: Simula
     assert log.frame.lat_deg == pytest.approx(about["lat_deg"], abs=1e-11)
     truth = tum(town_drive / "truth" / "trajectory_lidar.tum")
     np.testing.assert_allclose([scan.stamp for scan in log.scans], truth[:, 0], atol=2e-7)
-    exposures = np.array([image.stamp for image in log.images]) + log.calibration.camera_time_offset_s
+    exposures = np.array([image.stamp for image in log.images]) + log.calibration.camera().time_offset_s
     np.testing.assert_allclose(exposures, truth[:, 0] + 0.002, atol=2e-7)
-    np.testing.assert_allclose(log.calibration.T_camera_lidar, camera_in_lidar(simulation.camera), atol=1e-7)
+    np.testing.assert_allclose(
+        log.calibration.camera().T_camera_lidar, camera_in_lidar(simulation.camera), atol=1e-7
+    )
     points = log.scans[2].read()
     assert points.stamps is not None
     assert points.stamps.min() == pytest.approx(simulation.sweeps[2, 0] - simulation.zero_s, abs=1e-3)

@@ -31,13 +31,12 @@ def arrays(log: SensorLog) -> dict[str, np.ndarray]:
     assert log.gnss is not None
     assert log.initial_attitude is not None
     calibration = log.calibration
-    assert calibration.T_camera_lidar is not None
-    assert calibration.K is not None
+    camera = calibration.camera()
     found = {
         "imu stamps": log.imu.stamps, "forces": log.imu.specific_force, "rates": log.imu.angular_rate,
         "fix stamps": log.gnss.stamps, "positions": log.gnss.positions, "stddevs": log.gnss.stddevs,
         "attitude": log.initial_attitude.R_map_imu, "attitude stddevs": log.initial_attitude.stddevs,
-        "T_imu_lidar": calibration.T_imu_lidar, "T_camera_lidar": calibration.T_camera_lidar, "K": calibration.K,
+        "T_imu_lidar": calibration.T_imu_lidar, "T_camera_lidar": camera.T_camera_lidar, "K": camera.K,
         "antenna": calibration.p_imu_antenna,
         "scans": np.array([(scan.number, scan.stamp) for scan in log.scans]),
         "images": np.array([(image.number, image.stamp) for image in log.images]),
@@ -59,8 +58,8 @@ def test_a_layout_reads_as_the_drive_itself(
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
     assert (other.epoch_ns, other.frame, other.imu_noise) == (log.epoch_ns, log.frame, log.imu_noise)
-    assert other.calibration.image_size == log.calibration.image_size
-    assert other.calibration.camera_time_offset_s == log.calibration.camera_time_offset_s
+    assert other.calibration.image_sizes == log.calibration.image_sizes
+    assert other.calibration.camera().time_offset_s == log.calibration.camera().time_offset_s
     assert other.skips == ()
 
 

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,7 +149,7 @@ def test_a_cloud_with_gaps_between_its_fields(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points.rows.reshape(-1, 4)[:, 0], np.arange(6) + 1)
 
 
-def with_camera(**info: float) -> ros.Rig:
+def with_camera(**info: Any) -> ros.Rig:
     rig = ros.drive()
     rig.transforms(("lidar", "camera", (0.0, 0.1, 0.2)))
     rig.info(START_NS, **info)
@@ -170,18 +171,91 @@ def test_the_pixels_of_every_encoding(tmp_path: Path, encoding: str) -> None:
         rig.image(START_NS, rgb if encoding == "rgb8" else rgb[:, :, ::-1], encoding, step=32)
     log = open_drive(ros.write(tmp_path / "drive", rig))
     np.testing.assert_array_equal(log.images[0].read(), rgb)
-    assert log.calibration.K is not None
-    assert log.calibration.T_camera_lidar is not None
-    assert (log.calibration.K[0, 0], log.calibration.image_size) == (100.0, (6, 4))
-    np.testing.assert_allclose(log.calibration.T_camera_lidar[:3, 3], [0.0, -0.1, -0.2])
+    camera = log.calibration.camera()
+    assert (camera.K[0, 0], camera.image_size) == (100.0, (6, 4))
+    np.testing.assert_allclose(camera.T_camera_lidar[:3, 3], [0.0, -0.1, -0.2])
 
 
 def test_the_shift_of_a_projection_moves_the_camera(tmp_path: Path) -> None:
     rig = with_camera(shift=-20.0)
     rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8")
-    T = open_drive(ros.write(tmp_path / "drive", rig)).calibration.T_camera_lidar
-    assert T is not None
+    T = open_drive(ros.write(tmp_path / "drive", rig)).calibration.camera().T_camera_lidar
     np.testing.assert_allclose(T[:3, 3], [-0.2, -0.1, -0.2])
+
+
+LENSES = {
+    "plumb_bob": ((-0.3, 0.1, 0.001, 0.0, -0.02), "brown", (-0.3, 0.1, 0.001, 0.0, -0.02)),
+    "rational_polynomial": (
+        (0.4, -0.1, 0.0, 0.0, 0.0, 0.7, 0.1, 0.0),
+        "brown",
+        (0.4, -0.1, 0.0, 0.0, 0.0, 0.7, 0.1, 0.0),
+    ),
+    "equidistant": ((0.01, 0.002, 0.0, 0.0), "fisheye", (0.01, 0.002, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_lens_of_raw_images_is_that_of_their_info(tmp_path: Path, model: str) -> None:
+    """And that of rectified images none: K is then that of their projection."""
+    given, name, coefficients = LENSES[model]
+    for topic, is_raw in (("/image_raw", True), ("/image_rect", False)):
+        rig = with_camera(d=given, model=model, shift=-20.0)
+        rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8", topic=topic)
+        lens = open_drive(ros.write(tmp_path / topic[1:], rig)).calibration.camera().distortion
+        assert (lens is not None) == is_raw
+        if lens is not None:
+            assert (lens.model, lens.coefficients) == (name, coefficients)
+
+
+def test_every_camera_that_the_rig_names_is_read(tmp_path: Path) -> None:
+    rig = with_camera()
+    rig.transforms(("lidar", "left", (0.0, 0.5, 0.0)))
+    rig.info(START_NS, focal=50.0, topic="/left/camera_info", d=(0.1, 0.0, 0.0, 0.0), model="equidistant")
+    shades = {"/image_rect": 10, "/left/image_raw": 90}
+    for k in range(3):
+        for topic, shade in shades.items():
+            pixels = np.full((4, 6, 3), shade + k, np.uint8)
+            rig.image(START_NS + k * 100_000_000 + shade * 1_000_000, pixels, "rgb8", topic=topic)
+    bag = ros.write(tmp_path / "drive", rig)
+    with pytest.raises(DataError, match=r"2 topics of a camera: /image_rect, /left/image_raw; say which one"):
+        open_drive(bag)
+    left = {"topic": "/left/image_raw", "info": "/left/camera_info", "frame": "left", "time_offset_s": 0.01}
+    rig_yaml(bag, cameras={"front": {"topic": "/image_rect", "info": "/camera_info"}, "left": left})
+    log = open_drive(bag)
+    front, side = log.cameras
+    assert (front.name, front.K[0, 0], front.distortion) == ("front", 100.0, None)
+    assert (side.name, side.K[0, 0], side.time_offset_s) == ("left", 50.0, 0.01)
+    assert side.distortion is not None
+    np.testing.assert_allclose(side.T_camera_lidar[:3, 3], [0.0, -0.5, 0.0])
+    assert [image.camera for image in log.images] == ["front", "left"] * 3
+    for name, shade in (("front", 10), ("left", 90)):
+        assert [int(image.read()[0, 0, 0]) for image in log.images_of(name)] == [shade, shade + 1, shade + 2]
+    stamp = log.images_of("left")[1].stamp
+    near = log.image_at(stamp, 0.03, "left")
+    assert near is log.images_of("left")[1]
+    assert log.image_at(stamp, 0.01, "front") is None
+
+
+def test_the_rig_may_say_a_camera_from_the_imu(tmp_path: Path) -> None:
+    rig = with_camera()
+    rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8")
+    bag = ros.write(tmp_path / "drive", rig)
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 0.1, 0.7
+    lens = {"model": "mei", "coefficients": [0.01, 0.0, 0.0, 0.0], "xi": 2.0}
+    rig_yaml(
+        bag,
+        cameras={
+            "c": {
+                "topic": "/image_rect", "T_imu_camera": T.tolist(), "distortion": lens,
+                "K": [[9.0, 0, 3], [0, 9, 2], [0, 0, 1]], "image_size": [6, 4],
+            }
+        },
+    )  # fmt: skip
+    camera = open_drive(bag).calibration.camera()
+    np.testing.assert_allclose(camera.T_camera_lidar[:3, 3], [0.0, -0.1, -0.2])  # as by the transforms
+    assert camera.distortion is not None
+    assert camera.distortion.xi == 2.0
 
 
 def test_the_rig_says_which_of_several_lidars(tmp_path: Path) -> None:
@@ -375,10 +449,10 @@ def test_a_camera_info_of_zeros_is_refused(tmp_path: Path) -> None:
     assert open_drive(bag).images == ()
 
 
-def test_images_with_distortion_are_refused(tmp_path: Path) -> None:
-    rig = with_camera(d=0.1)
+def test_images_of_an_unknown_lens_are_refused(tmp_path: Path) -> None:
+    rig = with_camera(d=(0.1,) * 4, model="omni")
     rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8", topic="/image_raw")
-    with pytest.raises(DataError, match=r"/image_raw: its lens has distortion .* take the rectified topic"):
+    with pytest.raises(DataError, match=r"/camera_info: found distortion model 'omni' with 4 coefficients"):
         open_drive(ros.write(tmp_path / "drive", rig))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,8 +38,8 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> SensorLog:
 
 def not_green(log: SensorLog, folder: Path | None = None) -> list[Finding]:
     """What is found of sweeps and camera, and is not green."""
-    size = log.calibration.image_size
-    segmenter = None if folder is None else CachedLabels(folder, open_label_set("urban"), size)
+    sizes = log.calibration.image_sizes
+    segmenter = None if folder is None else CachedLabels(folder, open_label_set("urban"), sizes)
     sample = Sample(log, Settings(), segmenter)
     found = [*sweeps.check(sample), *camera.check(sample)]
     assert found
@@ -55,9 +56,15 @@ def calibrated(log: SensorLog, **parts: Array) -> SensorLog:
     return replace(log, calibration=replace(log.calibration, **parts))
 
 
-def turned(T: Array | None, rotation_deg: tuple[float, float, float]) -> Array:
+def with_camera(log: SensorLog, **parts: Any) -> SensorLog:
+    """The same drive, with another calibration of its camera."""
+    return replace(
+        log, calibration=replace(log.calibration, cameras=(replace(log.calibration.camera(), **parts),))
+    )
+
+
+def turned(T: Array, rotation_deg: tuple[float, float, float]) -> Array:
     """A transform, turned about the axes of its target."""
-    assert T is not None
     by = np.eye(4)
     by[:3, :3] = Rotation.from_rotvec(rotation_deg, degrees=True).as_matrix()
     return np.asarray(by @ T)
@@ -159,15 +166,16 @@ def test_points_that_were_not_measured_are_no_reason_to_refuse_a_scan(tmp_path: 
 @pytest.mark.parametrize("angle", [3.0, -4.0])
 def test_a_turned_camera_is_named_with_axis_and_angle(town: SensorLog, axis: int, angle: float) -> None:
     x, y, z = (angle * np.eye(3)[axis]).tolist()
-    found = mistakes(calibrated(town, T_camera_lidar=turned(town.calibration.T_camera_lidar, (x, y, z))))
+    found = mistakes(
+        with_camera(town, T_camera_lidar=turned(town.calibration.camera().T_camera_lidar, (x, y, z)))
+    )
     assert f"about its {'xyz'[axis]} axis" in found
     assert abs(float(found.split("turned by ")[1].split()[0]) - abs(angle)) < 0.7
 
 
 def test_an_inverted_camera_is_named(town: SensorLog) -> None:
-    T = town.calibration.T_camera_lidar
-    assert T is not None
-    assert "T_camera_lidar is inverted" in mistakes(calibrated(town, T_camera_lidar=np.linalg.inv(T)))
+    T = town.calibration.camera().T_camera_lidar
+    assert "T_camera_lidar is inverted" in mistakes(with_camera(town, T_camera_lidar=np.linalg.inv(T)))
 
 
 @pytest.mark.parametrize(
@@ -190,8 +198,7 @@ def test_images_of_another_time_are_named(town: SensorLog, by_s: float, says: st
     ],
 )
 def test_a_wrong_K_is_named(town: SensorLog, change: Callable[[Array], Array], says: str) -> None:
-    assert town.calibration.K is not None
-    assert says in mistakes(calibrated(town, K=change(town.calibration.K.copy())))
+    assert says in mistakes(with_camera(town, K=change(town.calibration.camera().K.copy())))
 
 
 def test_images_of_another_size_are_named(town: SensorLog) -> None:
@@ -199,7 +206,7 @@ def test_images_of_another_size_are_named(town: SensorLog) -> None:
         raise ImageSizeError("620 x 188", (620, 188))
 
     images = tuple(replace(image, read=read) for image in town.images)
-    wrong = replace(town, images=images, calibration=replace(town.calibration, image_size=(310, 94)))
+    wrong = replace(with_camera(town, image_size=(310, 94)), images=images)
     (finding,) = not_green(wrong)
     assert "image size" in finding.mistake
     assert "620 188" in finding.remedy
@@ -222,15 +229,15 @@ def test_an_inverse_is_named_though_a_rectification_turns_it_a_little(
     town: SensorLog, by: tuple[float, float, float]
 ) -> None:
     """KITTI's rectification is not inverted with the mounting of the camera."""
-    T = turned(np.linalg.inv(turned(town.calibration.T_camera_lidar, (0, 0, 0))), by)
-    assert "T_camera_lidar is inverted" in mistakes(calibrated(town, T_camera_lidar=T))
+    T = turned(np.linalg.inv(town.calibration.camera().T_camera_lidar), by)
+    assert "T_camera_lidar is inverted" in mistakes(with_camera(town, T_camera_lidar=T))
 
 
 def test_a_camera_that_has_all_points_behind_it_is_red_though_edges_are_few(tmp_path: Path) -> None:
     log = open_drive(street.write(tmp_path).drive)
-    T = turned(log.calibration.T_camera_lidar, (0, 0, 0))
+    T = log.calibration.camera().T_camera_lidar.copy()
     T[:3, 3] -= (0, 0, 1000.0)
-    (finding,) = [f for f in not_green(calibrated(log, T_camera_lidar=T)) if f.level is Level.RED]
+    (finding,) = [f for f in not_green(with_camera(log, T_camera_lidar=T)) if f.level is Level.RED]
     assert "of another camera" in finding.mistake
 
 

@@ -1,0 +1,13 @@
+# The package on a CPU; without a command it runs the demo into /data/demo:
+#   docker build -t gnss-sem-map . && docker run --rm -v "$PWD:/data" gnss-sem-map
+# --build-arg EXTRAS='[segmentation]' adds torch: its CPU build where pip is told to take that one.
+FROM python:3.11-slim
+ARG EXTRAS=""
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY gnss_sem_map gnss_sem_map
+COPY factor_graphs factor_graphs
+RUN pip install --no-cache-dir -c constraints.txt ".${EXTRAS}"
+WORKDIR /data
+ENTRYPOINT ["gnss-sem-map"]
+CMD ["demo"]

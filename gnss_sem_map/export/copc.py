@@ -1,0 +1,218 @@
+"""The map as COPC: LAZ in an octree, of which a viewer reads the parts and the detail that it shows.
+
+In a tile, voxels are put in Morton order: the first of every cube of 2, 4, 8, ... voxels stands for that cube in the
+level as coarse as this, and each voxel lies in the coarsest level in which it stands for one. So every tile is read
+once, and a node is written as soon as no tile is left that could add to it. Source: COPC 1.0.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.export.exported import NO_VOXELS, Exported
+from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.point_cloud import LAZ_SCALE_M, las_header, las_points
+from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET, Tile
+
+if TYPE_CHECKING:
+    import copclib
+    import laspy
+
+NODE_CELLS = 128
+"""A node is as wide as so many cells of its level."""
+Node = tuple[int, int, int, int]
+"""Level, and place along each axis."""
+
+
+def write_copc(exported: Exported, path: Path | str) -> None:
+    """Write every voxel that was not removed as COPC, with the content of `write_laz`.
+
+    Raises ConfigError without the package `copclib`, DataError for a map without a georeference or without voxels, and
+    when the file cannot be written.
+    """
+    try:
+        import copclib
+    except ImportError:
+        raise ConfigError(
+            "COPC needs copclib; in a clone: pip install -c constraints.txt '.[copc]'"
+        ) from None
+    georeference = exported.georeference
+    if georeference is None:
+        raise DataError(f"{exported.title}: COPC needs a georeference; this map is in its drive's own poses")
+    octree = _Octree.over(exported, georeference)
+    header = las_header(exported.map.label_set, georeference)
+    with replacing(path) as file:
+        writer = copclib.FileWriter(file.name, _config(octree, georeference, header))
+        for node, records in _nodes(exported, georeference, octree, header):
+            writer.AddNode(copclib.VoxelKey(*node), copclib.VectorChar(records.ravel().view(np.int8)))
+        writer.Close()
+        _refuse_cut(file.name)
+
+
+def _refuse_cut(name: str) -> None:
+    """Raise OSError for a file of which the end is missing: copclib does not say when the disk is full."""
+    import laspy
+
+    try:
+        with laspy.open(name) as reader:
+            complete = bool(reader.header.evlrs)  # the last that is written
+    except (laspy.errors.LaspyException, OSError, ValueError, EOFError):
+        complete = False
+    if not complete:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@dataclass(frozen=True, eq=False)
+class _Octree:
+    """A cube over the map: its lower corner in the CRS, its edge, and the level of single voxels."""
+
+    low: NDArray[np.float64]
+    edge_m: float
+    depth: int
+
+    @classmethod
+    def over(cls, exported: Exported, georeference: Georeference) -> _Octree:
+        extent, size = exported.extent, exported.map.voxel_size_m
+        if not extent.count:
+            raise DataError(NO_VOXELS)
+        # voxels without a label may lie farther than those that the extent is of
+        tiles = np.array(exported.map.tiles) * (1 << TILE_BITS)
+        low, high = tiles.min(axis=0), tiles.max(axis=0) + (1 << TILE_BITS)
+        corners = [
+            (x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (-Z_OFFSET, Z_OFFSET)
+        ]
+        placed = georeference.from_map(np.array(corners) * size)
+        widest = float((placed.max(axis=0) - placed.min(axis=0))[:2].max())
+        depth = max(0, int(np.ceil(np.log2(widest / (NODE_CELLS * size)))))
+        edge = NODE_CELLS * size * 2.0**depth
+        middle = georeference.from_map(np.array([(*(low + high) / 2, extent.mean[2])]) * size)[0]
+        return cls(middle - edge / 2, edge, depth)
+
+    def nodes(self, points: NDArray[np.float64], levels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Node (n, 4) of points (n, 3) of the CRS."""
+        edges = self.edge_m / 2.0**levels
+        places = np.floor((points - self.low) / edges[:, None]).astype(np.int64)
+        return np.column_stack([levels, np.clip(places, 0, (1 << levels)[:, None] - 1)])
+
+    def tiles(self, node: Node, exported: Exported, georeference: Georeference) -> set[Tile]:
+        """Tiles of the map that may have points in a node."""
+        level, *place = node
+        edge = self.edge_m / 2.0**level
+        corners = self.low[:2] + edge * np.add(place[:2], [(0, 0), (0, 1), (1, 0), (1, 1)])
+        heights = np.full((4, 1), self.low[2] + self.edge_m / 2)
+        flat = georeference.to_map(np.hstack([corners, heights]))[:, :2] / exported.map.voxel_size_m
+        low, high = (np.floor(flat.min(axis=0) - 1), np.ceil(flat.max(axis=0) + 1))
+        (west, south), (east, north) = (corner.astype(int) >> TILE_BITS for corner in (low, high))
+        return {(x, y) for x, y in exported.map.tiles if west <= x <= east and south <= y <= north}
+
+
+def _nodes(
+    exported: Exported, georeference: Georeference, octree: _Octree, header: laspy.LasHeader
+) -> Iterator[tuple[Node, NDArray[np.uint8]]]:
+    """Every node and its points as rows of bytes, as soon as it is complete."""
+    unread = set(exported.map.tiles)
+    parts: dict[Node, list[NDArray[np.uint8]]] = {}
+    missing: dict[Node, set[Tile]] = {}
+    written: set[Node] = set()
+
+    def add(node: Node, records: NDArray[np.uint8]) -> None:
+        if node not in parts:
+            parts[node], missing[node] = [], octree.tiles(node, exported, georeference) & unread
+        parts[node].append(records)
+
+    for tile in exported.map.tiles:
+        for node, records in _points_of(exported.map.read_tile(tile), georeference, octree, header):
+            add(node, records)
+        unread.discard(tile)
+        for tiles in missing.values():
+            tiles.discard(tile)
+        # from the finest on, so that a node gets what those below it give before it is written
+        while complete := [node for node in parts if not missing[node]]:
+            node = max(complete)
+            records = np.concatenate(parts.pop(node))
+            # readers go down from the root and stop at a level without points: it gets one from below
+            for above in _ancestors(node):
+                if len(records) and above not in parts and above not in written:
+                    add(above, records[:1])
+                    records = records[1:]
+            del missing[node]
+            if len(records):
+                written.add(node)
+                yield node, records
+
+
+def _points_of(
+    piece: SemanticMap, georeference: Georeference, octree: _Octree, header: laspy.LasHeader
+) -> Iterator[tuple[Node, NDArray[np.uint8]]]:
+    """The points of a tile, node by node."""
+    piece = piece[np.flatnonzero(piece.states != State.REMOVED)]
+    if not len(piece):
+        return
+    points = las_points(piece, georeference, header)
+    levels = np.maximum(octree.depth - _largest_cubes(piece), 0)
+    nodes = octree.nodes(np.column_stack([points.x, points.y, points.z]), levels)
+    nodes, of = np.unique(nodes, axis=0, return_inverse=True)
+    order = np.argsort(of.ravel(), kind="stable")
+    records = np.ascontiguousarray(points.array).view(np.uint8).reshape(len(piece), -1)[order]
+    ends = np.cumsum(np.bincount(of.ravel(), minlength=len(nodes)))
+    yield from zip(map(tuple, nodes.tolist()), np.split(records, ends[:-1]), strict=True)
+
+
+def _ancestors(node: Node) -> Iterator[Node]:
+    """The nodes above one, from the root down."""
+    level, x, y, z = node
+    yield from ((level - up, x >> up, y >> up, z >> up) for up in range(level, 0, -1))
+
+
+def _largest_cubes(piece: SemanticMap) -> NDArray[np.int64]:
+    """(v,) log2 of the edge, in voxels, of the largest cube of the Morton order in which a voxel comes first."""
+    x, y, z = np.add(piece.voxels.indices.astype(np.int64), [0, 0, Z_OFFSET]).T
+    mask = (1 << TILE_BITS) - 1
+    codes = _spread(x & mask) | _spread(y & mask) << 1 | _spread(z) << 2
+    order = np.argsort(codes, kind="stable")
+    differ = codes[order[1:]] ^ codes[order[:-1]]
+    cubes = np.full(len(codes), TILE_BITS, np.int64)
+    cubes[order[1:]] = np.minimum((np.frexp(differ.astype(np.float64))[1] - 1) // 3, TILE_BITS)
+    return cubes
+
+
+def _spread(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers of up to 14 bits with two zeros between their bits."""
+    spread = np.zeros_like(numbers)
+    for bit in range(14):
+        spread |= (numbers >> bit & 1) << 3 * bit
+    return spread
+
+
+def _config(octree: _Octree, georeference: Georeference, header: laspy.LasHeader) -> copclib.CopcConfigWriter:
+    """Header of the file; copclib takes the names of extra bytes from another LAZ alone."""
+    import copclib
+    import laspy
+
+    with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
+        path = Path(folder) / "header.laz"
+        one_point = laspy.ScaleAwarePointRecord.zeros(1, header=header)
+        laspy.LasData(header, one_point).write(str(path))
+        extra = copclib.LazReader(str(path)).laz_config.extra_bytes_vlr
+    config = copclib.CopcConfigWriter(
+        7, copclib.Vector3(*[LAZ_SCALE_M] * 3), copclib.Vector3(*header.offsets),
+        georeference.crs.to_wkt("WKT1_GDAL"), extra,
+    )  # fmt: skip
+    middle = octree.low + octree.edge_m / 2
+    config.copc_info.center_x, config.copc_info.center_y, config.copc_info.center_z = middle.tolist()
+    config.copc_info.halfsize = octree.edge_m / 2
+    config.copc_info.spacing = octree.edge_m / NODE_CELLS
+    config.las_header.generating_software = header.generating_software
+    return config

@@ -1,0 +1,68 @@
+"""What the first window of a range of chunks tells of motion, on disk: the chunk before it needs it, too.
+
+Another process maps that chunk. Without the file, or with a damaged one, it looks at these scans itself, with the same
+result.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.dynamics.clusters import PointSets, Segments
+from gnss_sem_map.dynamics.image_rows import Rows
+from gnss_sem_map.dynamics.moving_objects import Observation
+from gnss_sem_map.dynamics.visibility import RangeImage
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.untrusted import is_file, read_bytes
+from gnss_sem_map.files.work_folder import EDGES
+
+
+def save(observations: Sequence[Observation], work: Path, chunk: int) -> None:
+    """Save the observations of the first window of a chunk in the work folder of a run; raises OSError."""
+    file = io.BytesIO()
+    arrays = {f"{n}/{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    (work / EDGES).mkdir(exist_ok=True)
+    write_whole(_file(work, chunk), file.getvalue())
+
+
+def read(work: Path, chunk: int, rows: Rows) -> list[Observation] | None:
+    """The observations of the first window of a chunk, by a LiDAR with these rows; None where they are not saved."""
+    try:
+        if not is_file(_file(work, chunk)):
+            return None
+        with np.load(io.BytesIO(read_bytes(_file(work, chunk))), allow_pickle=False) as arrays:
+            count = len({name.partition("/")[0] for name in arrays.files})
+            return [_observation(arrays, f"{n}/", rows) for n in range(count)]
+    except (DataError, KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _file(work: Path, chunk: int) -> Path:
+    return work / EDGES / f"{chunk}.npz"
+
+
+def _arrays(one: Observation) -> dict[str, NDArray[Any]]:
+    seen, segments = one.seen, one.segments
+    parts = {field.name: getattr(segments.parts, field.name) for field in fields(PointSets)}
+    return parts | {
+        "frame": np.array(one.number), "stamp": np.array(one.stamp),
+        "image": seen.image, "T_lidar_map": seen.T_lidar_map,
+        "keys": segments.keys, "number": segments.number, "truncated": segments.truncated,
+    }  # fmt: skip
+
+
+def _observation(arrays: Mapping[str, NDArray[Any]], at: str, rows: Rows) -> Observation:
+    parts = PointSets(**{field.name: arrays[at + field.name] for field in fields(PointSets)})
+    segments = Segments(arrays[at + "keys"], parts, arrays[at + "number"], arrays[at + "truncated"])
+    seen = RangeImage(arrays[at + "image"], arrays[at + "T_lidar_map"], rows)
+    return Observation(int(arrays[at + "frame"]), float(arrays[at + "stamp"]), seen, segments)

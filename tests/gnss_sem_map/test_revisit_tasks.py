@@ -1,0 +1,129 @@
+"""Places that a drive passes again, registered in other processes: the same results, to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from street import Street
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.work_folder import clear
+from gnss_sem_map.mapping.execution import Executor, InProcess
+from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.runs import revisit_tasks
+from gnss_sem_map.runs.revisit_tasks import RevisitTasks
+from gnss_sem_map.runs.source import Source, source_of
+from gnss_sem_map.scans.local_maps import LocalMaps
+from gnss_sem_map.scans.revisits import Found, Pair, Pass, register_pair
+from gnss_sem_map.sensor_log import SensorLog
+
+SETTINGS = Settings()
+PAIRS: list[Pair] = [(0, 0, 0, 1), (0, 0, 0, 2), (0, 1, 0, 2), (0, 0, 0, 3), (0, 2, 0, 1)]
+
+
+@pytest.fixture(scope="module")
+def source(small_drive: Street) -> Source:
+    return source_of(small_drive.drive)
+
+
+@pytest.fixture(scope="module")
+def log(source: Source) -> SensorLog:
+    return open_drive(source.drive)
+
+
+@pytest.fixture(scope="module")
+def track(log: SensorLog) -> Trajectory:
+    assert log.reference is not None
+    return log.reference
+
+
+@pytest.fixture(scope="module")
+def places(log: SensorLog, track: Trajectory) -> Pass:
+    stamps = np.array([scan.stamp for scan in log.scans])[[1, 4, 7, 9]]
+    return Pass(np.arange(len(stamps)), stamps, track.at(stamps), LocalMaps(log, track, stamps))
+
+
+@pytest.fixture(scope="module")
+def expected(places: Pass) -> list[Found | None]:
+    found = [register_pair([places], pair, SETTINGS.trajectory.revisits) for pair in PAIRS]
+    assert any(one is not None for one in found)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def small_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(revisit_tasks, "PAIRS_PER_TASK", 2)
+
+
+def assert_same(found: Sequence[Found | None], expected: Sequence[Found | None]) -> None:
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            for a, b in zip(
+                (one.T, one.covariance, *one.sample), (other.T, other.covariance, *other.sample), strict=True
+            ):
+                np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("executor", [InProcess(), pytest.param(Processes(2), marks=pytest.mark.integration)])
+def test_other_processes_find_the_same(
+    log: SensorLog, track: Trajectory, source: Source, places: Pass, expected: list[Found | None],
+    tmp_path: Path, executor: Executor,
+) -> None:  # fmt: skip
+    registrar = RevisitTasks(source, tmp_path / "w", executor)(log, track, SETTINGS)
+    assert_same(list(registrar([places], PAIRS)), expected)
+    clear(tmp_path / "w")
+    assert not (tmp_path / "w").exists()
+
+
+@pytest.mark.parametrize("damage", [b"", b"[]", b"{", b"{}"])
+def test_only_what_is_missing_or_damaged_is_registered_again(
+    log: SensorLog, track: Trajectory, source: Source, places: Pass, expected: list[Found | None],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: bytes,
+) -> None:  # fmt: skip
+    registrar = RevisitTasks(source, tmp_path, InProcess())(log, track, SETTINGS)
+    list(registrar([places], PAIRS))
+    (tmp_path / "revisits" / "1.json").write_bytes(damage)
+    registered: list[Any] = []
+
+    def noted(passes: Sequence[Pass], pair: Pair, *others: Any) -> Found | None:
+        registered.append(pair)
+        return register_pair(passes, pair, *others)
+
+    monkeypatch.setattr(revisit_tasks, "register_pair", noted)
+    assert_same(list(registrar([places], PAIRS)), expected)
+    assert registered == PAIRS[2:4]
+
+
+def test_a_worker_that_finds_another_trajectory_registers_again(
+    log: SensorLog,
+    track: Trajectory,
+    source: Source,
+    places: Pass,
+    expected: list[Found | None],
+    tmp_path: Path,
+) -> None:
+    list(RevisitTasks(source, tmp_path, InProcess())(log, track, SETTINGS)([places], PAIRS))
+    T = track.T_map_imu.copy()
+    T[:, 0, 3] += 0.01 * (track.stamps - track.start)
+    moved = Trajectory(track.stamps, T)
+    there = Pass(places.anchors, places.stamps, moved.at(places.stamps), LocalMaps(log, moved, places.stamps))
+    found = list(RevisitTasks(source, tmp_path, InProcess())(log, moved, SETTINGS)([there], PAIRS))
+    assert_same(found, [register_pair([there], pair, SETTINGS.trajectory.revisits) for pair in PAIRS])
+
+
+def test_a_worker_that_finds_another_drive_says_so(
+    log: SensorLog, track: Trajectory, source: Source, places: Pass, tmp_path: Path
+) -> None:
+    shorter = replace(log, scans=log.scans[:-1])
+    with pytest.raises(DataError, match="a worker finds another drive"):
+        list(RevisitTasks(source, tmp_path, InProcess())(shorter, track, SETTINGS)([places], PAIRS))

@@ -30,7 +30,8 @@ def shift_stddevs(fixes: GnssFixes, stops: NDArray[np.intp]) -> Array:
     if time < LEAST_S:
         return np.zeros(3)
     grown = np.exp(-SHORT_S / LASTING_S) - np.exp(-LONG_S / LASTING_S)
-    return np.sqrt(np.maximum(long - short, 0.0) / grown)
+    stddevs: Array = np.sqrt(np.maximum(long - short, 0.0) / grown)
+    return stddevs
 
 
 def _half_mean_squares(fixes: GnssFixes, stops: NDArray[np.intp], apart_s: float) -> tuple[Array, float]:

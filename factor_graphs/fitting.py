@@ -102,8 +102,8 @@ def calibrate(
     """Fit, correct time offset and lever arm, and fit again, until the correction is lost in its own noise.
 
     `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from. Unasked, a
-    time offset within the step of the IMU is not believed: with fixes of a centimetre, an accelerometer whose scale is off
-    by 0.4 % looks like 6 ms, and 6 ms are 6 cm at 10 m/s.
+    time offset within the step of the IMU is not believed: with fixes of a centimetre, an accelerometer whose scale is
+    off by 0.4 % looks like 6 ms, and 6 ms are 6 cm at 10 m/s.
     """
     with_time, with_lever = settings.estimate_time_offset, settings.estimate_lever_arm
     calibration = Calibration(0.0, given)

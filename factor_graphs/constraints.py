@@ -48,17 +48,21 @@ def zero_velocity_factors(
         yield gtsam.PriorFactorVector(V(i), np.zeros(3), model)
 
 
-def standing(intervals: ImuIntervals, velocities: Array) -> NDArray[np.bool_]:
+def standing(quiet: NDArray[np.bool_], velocities: Array) -> NDArray[np.bool_]:
     """The keyframes at which the vehicle stands, (k,): slow there, and the IMU quiet on both sides."""
     slow = np.linalg.norm(velocities, axis=1) < STANDING_SPEED
+    still: NDArray[np.bool_] = slow & np.append(quiet, True) & np.append(True, quiet)
+    return still
+
+
+def quiet_intervals(intervals: ImuIntervals) -> NDArray[np.bool_]:
+    """The intervals (k - 1,) in which the IMU is as quiet as in a vehicle that stands."""
     which = np.repeat(np.arange(len(intervals.keyframes) - 1), np.diff(intervals.bounds))
-    quiet = np.ones(len(intervals.keyframes) - 1, dtype=bool)
+    quiet = ~intervals.blind
     for samples in (intervals.specific_force, intervals.angular_rate):
         scatter = _scatter(samples, which, len(quiet))
         quiet &= scatter <= QUIET * np.quantile(scatter, 0.1)
-    quiet &= ~intervals.blind
-    still: NDArray[np.bool_] = slow & np.append(quiet, True) & np.append(True, quiet)
-    return still
+    return quiet
 
 
 def _scatter(samples: Array, which: NDArray[np.intp], n: int) -> Array:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 # Intervals are made dense in blocks of so many nodes, few enough for the cache: in one piece, with 200 MB for every
 # intermediate result, a drive of two hours took a sixth more CPU time as a whole.
-BLOCK = 20_000
+BLOCK = 6_000
 
 
 def densify(

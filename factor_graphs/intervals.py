@@ -1,6 +1,8 @@
 """The IMU between keyframes: where the keyframes are, and the steps that lead from one to the next."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,10 @@ MAX_STEP_S = 0.01
 UNSEEN_FORCE, UNSEEN_RATE = 2.0, 0.3
 # A whole day of steps; each costs 300 bytes.
 MOST_STEPS = 10_000_000
+# The steps are made in blocks of so many, few enough for the cache: in one piece, two hours took twice as long.
+BLOCK = 10_000
+# Yaw rate is the mean over so long, s: a single sample is noise.
+RATE_WINDOW_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +51,20 @@ class ImuIntervals:
     def durations(self) -> Array:
         """Length of every step, (n,) s."""
         return np.diff(self.nodes)
+
+    @cached_property
+    def yaw_rate(self) -> Array:
+        """What the gyroscope says about the imu's z axis around every keyframe, (k,) rad/s."""
+        turned = np.concatenate([[0.0], np.cumsum(self.angular_rate[:, 2] * self.durations)])
+        first = np.maximum(self.keyframes - RATE_WINDOW_S / 2, self.nodes[0])
+        last = np.minimum(self.keyframes + RATE_WINDOW_S / 2, self.nodes[-1])
+        by_first, by_last = (np.interp(stamps, self.nodes, turned) for stamps in (first, last))
+        return np.asarray((by_last - by_first) / (last - first))
+
+    @property
+    def step_s(self) -> float:
+        """The usual step, s."""
+        return float(np.median(self.durations))
 
     def part(self, first: int, last: int) -> "ImuIntervals":
         """From one keyframe to another."""
@@ -84,18 +104,34 @@ def split(
     gap_ends = np.column_stack([imu.stamps[gap], imu.stamps[gap + 1]])
     marks = np.concatenate([imu.stamps[[0, -1]], gap_ends.ravel(), fix_stamps])
     keyframes = _fill(_distinct(np.sort(marks)), max_interval_s)
-    nodes = _fill(_distinct(np.union1d(imu.stamps, keyframes), keep=keyframes), MAX_STEP_S)
-    both = np.hstack([imu.specific_force, imu.angular_rate])
-    at_nodes = np.column_stack([np.interp(nodes, imu.stamps, column) for column in both.T])
-    rate = (at_nodes[:-1, 3:] + at_nodes[1:, 3:]) / 2
-    # the imu turns during the step; seen from its start, the later force is turned by the angular rate
-    later = Rotation.from_rotvec(rate * np.diff(nodes)[:, None]).apply(at_nodes[1:, :3])
-    force = (at_nodes[:-1, :3] + later) / 2
+    _check_steps(imu.stamps, keyframes)
+    edges = np.searchsorted(keyframes, imu.stamps[::BLOCK], side="right")
+    edges = np.unique([0, *edges[1:], len(keyframes) - 1])
+    parts = [_steps(imu, keyframes[first : last + 1]) for first, last in pairwise(edges.tolist())]
+    nodes = np.concatenate([*(part[0][:-1] for part in parts), keyframes[-1:]])
+    force, rate = (np.concatenate([part[n] for part in parts]) for n in (1, 2))
     middle = (keyframes[:-1] + keyframes[1:]) / 2
     blind = np.zeros(len(middle), dtype=bool)
     for first, last in gap_ends:
         blind |= (middle > first) & (middle < last)
     return ImuIntervals(keyframes, np.searchsorted(nodes, keyframes), nodes, force, rate, blind)
+
+
+def _steps(imu: ImuSamples, keyframes: Array) -> tuple[Array, Array, Array]:
+    """Ends (n + 1,) of the steps between some keyframes, their specific force and angular rate, (n, 3) each."""
+    first = int(np.searchsorted(imu.stamps, keyframes[0], side="right")) - 1
+    rows = slice(first, int(np.searchsorted(imu.stamps, keyframes[-1])) + 1)
+    stamps = imu.stamps[rows]
+    within = stamps[(stamps >= keyframes[0]) & (stamps <= keyframes[-1])]
+    nodes = _fill(_distinct(np.union1d(within, keyframes), keep=keyframes), MAX_STEP_S)
+    force, rate = (
+        np.column_stack([np.interp(nodes, stamps, column) for column in values[rows].T])
+        for values in (imu.specific_force, imu.angular_rate)
+    )
+    rate = (rate[:-1] + rate[1:]) / 2
+    # the imu turns during the step; seen from its start, the later force is turned by the angular rate
+    later = Rotation.from_rotvec(rate * np.diff(nodes)[:, None]).apply(force[1:])
+    return nodes, (force[:-1] + later) / 2, rate
 
 
 def nearest(known: NDArray[Any], wanted: NDArray[Any]) -> NDArray[np.intp]:
@@ -148,13 +184,24 @@ def _distinct(stamps: Array, keep: Array | None = None) -> Array:
     return kept
 
 
+def _check_steps(stamps: Array, keyframes: Array) -> None:
+    """Refuse a log of too many steps before any is made."""
+    span = float(keyframes[-1] - keyframes[0])
+    if max(len(stamps), span / MAX_STEP_S) > MOST_STEPS:
+        raise _too_many(span, span / MAX_STEP_S, MAX_STEP_S)
+
+
+def _too_many(span: float, steps: float, step_s: float) -> MeasurementError:
+    return MeasurementError(
+        f"the IMU spans {span:.6g} s, {steps:.3g} steps of {step_s:g} s;"
+        f" expected at most {MOST_STEPS}: are its stamps in seconds?"
+    )
+
+
 def _fill(stamps: Array, max_interval_s: float) -> Array:
     exact = np.maximum(1, np.ceil(np.diff(stamps) / max_interval_s - 0.05))
     if exact.sum() > MOST_STEPS:
-        raise MeasurementError(
-            f"the IMU spans {stamps[-1] - stamps[0]:.6g} s, {exact.sum():.3g} steps of {max_interval_s:g} s;"
-            f" expected at most {MOST_STEPS}: are its stamps in seconds?"
-        )
+        raise _too_many(stamps[-1] - stamps[0], exact.sum(), max_interval_s)
     parts = exact.astype(int)
     first = np.repeat(np.cumsum(parts) - parts, parts)
     share = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)

@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.graph import from_values
-from factor_graphs.intervals import ImuIntervals, nearest
+from factor_graphs.intervals import nearest
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
@@ -34,8 +34,6 @@ BESIDE_S = 2.0
 UNSEEN_SLIP = 0.1
 # A skid is so many times less certain than it is fast.
 SKID = 3.0
-# Yaw rate is the mean over so long, s: a single sample is noise.
-RATE_WINDOW_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,7 @@ def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
     T, velocities, biases = from_values(fit.values, len(stamps))
     R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
     in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
-    return BodyMotion(R_imu_map, in_imu, _yaw_rate(problem.intervals) - biases[:, 5], np.gradient(stamps))
+    return BodyMotion(R_imu_map, in_imu, problem.intervals.yaw_rate - biases[:, 5], np.gradient(stamps))
 
 
 def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
@@ -208,13 +206,3 @@ def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     distance = np.abs(good[nearest(good, stamps)] - stamps)
     beside: NDArray[np.bool_] = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
-
-
-def _yaw_rate(intervals: ImuIntervals) -> Array:
-    """What the gyroscope says about the imu's z axis around every keyframe, (k,) rad/s."""
-    turned = np.concatenate([[0.0], np.cumsum(intervals.angular_rate[:, 2] * intervals.durations)])
-    first = np.maximum(intervals.keyframes - RATE_WINDOW_S / 2, intervals.nodes[0])
-    last = np.minimum(intervals.keyframes + RATE_WINDOW_S / 2, intervals.nodes[-1])
-    by_first, by_last = (np.interp(stamps, intervals.nodes, turned) for stamps in (first, last))
-    rate: Array = (by_last - by_first) / (last - first)
-    return rate

@@ -40,6 +40,10 @@ class Segment:
     """An image labels some of its points as vehicle."""
     truncated: bool
     """It is cut off by the edge of the image or hidden in part: its box is not that of the object."""
+    outline: NDArray[np.floating]
+    """(v, 2) m: the points of its voxels on average, which tell its extent in any direction."""
+    seen_from: NDArray[np.float64]
+    """(2,) m: where the LiDAR was."""
 
 
 @dataclass(eq=False)

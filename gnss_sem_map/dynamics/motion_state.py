@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.special import betaincc
 
 from gnss_sem_map.dynamics.own_motion import motion_of
+from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
 
 LEAST_TRACKED_POINTS = 5
@@ -22,8 +23,6 @@ LENGTH_M = 5.0
 """Length of a car."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
-LEAST_MISSES_PER_HIT = 0.05
-"""What moved is seen through at least so often: parked cars reach 0.03 with sharp poses."""
 
 
 class Motion(StrEnum):
@@ -76,7 +75,7 @@ class MotionSettings(BaseModel):
     )
     farthest_object_m: float = Field(default=60.0, gt=0, description="Largest range of objects, m.")
     grow_m: float = Field(
-        default=0.5, ge=0, description="Points above ground this close to a moving segment belong to it, m."
+        default=0.35, ge=0, description="Points above ground this close to a moving segment belong to it, m."
     )
 
 
@@ -161,7 +160,7 @@ def _motion_of_track(
         hit_elsewhere, missed_elsewhere = _elsewhere(members, segments, hits, misses, reach)
         # the volume that it left or came into is free at other times, as far as it did not cover it itself
         least = elsewhere_misses_per_hit * min(1.0, moved.shift_m / LENGTH_M)
-        displaced = missed_elsewhere > least * hit_elsewhere and missed > LEAST_MISSES_PER_HIT * hit
+        displaced = missed_elsewhere > least * hit_elsewhere and not bool(is_occupied(hit, missed))
     reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
     if moved and displaced:
         motion = Motion.MOVING

@@ -25,8 +25,8 @@ from gnss_sem_map.dynamics.ground_grid import (
 )
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
-from gnss_sem_map.dynamics.own_motion import hold_something_else
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.standing import is_occupied, standing
 from gnss_sem_map.dynamics.tracking import Segment
 from gnss_sem_map.dynamics.visibility import (
     SCANS_PER_PART,
@@ -100,7 +100,8 @@ def decide(
     _check_order(observations)
     if not observations:
         return Decision([], (), False)
-    counts = _observations_by_others(observations, before, settings.farthest_m)
+    places = _places(observations)
+    counts = _observations_by_others(observations, places, before, settings.farthest_m)
     is_sharp = are_sharp(counts)
     segments = [
         split_segments(
@@ -113,22 +114,23 @@ def decide(
     )
     listed = _all_segments(observations, segments)
     objects = classify_motion(listed, hits, misses, settings, is_sharp)
-    gone, mixed = np.zeros(len(listed), np.bool_), np.zeros(len(listed), np.bool_)
+    gone = np.zeros(len(listed), np.bool_)
     for one in objects:
-        members = list(one.segments)
-        gone[members] = one.motion in GONE
-        if one.displaced:
-            mixed[members] = hold_something_else([listed[n] for n in members])
-    ends = np.cumsum([len(of_scan.truncated) for of_scan in segments])[:-1]
-    moved = [
-        # where a segment holds more than the mover, what nobody saw through stays
-        is_gone[of_scan.number] & ~(is_mixed[of_scan.number] & (counted[1] == 0))
-        for of_scan, counted, is_gone, is_mixed in zip(
-            segments, counts, np.split(gone, ends), np.split(mixed, ends), strict=True
-        )
-    ]
+        gone[list(one.segments)] = one.motion in GONE
+    is_whole = np.array([not one.truncated for one in listed], np.bool_)
+    stood = is_whole & ~gone & is_occupied(hits, misses)
+    moved_of, stood_of = _of_voxels(gone, segments), _of_voxels(stood, segments)
+    stays = standing(places, counts, moved_of, stood_of)
+    moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
     first_seen_here = tuple(one for one in objects if listed[one.segments[0]].scan < count)
-    return Decision(moved[:count], first_seen_here, is_sharp)
+    return Decision(moved, first_seen_here, is_sharp)
+
+
+def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> list[NDArray[np.bool_]]:
+    """For each scan, for its voxels (v,) what is true of their segments (s,), which are those of all scans."""
+    ends = np.cumsum([len(of_scan.truncated) for of_scan in segments])[:-1]
+    parts = zip(np.split(of_segments, ends), segments, strict=True)
+    return [part[of_scan.number] for part, of_scan in parts]
 
 
 def _check_order(observations: Sequence[Observation]) -> None:
@@ -140,15 +142,24 @@ def _check_order(observations: Sequence[Observation]) -> None:
             )
 
 
+def _places(observations: Sequence[Observation]) -> list[NDArray[np.int32]]:
+    """For each scan the numbers of its voxels (v,), the same in all scans."""
+    keys = [seen.segments.keys for seen in observations]
+    _, place = distinct(np.concatenate(keys))
+    return np.split(place, np.cumsum([len(of_scan) for of_scan in keys])[:-1])
+
+
 def _observations_by_others(
-    observations: Sequence[Observation], before: Keyframes | None, farthest_m: float
+    observations: Sequence[Observation],
+    places: Sequence[NDArray[np.int32]],
+    before: Keyframes | None,
+    farthest_m: float,
 ) -> list[NDArray[np.int32]]:
     """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
-    keys, voxel = distinct(np.concatenate([seen.segments.keys for seen in observations]))
-    rows = np.split(voxel, np.cumsum([len(seen.segments.keys) for seen in observations])[:-1])
-    points, centroids = np.zeros(len(keys)), np.zeros((len(keys), 3))
-    for seen, row in zip(observations, rows, strict=True):  # side by side, all of a chunk take 60 MB
-        _add(seen.segments.parts.points, seen.segments.parts.sums, row, points, centroids)
+    count = 1 + max(int(place.max(initial=-1)) for place in places)
+    points, centroids = np.zeros(count), np.zeros((count, 3))
+    for seen, place in zip(observations, places, strict=True):  # side by side, all of a chunk take 60 MB
+        _add(seen.segments.parts.points, seen.segments.parts.sums, place, points, centroids)
     centroids /= points[:, None]
     order = spatial_order(centroids)
     centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
@@ -156,7 +167,7 @@ def _observations_by_others(
         counts += hits_and_misses(centroids, some, farthest_m)
     counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
-    return [counts[:, row] for row in rows]
+    return [counts[:, place] for place in places]
 
 
 @njit(cache=True, nogil=True)
@@ -232,8 +243,6 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     scan=scan,
                     stamp=seen.stamp,
                     centroid=centroids[number],
-                    lowest=whole.lowest[number],
-                    highest=whole.highest[number],
                     points=int(whole.points[number]),
                     shown=bool(whole.labelled[number]),
                     truncated=truncated,

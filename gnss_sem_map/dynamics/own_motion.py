@@ -28,8 +28,6 @@ STEADY_SHARE = 0.6
 """What moves goes on: its shift is at least this share of its way, to and fro."""
 LARGEST_STEP_SHARE = 0.6
 """A step from one scan to the next that is a larger share of the shift is an error of the clusters."""
-LARGER_RATIO, LARGER_M = 1.2, 0.5
-"""A segment larger than the usual one of its track, by this factor and this much, holds something else as well."""
 CAR_M = 4.5
 """A vehicle that showed less of its length may be as long as this."""
 
@@ -110,9 +108,3 @@ def motion_of(segments: Sequence[Segment]) -> OwnMotion | None:
     lidar = np.array([one.seen_from @ along for one in whole])
     ranges = np.array([np.linalg.norm(one.centroid - one.seen_from) for one in whole])
     return own_motion(ends[:, 0], ends[:, 1], lidar, ranges)
-
-
-def hold_something_else(segments: Sequence[Segment]) -> NDArray[np.bool_]:
-    """Which segments (k,) of a track are larger than its object, so that they hold something beside it as well."""
-    sizes = np.array([np.linalg.norm(one.highest - one.lowest) for one in segments])
-    return np.asarray(sizes > LARGER_RATIO * np.median(sizes) + LARGER_M)

@@ -24,10 +24,6 @@ class Segment:
     stamp: float
     centroid: NDArray[np.float64]
     """(2,) m, east and north in the map frame."""
-    lowest: NDArray[np.float64]
-    """(2,) m: lower corner of the bounding box."""
-    highest: NDArray[np.float64]
-    """(2,) m: upper corner of the bounding box."""
     points: int
     shown: bool
     """An image labels some of its points as vehicle."""

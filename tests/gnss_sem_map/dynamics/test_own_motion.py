@@ -26,7 +26,7 @@ def seen(scan, centre, heading, lidar, truncated=False, grazing_deg=3.0):
             points += [centre + turn @ point for point in face]
     outline = np.array(points)
     return Segment(
-        scan, 0.1 * scan, outline.mean(axis=0), outline.min(axis=0), outline.max(axis=0), len(outline), True,
+        scan, 0.1 * scan, outline.mean(axis=0), len(outline), True,
         truncated, outline, np.asarray(lidar, float),
     )  # fmt: skip
 

@@ -164,6 +164,15 @@ def test_a_car_that_creeps_a_third_of_its_length_goes(lengths):
     assert others < 2e-4
 
 
+def test_a_car_that_creeps_past_parked_cars_takes_nothing_of_them_along():
+    """It passes so closely that it is one segment with them for some scans."""
+    creeping = going(16, 4.5 - CAR[1] - 0.3, 0.5)
+    share, others, _ = drive([*ROW, creeping], scans=60, ego_speed=0.0)
+    assert share[-1] > 0.5
+    np.testing.assert_array_equal(share[:-1], 0)
+    assert others == 0
+
+
 @pytest.mark.parametrize("start", [2.0, 2.9])
 def test_what_no_image_shows_goes_however_short_the_drive(start):
     """Half a second of driving of its own is enough; and the row of parked cars stays."""

@@ -59,7 +59,7 @@ class MappedChunk:
     objects: tuple[TrackedObject, ...]
     """Those that are first seen in this chunk."""
     keyframes: KeyframeScans | None
-    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
+    """Scans for free-space evidence; None where the poses are not sharp enough for it."""
     stats: RunStats
     """Its counts and skips."""
 
@@ -206,13 +206,7 @@ class _Chunk:
         """The chunk, once the scans before and after it are known."""
         release_memory()  # of the scans, freed by other threads: 250 MB after three hundred scans
         settings, numbers = self._drive.settings, [one.number for one in self.observations]
-        decision = decide(
-            [*self.observations, *after],
-            len(numbers),
-            before,
-            settings.dynamics,
-            self._drive.from_lidar_odometry,
-        )
+        decision = decide([*self.observations, *after], len(numbers), before, settings.dynamics)
         last = self._last_window()
         images = [one.seen for one in self.observations if one.number in last]
         with writing_to(self._folder):
@@ -231,7 +225,7 @@ class _Chunk:
             moving[numbers[place]] = points.near.indices[moved].astype(np.int64)
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
-        keyframes = self._keyframes.keyframes() if self._drive.from_lidar_odometry else None
+        keyframes = self._keyframes.keyframes() if decision.is_sharp else None
         static = self._all.to_map() - gone
         number = self._first + self._number
         return MappedChunk(

@@ -42,6 +42,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/segmentation/test_onnx_file.py",
         "gnss_sem_map/segmentation/test_refinenet.py",
         "gnss_sem_map/segmentation/test_training.py",
+        "gnss_sem_map/simulation/test_rigs.py",
         "gnss_sem_map/simulation/test_sessions.py",
         "gnss_sem_map/simulation/test_town.py",
         "gnss_sem_map/test_finished_run.py",

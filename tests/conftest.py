@@ -31,6 +31,7 @@ INTEGRATION_FILES = tuple(
         "factor_graphs/test_relative_poses.py",
         "factor_graphs/test_smoothing.py",
         "faults",
+        "gnss_sem_map/datasets/test_kitti_360.py",
         "gnss_sem_map/dynamics/test_moving_objects.py",
         "gnss_sem_map/evaluation/preflight",
         "gnss_sem_map/export/test_every_writer.py",

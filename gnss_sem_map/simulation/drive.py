@@ -106,6 +106,11 @@ class Simulation:
         """The map's frame: the position that the first row of the drive's oxts reports."""
         return LocalFrame(*(float(v) for v in self.oxts[self.sync[0], :3]))
 
+    @property
+    def place(self) -> LocalFrame:
+        """The simulation's own axes."""
+        return _PLACE
+
     def to_map(self, points: Floats) -> Floats:
         """From the simulation's own axes (origin at `_PLACE`) to the map that readers of the drive will find."""
         return self.frame.to_map(*_PLACE.to_geodetic(points))
@@ -316,14 +321,12 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
     ):
         (partial / name).mkdir(parents=True)
     morning_ns = simulation.morning_ns
-    _write_oxts(
-        partial, morning_ns, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync]
-    )
-    _write_oxts(folder / "extract", morning_ns, simulation.oxts_stamps, simulation.oxts)
+    write_oxts(partial, morning_ns, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
+    write_oxts(folder / "extract", morning_ns, simulation.oxts_stamps, simulation.oxts)
     stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}
     for name, values in stamps.items():
-        _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", morning_ns, values)
-    _write_stamps(
+        write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", morning_ns, values)
+    write_stamps(
         partial / "image_02" / "timestamps.txt",
         morning_ns,
         simulation.stamps + simulation.rig.cameras[0].stamp_after_s,
@@ -347,15 +350,16 @@ def write_truth(simulation: Simulation, truth: Path) -> None:
         write_changes(truth / "changes.json", simulation.session, simulation.changes, to_map)
 
 
-def _write_oxts(drive: Path, morning_ns: int, stamps: Floats, rows: Floats) -> None:
+def write_oxts(drive: Path, morning_ns: int, stamps: Floats, rows: Floats) -> None:
+    """`drive/oxts`: stamps and rows of the navigation unit."""
     (drive / "oxts" / "data").mkdir(parents=True)
     (drive / "oxts" / "dataformat.txt").write_text(DATAFORMAT)
-    _write_stamps(drive / "oxts" / "timestamps.txt", morning_ns, stamps)
+    write_stamps(drive / "oxts" / "timestamps.txt", morning_ns, stamps)
     for k, row in enumerate(rows):
         (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(row_text(row))
 
 
-def _write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
+def write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
     """One line `date time` with nanoseconds for each stamp."""
     times = (morning_ns + np.round(stamps * 1e9).astype(np.int64)).astype("datetime64[ns]")
     path.write_text("".join(str(time).replace("T", " ") + "\n" for time in times))

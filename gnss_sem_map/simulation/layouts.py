@@ -24,13 +24,14 @@ from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.simulation.bags import BagWriter
 from gnss_sem_map.simulation.drive import Simulation
+from gnss_sem_map.simulation.kitti_360_drive import write_kitti_360
 from gnss_sem_map.simulation.rig_drives import made_aside, write_table
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 Event = tuple[int, Callable[[int], None]]
 """Unix ns, and what writes the message of that moment."""
-Layout = Literal["kitti-raw", "table", "rosbag1", "mcap"]
+Layout = Literal["kitti-raw", "table", "rosbag1", "mcap", "kitti-360"]
 TRUTH: Final = "truth"
 LAT, LON, ALT = kitti_raw.LAT, kitti_raw.LON, kitti_raw.ALT
 FORCE, RATE = kitti_raw.SPECIFIC_FORCE, kitti_raw.ANGULAR_RATE
@@ -174,6 +175,8 @@ def write_rig(
     """Write the drive of a rig with its truth into a folder of `out`, see `write_table`; returns the folder."""
     if layout == "kitti-raw":
         raise DataError("KITTI raw has one LiDAR and one camera; choose the layout table, rosbag1 or mcap")
+    if layout == "kitti-360":
+        return write_kitti_360(simulation, out, progress, workers)
     if layout == "table":
         return write_table(simulation, out, progress, workers)
     target = out / simulation.name

@@ -18,7 +18,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
 
-_UNFILTERED: Final = (
+UNFILTERED: Final = (
     cv2.IMWRITE_PNG_FILTER,
     cv2.IMWRITE_PNG_FILTER_NONE,
 )  # ids are read four times as fast so
@@ -143,4 +143,4 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> None:
         image = simulation.image(k, number)
         pixels = cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR)
         write_png(drive / "images" / camera.name / f"{name}.png", pixels)
-        write_png(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids, *_UNFILTERED)
+        write_png(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids, *UNFILTERED)

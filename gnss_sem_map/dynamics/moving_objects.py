@@ -6,11 +6,12 @@ and misses of their voxels in all of them, and tells which have moved. `moved_po
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
@@ -25,9 +26,18 @@ from gnss_sem_map.dynamics.ground_grid import (
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
-from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses, spatial_order
+from gnss_sem_map.dynamics.visibility import (
+    SCANS_PER_PART,
+    Keyframes,
+    KeyframeScans,
+    RangeImage,
+    hits_and_misses,
+    spatial_order,
+)
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.voxels.hash_unique import distinct
+
+Array = NDArray[np.float64]
 
 FOOT_HEIGHT_M, BODY_HEIGHT_M = 0.05, 0.2
 """Heights over the lowest ground around: the body of an object begins at BODY_HEIGHT_M, its foot at FOOT_HEIGHT_M."""
@@ -37,8 +47,6 @@ CELL_M_PER_DEG, LARGEST_CELL_M = 1.0, 2.0
 object."""
 HIDING_M = 0.5
 """Something nearer by this hides the side of an object."""
-SCANS_AT_A_TIME = 64
-"""Range images that are copied side by side for counting: 8 MB. All of a chunk would add 75 MB to the peak of a run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +86,14 @@ class Decision:
 def decide(
     observations: Sequence[Observation],
     count: int,
-    before: Sequence[RangeImage],
+    before: Keyframes | None,
     settings: MotionSettings,
     from_lidar_odometry: bool = False,
 ) -> Decision:
     """Decide what moved in the first `count` of the observations, in time order, by the evidence of all.
 
-    The scans `before` count as evidence too. `from_lidar_odometry`: the poses come from LiDAR odometry, so that static
-    objects are not blurred. Raises DataError when the stamps do not increase.
+    The scans `before` count as evidence too, if there are some. `from_lidar_odometry`: the poses come from LiDAR
+    odometry, so that static objects are not blurred. Raises DataError when the stamps do not increase.
     """
     _check_order(observations)
     if not observations:
@@ -120,24 +128,38 @@ def _check_order(observations: Sequence[Observation]) -> None:
 
 
 def _observations_by_others(
-    observations: Sequence[Observation], before: Sequence[RangeImage], farthest_m: float
+    observations: Sequence[Observation], before: Keyframes | None, farthest_m: float
 ) -> list[NDArray[np.int32]]:
     """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
-    parts = [seen.segments.parts for seen in observations]
-    _, row = distinct(np.concatenate([seen.segments.keys for seen in observations]))
-    points = np.bincount(row, np.concatenate([part.points for part in parts]))
-    centroids = np.empty((len(points), 3))
-    for axis in range(3):  # one at a time: all of a chunk take 60 MB
-        centroids[:, axis] = np.bincount(row, np.concatenate([part.sums[:, axis] for part in parts])) / points
-    images = [*before, *(seen.seen for seen in observations)]
+    keys, voxel = distinct(np.concatenate([seen.segments.keys for seen in observations]))
+    rows = np.split(voxel, np.cumsum([len(seen.segments.keys) for seen in observations])[:-1])
+    points, centroids = np.zeros(len(keys)), np.zeros((len(keys), 3))
+    for seen, row in zip(observations, rows, strict=True):  # side by side, all of a chunk take 60 MB
+        _add(seen.segments.parts.points, seen.segments.parts.sums, row, points, centroids)
+    centroids /= points[:, None]
     order = spatial_order(centroids)
     centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
-    for start in range(0, len(images), SCANS_AT_A_TIME):
-        some = KeyframeScans.of(images[start : start + SCANS_AT_A_TIME])
+    for some in chain(() if before is None else before.parts(), _parts(observations)):
         counts += hits_and_misses(centroids, some, farthest_m)
     counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
-    return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
+    return [counts[:, row] for row in rows]
+
+
+@njit(cache=True, nogil=True)
+def _add(
+    points: NDArray[np.int32], sums: Array, row: NDArray[np.int32], all_points: Array, all_sums: Array
+) -> None:
+    for i in range(len(row)):
+        all_points[row[i]] += points[i]
+        for axis in range(3):
+            all_sums[row[i], axis] += sums[i, axis]
+
+
+def _parts(observations: Sequence[Observation]) -> Iterator[KeyframeScans]:
+    """The scans, some at a time: side by side, all images of a chunk would add 75 MB to the peak of a run."""
+    for start in range(0, len(observations), SCANS_PER_PART):
+        yield KeyframeScans.of([one.seen for one in observations[start : start + SCANS_PER_PART]])
 
 
 def observe(

@@ -6,6 +6,7 @@ import pytest
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.dynamics.moving_objects import decide, moved_points, observe
+from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement.vehicles import Motion
 
@@ -81,7 +82,8 @@ def decided(seen, settings=None, matched=False, first=0, last=None, window=1000)
     settings, last = settings or MotionSettings(), len(seen) if last is None else last
     before = [observation.seen for observation, _ in seen[max(first - window, 0) : first]]
     observations = [observation for observation, _ in seen[first : last + window]]
-    decision = decide(observations, last - first, before, settings, matched)
+    images = KeyframeScans.of(before) if before else None
+    decision = decide(observations, last - first, images, settings, matched)
     moving = {
         observation.number: near.indices[moved_points(near, moved, settings.grow_m)]
         for (observation, near), moved in zip(seen[first:last], decision.moved, strict=True)

@@ -180,7 +180,7 @@ def _points(log: SensorLog, scan: Scan | None, trajectory: Trajectory, T_imu_map
     p_map = points_in_map(scan.read(), scan.stamp, trajectory, log.calibration.T_imu_lidar)
     p = p_map @ T_imu_map[:3, :3].T + T_imu_map[:3, 3]
     squares = np.einsum("ij,ij->i", p, p)
-    return p[(squares > NEAREST_M**2) & (squares < FARTHEST_M**2)]
+    return np.asarray(p[(squares > NEAREST_M**2) & (squares < FARTHEST_M**2)])
 
 
 def _thinned(p: Array) -> Array:

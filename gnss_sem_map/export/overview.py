@@ -58,7 +58,8 @@ def overview_of(tiled: TiledMap) -> Overview | None:
         hits += np.bincount(flat, weights, len(hits))
         for label in range(-1, len(names)):
             votes[label + 1] += np.bincount(flat[labels == label], minlength=len(hits)).astype(np.int32)
-        squares += len(np.unique(places >> area_shift, axis=0))
+        x, y = (places >> area_shift).T
+        squares += len(np.unique(x << 32 | y & 0xFFFFFFFF))
         known, sure = labels >= 0, piece.confidence[shown]
         classes += _sums(labels[known], sure[known], len(classes))
         groups = np.searchsorted(LOOKS, weights[known], side="right") - 1

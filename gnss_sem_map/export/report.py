@@ -254,7 +254,7 @@ def _movers(refinement: Mapping[str, Any]) -> dict[str, Any]:
         "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},
         "mover_rows": [
             (t["motion"], percent(t["probability"]), t["reason"], t["points"],
-             f"{t['first_stamp']:.1f}", f"{t['last_stamp']:.1f}")
+             *(f"{round(t[end], 1) + 0.0:.1f}" for end in ("first_stamp", "last_stamp")))
             for t in moving
         ],
     }  # fmt: skip

@@ -123,6 +123,12 @@ class Segments:
         """Statistics of every segment (s,)."""
         return self.parts.merged(self.number, len(self.truncated))
 
+    def outlines(self) -> list[NDArray[np.float32]]:
+        """For every segment, its voxels by the means of their points (v, 2) m."""
+        order = np.argsort(self.number, kind="stable")
+        means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
+        return np.split(means, np.cumsum(np.bincount(self.number, minlength=len(self.truncated)))[:-1])
+
     def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
         """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
         weights, count = counts * self.parts.points, len(self.truncated)

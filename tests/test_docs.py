@@ -44,6 +44,11 @@ class Block:
     title: str
     text: str
 
+    @property
+    def lines(self) -> list[str]:
+        """Its commands, one that goes on over several lines as one."""
+        return self.text.replace("\\\n", " ").splitlines()
+
 
 def blocks(page: Path) -> Iterator[Block]:
     for language, title, text in FENCED.findall(page.read_text("utf-8")):
@@ -55,7 +60,7 @@ LINES = [
     pytest.param(line, id=f"{block.page}: {line[:60]}")
     for block in BLOCKS
     if block.language == "bash"
-    for line in block.text.splitlines()
+    for line in block.lines
 ]
 IN_TEXT = sorted(
     {
@@ -147,7 +152,7 @@ def test_a_page_runs_from_its_first_command_to_its_last(name: str, tmp_path: Pat
             done = run([sys.executable, "-c", block.text], tmp_path)
             assert done.returncode == 0, done.stderr
             assert done.stdout
-        for line in block.text.splitlines() if block.language == "bash" else ():
+        for line in block.lines if block.language == "bash" else ():
             done = run([sys.executable, "-m", "gnss_sem_map.cli", *shlex.split(line)[1:]], tmp_path)
             is_check = line.split()[1] == "check"  # may be red: the drives here last seconds
             assert done.returncode == 0 or (is_check and done.returncode == 1), (line, done.stderr)

@@ -7,7 +7,9 @@ committed.
 from __future__ import annotations
 
 import ast
+import base64
 import json
+import posixpath
 import re
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -17,8 +19,15 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 ROOT = Path(__file__).resolve().parents[2]
 BENCHMARKS = ROOT / "benchmarks"
-_TYPES = {str: "text", int: "whole number", float: "number", bool: "true or false", Path: "file"}
-_CALL = "gnss-sem-map"
+COPIED = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "gnss_sem_map/segmentation/demo_network/README.md": "demo_network.md",
+}
+"""Texts outside docs/ that are pages of the site."""
+PROGRAM = "gnss-sem-map"
+TYPE_NAMES = {str: "text", int: "whole number", float: "number", bool: "true or false", Path: "file"}
 MOST_ROWS = 16
 """Parts of a result with more figures are divided further."""
 EXECUTED = ROOT / "build" / "notebooks"
@@ -38,8 +47,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """Formulas as MathML, drawn without a script; links to sources, which are not in the site, as text."""
     markdown = re.sub(r"```math\n(.*?)```", lambda found: _formula(found[1], "block"), markdown, flags=re.S)
     markdown = re.sub(r"\$`(.*?)`\$", lambda found: _formula(found[1], "inline"), markdown)
-    markdown = markdown.replace("(../gnss_sem_map/segmentation/demo_network/README.md)", "(demo_network.md)")
-    return re.sub(r"\[([^\]]*)\]\(\.\./[^)]*\)", r"\1", markdown)
+    return re.sub(r"\[([^\]]*)\]\((\.\./[^)]*)\)", lambda found: _link(found, "docs"), markdown)
 
 
 def _formula(latex: str, display: str) -> str:
@@ -51,16 +59,12 @@ def _formula(latex: str, display: str) -> str:
 
 def pages() -> Iterator[tuple[str, str | bytes]]:
     """Path in the site and content of every page and picture."""
-    yield "index.md", of_the_repository("README.md")
-    yield "changelog.md", of_the_repository("CHANGELOG.md")
-    yield "contributing.md", of_the_repository("CONTRIBUTING.md")
-    yield "demo_network.md", of_the_repository("gnss_sem_map/segmentation/demo_network/README.md")
+    for source, path in COPIED.items():
+        yield path, of_the_repository(source)
     yield "settings.md", settings_page()
     yield "commands.md", commands_page()
     yield "api.md", api_page()
     yield "benchmarks.md", benchmarks_page()
-    for name in ("paper.yaml", "batch_kitti.py", "streaming.py", "kalman_baseline.py", "training_images.py"):
-        yield f"examples/{name}", (ROOT / "examples" / name).read_text("utf-8")
     for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
         yield from notebook_page(notebook)
 
@@ -70,8 +74,23 @@ def pages() -> Iterator[tuple[str, str | bytes]]:
 
 def of_the_repository(name: str) -> str:
     """A page outside docs/, with the links to docs/ as they are in the site."""
-    text = (ROOT / name).read_text("utf-8")
-    return re.sub(r"(\]\(|src=\")docs/", r"\1", text).replace("](CONTRIBUTING.md", "](contributing.md")
+    text = (ROOT / name).read_text("utf-8").replace('src="docs/', 'src="')
+    return re.sub(r"\[([^\]]*)\]\(([^)]*)\)", lambda found: _link(found, posixpath.dirname(name)), text)
+
+
+def _link(found: re.Match[str], folder: str) -> str:
+    """A link in a file of `folder` as one of the site; what is not in the site stays as text."""
+    target, hash_, heading = found[2].partition("#")
+    if not target or "://" in target:
+        return found[0]
+    path = posixpath.normpath(posixpath.join(folder, target))
+    if path in COPIED:
+        return f"[{found[1]}]({COPIED[path]}{hash_}{heading})"
+    return (
+        f"[{found[1]}]({path.removeprefix('docs/')}{hash_}{heading})"
+        if path.startswith("docs/")
+        else found[1]
+    )
 
 
 # --- settings -----------------------------------------------------------------------------------------------------
@@ -122,7 +141,7 @@ def _type_name(annotation: Any) -> str:
         return " or ".join(_type_name(part) for part in inner if part is not NoneType)
     if origin is not None:
         return f"{origin.__name__} of {', '.join(map(_type_name, inner))}"
-    return _TYPES.get(annotation, annotation.__name__)
+    return TYPE_NAMES.get(annotation, annotation.__name__)
 
 
 def _default(value: Any) -> str:
@@ -144,7 +163,7 @@ def commands_page() -> str:
         "Exit codes: 0 done, 1 an error (one line on stderr), 2 wrong usage, 128 plus its number for a signal.\n"
     ]
     for name, command in group.commands.items():
-        context = typer.Context(command, info_name=f"{_CALL} {name}")
+        context = typer.Context(command, info_name=f"{PROGRAM} {name}")
         records = (parameter.get_help_record(context) for parameter in command.params)
         rows = [(f"`{_names(names)}`", _escaped(text)) for names, text in filter(None, records)]
         needed = [
@@ -154,7 +173,7 @@ def commands_page() -> str:
         ]
         text = "\n".join(line.strip() for line in (command.help or "").splitlines())
         parts.append(
-            f"\n## {name}\n\n{text}\n\n```text\n{' '.join([_CALL, name, *needed, '[OPTIONS]'])}\n```\n"
+            f"\n## {name}\n\n{text}\n\n```text\n{' '.join([PROGRAM, name, *needed, '[OPTIONS]'])}\n```\n"
         )
         parts.append(_table(("argument or option", "meaning"), rows))
     return "".join(parts)
@@ -280,8 +299,6 @@ def _nested(value: Any) -> bool:
 
 def notebook_page(notebook: Path) -> Iterator[tuple[str, str | bytes]]:
     """A notebook as a page with its pictures: with output if `make notebooks` executed it, otherwise without."""
-    import base64
-
     executed = EXECUTED / notebook.name
     cells = json.loads((executed if executed.is_file() else notebook).read_text("utf-8"))["cells"]
     place = f"notebooks/{notebook.stem}"

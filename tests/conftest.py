@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NoReturn
 
+import hypothesis
 import pytest
 import street
 from declared import DATA, absent
@@ -18,6 +19,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Simulation
+
+hypothesis.settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of a law
+hypothesis.settings.load_profile("untimed")
 
 TESTS = Path(__file__).parent
 NOT_UNIT = ("integration", "slow", "faults")

@@ -105,13 +105,12 @@ def test_what_text_calls_a_command_is_one(code: str) -> None:
     program, name, *words = code.split()
     options = {word.split("=")[0] for word in words if word.startswith("-")}
     if program == "gnss-sem-map":
-        if name not in {"COMMAND", "--version", "--help", "-h"}:
-            known = {
-                option
-                for parameter in COMMANDS.commands[name].params
-                for option in (*parameter.opts, *parameter.secondary_opts)
-            }
-            assert options <= known | {"--help", "-h"}
+        if name == "COMMAND":
+            return
+        is_of_all = name.startswith("-")
+        parameters = COMMANDS.params if is_of_all else COMMANDS.commands[name].params
+        known = {option for each in parameters for option in (*each.opts, *each.secondary_opts)}
+        assert options | ({name} if is_of_all else set()) <= known | {"--help", "-h"}
     elif program == "make":
         targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
         assert {name, *words} <= targets

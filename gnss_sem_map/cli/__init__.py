@@ -21,11 +21,12 @@ def main() -> None:
     try:
         stop_on_signals()
         from gnss_sem_map.cli.commands import main as run_command
+
+        run_command()
     except Stopped as stopped:
         ignore_signals()
         print(f"gnss-sem-map: {stopped}", file=sys.stderr)
         sys.exit(128 + stopped.number)
-    run_command()
 
 
 def __getattr__(name: str) -> Any:

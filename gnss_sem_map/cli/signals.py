@@ -10,6 +10,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
 LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset")
 """Modules whose functions take locks: one that is left between taking a lock and giving it back blocks all threads."""
+IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
 
@@ -60,7 +61,22 @@ def _stop_later(number: int, seen: FrameType | None = None) -> None:
 
 
 def _takes_locks(frame: FrameType | None) -> bool:
-    return frame is not None and str(frame.f_globals.get("__name__")).startswith(LOCKING)
+    """Whether a function that takes locks is on top, or a module is being imported.
+
+    An import that is left may crash in compiled code, and some modules drop every exception of what they import.
+    """
+    if frame is None:
+        return False
+    if _module_of(frame).startswith(LOCKING):
+        return True
+    while (frame := frame.f_back) is not None:
+        if _module_of(frame).startswith(IMPORTING):
+            return True
+    return False
+
+
+def _module_of(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__"))
 
 
 def _dropped(dropped: sys.UnraisableHookArgs) -> None:

@@ -19,8 +19,8 @@ import bags
 from gnss_sem_map import run
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.simulation import prepare, write_corrupted_labels
-from gnss_sem_map.simulation.rig_drives import write_table
 from gnss_sem_map.simulation.rigs import RIGS
+from gnss_sem_map.simulation.table_drive import write_table
 
 RESULTS = Path(__file__).parent / "results" / "rigs.json"
 SECONDS, SEED = 30.0, 0

@@ -21,7 +21,7 @@ from gnss_sem_map.cli import (
     settings,
     simulation,
 )
-from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
+from gnss_sem_map.cli.signals import Stopped, ignore_signals
 from gnss_sem_map.memory import collect_seldom, share_one_heap
 
 COMMANDS = (
@@ -93,7 +93,7 @@ for _command in COMMANDS:
 def main() -> None:
     """Entry point: one line on stderr for every error; exit code 2 for wrong usage, 1 for any other error.
 
-    A signal ends it with one line too, and with 128 plus its number.
+    A signal ends it with one line too, and with 128 plus its number; they are caught from `cli.main` on.
     """
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
@@ -106,7 +106,6 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
-        stop_on_signals()
         code = app(prog_name="gnss-sem-map", standalone_mode=False)
         sys.stdout.flush()
     except Stopped as stopped:

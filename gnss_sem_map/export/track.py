@@ -42,11 +42,10 @@ def read_track(path: Path, scans_s: tuple[float, float] | None = None) -> Track:
     kept = trajectory[np.unique(np.linspace(0, len(trajectory) - 1, MOST_POSES).astype(np.intp))]
     horizontal = vertical = None
     if kept.covariances is not None:
-        R = kept.T_map_imu[:, :3, :3]
-        covariances = R @ kept.covariances[:, 3:, 3:] @ R.transpose(0, 2, 1)
-        largest = np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1].clip(0)
+        covariances = kept.position_covariances
+        largest = np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]
         horizontal, vertical = (
-            SHARE_95_PLANE * np.sqrt(largest),
+            SHARE_95_PLANE * np.sqrt(largest.clip(0)),
             SHARE_95 * np.sqrt(covariances[:, 2, 2].clip(0)),
         )
     return Track(

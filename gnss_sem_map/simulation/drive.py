@@ -20,9 +20,9 @@ from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.files.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
+from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
 from gnss_sem_map.simulation.oxts import DATAFORMAT, Gnss, oxts_rows, row_text, sweep_rows
-from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.rigs import Rig, kitti
 from gnss_sem_map.simulation.sessions import Change, changes, session_of
 from gnss_sem_map.simulation.streets import around_the_block

@@ -14,9 +14,9 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.camera import Camera
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_oxts, write_png, write_stamps, write_truth
-from gnss_sem_map.simulation.rig import transform
-from gnss_sem_map.simulation.rig_drives import UNFILTERED, Progress, made_aside, render_frames
+from gnss_sem_map.simulation.kitti_rig import transform
 from gnss_sem_map.simulation.rigs import MountedCamera
+from gnss_sem_map.simulation.table_drive import UNFILTERED, Progress, made_aside, render_frames
 
 _R_RECT: Final = Rotation.from_euler("ZYX", [-0.10, 0.51, 0.15], degrees=True).as_matrix()
 _RECTIFIED: Final = ("image_00", "image_01")
@@ -27,7 +27,7 @@ def write_kitti_360(
 ) -> Path:
     """Write a drive of KITTI-360's rig into a folder of `out`; returns the folder of the drive in its `data_3d_raw`.
 
-    See `rig_drives.write_table`. Raises DataError for another rig.
+    See `table_drive.write_table`. Raises DataError for another rig.
     """
     names = [camera.name for camera in simulation.rig.cameras]
     if names != list(IMAGES) or len(simulation.rig.lidars) != 1:

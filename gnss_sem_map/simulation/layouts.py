@@ -25,7 +25,7 @@ from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.simulation.bags import BagWriter
 from gnss_sem_map.simulation.drive import Simulation
 from gnss_sem_map.simulation.kitti_360_drive import write_kitti_360
-from gnss_sem_map.simulation.rig_drives import made_aside, write_table
+from gnss_sem_map.simulation.table_drive import made_aside, write_table
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]

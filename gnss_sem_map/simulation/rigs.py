@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from gnss_sem_map.sensor_log.cameras import Distortion
 from gnss_sem_map.simulation.camera import Camera
 from gnss_sem_map.simulation.compiled import Floats
+from gnss_sem_map.simulation.kitti_rig import FORWARD, T_IMU_LIDAR, camera_in_imu, transform
 from gnss_sem_map.simulation.lidar import Lidar
-from gnss_sem_map.simulation.rig import FORWARD, T_IMU_LIDAR, camera_in_imu, transform
 
 RigName = Literal["kitti", "surround", "kitti-360"]
 _Place = tuple[float, float, float]

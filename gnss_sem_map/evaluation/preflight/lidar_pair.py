@@ -21,10 +21,9 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, points_in_map
+from gnss_sem_map.scans.downsampling import one_per_cube
 from gnss_sem_map.scans.registration import exp, inverse
 from gnss_sem_map.sensor_log import Scan, SensorLog
-from gnss_sem_map.voxels.hash_unique import distinct
-from gnss_sem_map.voxels.kernels import pack_keys
 
 Array = NDArray[np.float64]
 
@@ -34,7 +33,7 @@ AT_MOST_S = 0.3
 """Farther from where it was wanted, no sweep is taken."""
 NEAREST_M, FARTHEST_M = 2.5, 40.0
 EDGE_M, NEIGHBOURS = 0.3, 8
-"""One point per cube of this edge counts, with the plane of so many neighbours."""
+"""One point per cube of this edge counts, the mean, with the plane of so many neighbours."""
 LEAST_POINTS = 150
 STEPS_M = (3.0, 2.0, 1.0, 0.5, 0.3, 0.2, 0.2)
 """How far a point may lie from its surface, step by step."""
@@ -160,12 +159,12 @@ def _moment(first: SensorLog, other: SensorLog, stamp: float, trajectory: Trajec
         return None  # what cannot be read is told by other checks
     if not clouds or len(p) < LEAST_POINTS:
         return None
-    surface = _thinned(np.concatenate(clouds))
+    surface = one_per_cube(np.concatenate(clouds), EDGE_M)
     if len(surface) < LEAST_POINTS:
         return None
     cloud, tree = small_gicp.PointCloud(surface), small_gicp.KdTree(surface)
     small_gicp.estimate_normals(cloud, tree, NEIGHBOURS)
-    return _Moment(surface, np.asarray(cloud.normals())[:, :3].copy(), tree, _thinned(p))
+    return _Moment(surface, np.asarray(cloud.normals())[:, :3].copy(), tree, one_per_cube(p, EDGE_M))
 
 
 def _nearest(scans: tuple[Scan, ...], stamp: float) -> Scan | None:
@@ -181,15 +180,6 @@ def _points(log: SensorLog, scan: Scan | None, trajectory: Trajectory, T_imu_map
     p = p_map @ T_imu_map[:3, :3].T + T_imu_map[:3, 3]
     squares = np.einsum("ij,ij->i", p, p)
     return np.asarray(p[(squares > NEAREST_M**2) & (squares < FARTHEST_M**2)])
-
-
-def _thinned(p: Array) -> Array:
-    keys = np.empty(len(p), np.int64)
-    pack_keys(np.ascontiguousarray(p), EDGE_M, keys)
-    cubes, cube = distinct(keys)
-    one = np.empty(len(cubes), np.int64)
-    one[cube] = np.arange(len(p))
-    return np.ascontiguousarray(p[one])
 
 
 def _residuals(moment: _Moment, T: Array, within_m: float) -> tuple[Array, Array, Array]:

@@ -17,8 +17,8 @@ from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Simulation, prepare, write_corrupted_labels
 from gnss_sem_map.simulation.layouts import Layout, write_rig
-from gnss_sem_map.simulation.rig_drives import write_table
 from gnss_sem_map.simulation.rigs import RIGS, Rig, RigName
+from gnss_sem_map.simulation.table_drive import write_table
 
 SECONDS, SEED = 0.6, 0
 COARSER = 4

@@ -16,8 +16,8 @@ from gnss_sem_map.evaluation.preflight.findings import Finding, Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import prepare
-from gnss_sem_map.simulation.rig_drives import write_table
 from gnss_sem_map.simulation.rigs import Rig, surround
+from gnss_sem_map.simulation.table_drive import write_table
 
 
 @pytest.fixture(scope="module")

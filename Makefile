@@ -8,7 +8,7 @@ PYTEST := $(BIN)/pytest -n auto --dist loadfile
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 
-.PHONY: test test-unit test-slow test-faults check demo notebooks package clean
+.PHONY: test test-unit test-slow test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -28,8 +28,14 @@ test: $(TOOLS)
 test-unit: $(TOOLS)
 	$(PYTEST) -m 'not slow and not faults and not integration'
 
+# Executed in build/notebooks, where the site finds them with their pictures.
 notebooks: $(TOOLS)
-	$(PYTEST) --nbmake --nbmake-timeout=600 examples
+	rm -rf build/notebooks && mkdir -p build/notebooks && cp examples/*.ipynb build/notebooks
+	$(PYTEST) --nbmake --nbmake-timeout=600 --overwrite build/notebooks
+
+# The documentation site, in build/site; a link that leads nowhere is an error.
+docs: $(TOOLS)
+	$(BIN)/mkdocs build --quiet --strict
 
 demo: $(PACKAGE)
 	$(BIN)/gnss-sem-map demo

@@ -42,7 +42,7 @@ from gnss_sem_map.scans.deskew import points_in_map
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_scans
 from gnss_sem_map.sensor_log import Calibration, Points, Scan, SensorLog
 from gnss_sem_map.simulation import Simulation, prepare
-from gnss_sem_map.simulation.rig import T_IMU_LIDAR
+from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR
 
 Array = NDArray[np.float64]
 DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"

@@ -96,13 +96,17 @@ class Trajectory:
         return self.T_map_imu[:, :3, 3]
 
     @property
-    def position_stddevs(self) -> Array:
-        """Standard deviations of the positions along east, north, up, (k, 3) m."""
+    def position_covariances(self) -> Array:
+        """Covariances of the positions along east, north, up, (k, 3, 3) m²; raises MeasurementError without any."""
         if self.covariances is None:
             raise MeasurementError("this trajectory has no covariances")
         R = self.T_map_imu[:, :3, :3]
-        variances: Array = np.einsum("kij,kjl,kil->ki", R, self.covariances[:, 3:, 3:], R)
-        return np.sqrt(variances)
+        return np.asarray(R @ self.covariances[:, 3:, 3:] @ np.swapaxes(R, 1, 2))
+
+    @property
+    def position_stddevs(self) -> Array:
+        """Standard deviations of the positions along east, north, up, (k, 3) m."""
+        return np.sqrt(np.diagonal(self.position_covariances, axis1=1, axis2=2))
 
     def moved(self, T: Array) -> "Trajectory":
         """The same trajectory in another map frame, T = T_other_map (4, 4); covariances are in imu axes and stay."""

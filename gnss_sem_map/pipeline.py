@@ -178,7 +178,9 @@ def _checked_and_located(
 ) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
     """All that comes before the map; the sweeps that the check has read are not read again."""
     sweeps = KeptSweeps()
+    progress("preflight", 0, 1)
     page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
+    progress("preflight", 1, 1)
     found, sharpness = _located(
         sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, bound
     )

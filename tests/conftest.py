@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NoReturn
 
+import hypothesis
 import pytest
 import street
 from declared import DATA, absent
@@ -18,6 +19,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Simulation
+
+hypothesis.settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of a law
+hypothesis.settings.load_profile("untimed")
 
 TESTS = Path(__file__).parent
 NOT_UNIT = ("integration", "slow", "faults")
@@ -31,6 +35,7 @@ INTEGRATION_FILES = tuple(
         "factor_graphs/test_relative_poses.py",
         "factor_graphs/test_smoothing.py",
         "faults",
+        "gnss_sem_map/datasets/test_kitti_360.py",
         "gnss_sem_map/dynamics/test_moving_objects.py",
         "gnss_sem_map/evaluation/preflight",
         "gnss_sem_map/export/test_every_writer.py",
@@ -42,6 +47,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/segmentation/test_onnx_file.py",
         "gnss_sem_map/segmentation/test_refinenet.py",
         "gnss_sem_map/segmentation/test_training.py",
+        "gnss_sem_map/simulation/test_rigs.py",
         "gnss_sem_map/simulation/test_sessions.py",
         "gnss_sem_map/simulation/test_town.py",
         "gnss_sem_map/test_finished_run.py",

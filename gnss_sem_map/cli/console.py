@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from gnss_sem_map.cli.logs import PROGRAM, Chosen, StageLog, Terminal
+
 if TYPE_CHECKING:
     from gnss_sem_map.datasets.ros.contents import Topic
     from gnss_sem_map.evaluation.preflight.findings import Preflight
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """A progress bar per stage on stderr; nothing when that is not a terminal."""
+    """A progress bar per stage on stderr, with --verbose lines; nothing when that is not a terminal, or --quiet."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -41,10 +43,13 @@ def progress_bars() -> Iterator[Progress]:
     stage = TextColumn("{task.description:>12}")
     columns = (stage, BarColumn(), MofNCompleteColumn(), Throughput(), TimeRemainingColumn())
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+    has_bars = console.is_terminal and Chosen.terminal is Terminal.NORMAL
+    with Progress(*columns, console=console, disable=not has_bars, transient=True) as bars:
         tasks: dict[str, Any] = {}
+        log = StageLog()
 
         def show(stage: str, done: int, total: int) -> None:
+            log(stage, done, total)
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total)
             bars.update(tasks[stage], completed=done, total=total)
@@ -53,9 +58,11 @@ def progress_bars() -> Iterator[Progress]:
 
 
 def warn(warnings: Iterable[str]) -> None:
-    """Warnings on stderr, a line each."""
+    """Warnings on stderr, a line each; with --quiet only in the log file."""
     for warning in warnings:
-        typer.echo(f"warning: {warning}", err=True)
+        PROGRAM.warning("%s", warning)
+        if Chosen.terminal is not Terminal.QUIET:
+            typer.echo(f"warning: {warning}", err=True)
 
 
 def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:

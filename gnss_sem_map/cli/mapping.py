@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
+from gnss_sem_map.cli.dry_run import print_plan
 from gnss_sem_map.cli.options import (
     Config,
     Crs,
@@ -87,16 +88,30 @@ def run(
     ] = None,
     force: Force = False,
     as_json: Json = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Open everything, print what would be done and its cost; write nothing."
+        ),
+    ] = False,
 ) -> None:
     """Make trajectory, semantic map, refined map and all exports of one drive, or one map of several."""
     from gnss_sem_map.runs import finished_run
     from gnss_sem_map.runs.many_drives import HowMapped
     from gnss_sem_map.runs.run_folder import claimed_run, places_read
+    from gnss_sem_map.runs.source import source_of
     from gnss_sem_map.segmentation import no_segmenter_message
 
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
+    if dry_run:
+        sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
+        with claimed_run(
+            out, [place for drive in found for place in places_read(drive, settings, segmenter, config)]
+        ):
+            print_plan(sources, settings, workers or default_workers())
+        return
     if len(found) > 1 or align_to is not None:
         if segmenter is None:
             typer.echo(no_segmenter_message(str(found[0])), err=True)

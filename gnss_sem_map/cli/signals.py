@@ -10,6 +10,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
 LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset")
 """Modules whose functions take locks: one that is left between taking a lock and giving it back blocks all threads."""
+IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
+"""Modules that import others: one of their functions is below whatever an import runs."""
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
 
@@ -41,7 +43,7 @@ def ignore_signals() -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    if not _takes_locks(frame):
+    if not _must_go_on(frame):
         raise Stopped(number)
     _stop_later(number, frame)
 
@@ -59,8 +61,23 @@ def _stop_later(number: int, seen: FrameType | None = None) -> None:
     signal.setitimer(signal.ITIMER_REAL, TRY_AGAIN_S)
 
 
-def _takes_locks(frame: FrameType | None) -> bool:
-    return frame is not None and str(frame.f_globals.get("__name__")).startswith(LOCKING)
+def _must_go_on(frame: FrameType | None) -> bool:
+    """Whether a function that takes locks is on top, or a module is being imported.
+
+    An import that is left may crash in compiled code, and some modules drop every exception of what they import.
+    """
+    if frame is None:
+        return False
+    if _module_of(frame).startswith(LOCKING):
+        return True
+    while (frame := frame.f_back) is not None:
+        if _module_of(frame).startswith(IMPORTING):
+            return True
+    return False
+
+
+def _module_of(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__"))
 
 
 def _dropped(dropped: sys.UnraisableHookArgs) -> None:

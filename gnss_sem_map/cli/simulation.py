@@ -42,19 +42,39 @@ def simulate(
         ),
     ] = "unit",
     layout: Annotated[
-        Literal["kitti-raw", "table", "rosbag1", "mcap"],
+        Literal["kitti-raw", "table", "rosbag1", "mcap", "kitti-360"] | None,
         typer.Option(
-            help="KITTI raw, a CSV log, a ROS 1 bag, or a ROS 2 bag: the same drive, and the same map."
+            help="KITTI raw, a CSV log, a ROS 1 bag, or a ROS 2 bag: the same drive, and the same map. KITTI-360: its"
+            " own rig. Default: KITTI raw, of other rigs a CSV log.",
+            show_default=False,
         ),
-    ] = "kitti-raw",
+    ] = None,
+    rig: Annotated[
+        Literal["kitti", "surround", "kitti-360"] | None,
+        typer.Option(
+            help="KITTI's LiDAR and camera; two LiDARs of 32 rings and four cameras, one of them a fisheye; or"
+            " KITTI-360's LiDAR, two cameras and two fisheyes. Default: that of the layout, else KITTI's.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a simulated drive, with the exact truth beside it."""
+    from gnss_sem_map.simulation import prepare
     from gnss_sem_map.simulation import simulate as write_drive
-    from gnss_sem_map.simulation.layouts import write_in_layout
+    from gnss_sem_map.simulation.layouts import write_in_layout, write_rig
+    from gnss_sem_map.simulation.rigs import RIGS
 
     with progress_bars() as progress:
+        rig = rig or ("kitti-360" if layout == "kitti-360" else "kitti")
+        if rig != "kitti" or layout == "kitti-360":
+            simulation = prepare(seconds, seed, laps=laps, session=session, gnss=gnss, rig=RIGS[rig]())
+            drive = write_rig(
+                simulation, out, layout or "table", lambda done, total: progress("simulate", done, total)
+            )
+            typer.echo(f"drive in {drive}")
+            return
         drive = write_in_layout(
-            out, layout,
+            out, layout or "kitti-raw",
             lambda folder: write_drive(
                 folder, seconds, seed, lambda done, total: progress("simulate", done, total),
                 laps=laps, session=session, gnss=gnss,

@@ -28,7 +28,7 @@ def read_rows(path: Path, expected: dict[str, int]) -> dict[str, Array]:
     if not is_file(path):
         raise DataError(
             f"{shown(path)}: missing calibration file; expected rows {sorted(expected)}."
-            " It comes with the drive's date (KITTI raw: *_calib.zip)"
+            " It comes with the drive's date (KITTI raw: *_calib.zip) or the data set (KITTI-360: calibration.zip)"
         )
     read_bytes(path, MOST_BYTES)
     try:

@@ -95,7 +95,7 @@ def _left_out(what: str, folder: Path, poses: int, found: frames.Frames) -> list
 
 def _times(path: Path) -> Array:
     """Stamps, s, that increase; raises DataError, with the line, for anything else."""
-    times = _table(path, 1)[:, 0]
+    times = read_table(path, 1)[:, 0]
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         line = int(backwards[0]) + 2
@@ -115,7 +115,7 @@ def _times(path: Path) -> Array:
 
 def _poses(path: Path) -> Array:
     """Poses (k, 3, 4); raises DataError, with the line, for one that is no rigid transform."""
-    poses = _table(path, 12).reshape(-1, 3, 4)
+    poses = read_table(path, 12).reshape(-1, 3, 4)
     R = poses[:, :, :3]
     with np.errstate(all="ignore"):
         off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -151,8 +151,8 @@ def _read_compensated(path: Path, state: frames.State | None) -> Points:
     return Points(rows[:, :3], rows[:, 3], None)
 
 
-def _table(path: Path, columns: int) -> Array:
-    """Rows of numbers; raises DataError, with the line, for anything else."""
+def read_table(path: Path, columns: int) -> Array:
+    """Rows (n, columns) of numbers; raises DataError, with the line, for anything else."""
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing; expected one line of {columns} numbers per frame")
     rows = []

@@ -9,6 +9,7 @@ to frame k, and is blank when the frame is missing.
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -72,6 +73,48 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     Without `with_imu`, the thousands of files of its `_extract` twin are not read.
     """
     calibration = _calibration(date_folder(drive), has_images=is_folder(drive / "image_02"))
+    unit = navigation(drive, _twins(drive), with_imu)
+    epoch_ns = unit.epoch_ns
+    scans, scan_skips = _scans(drive, epoch_ns)
+    images, image_skips = _images(drive, epoch_ns, calibration.image_sizes.get(""))
+    return SensorLog(
+        name=shown(drive.name or drive.resolve().name),
+        epoch_ns=epoch_ns,
+        calibration=calibration,
+        scans=scans,
+        images=images,
+        frame=unit.frame,
+        imu=unit.imu,
+        gnss=unit.gnss,
+        imu_noise=OXTS_NOISE,
+        initial_attitude=unit.attitude,
+        reference=unit.reference,
+        skips=(*unit.skips, *scan_skips, *image_skips),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Navigation:
+    """What the navigation unit of a drive measured."""
+
+    epoch_ns: int
+    """Unix time of its first row."""
+    frame: LocalFrame
+    """At its first fix."""
+    imu: ImuSamples
+    gnss: GnssFixes
+    attitude: AttitudePrior
+    """Its own, at the first row of the IMU."""
+    reference: Trajectory
+    """Its own solution."""
+    skips: list[Skip]
+
+
+def navigation(drive: Path, twins: tuple[Path, ...], with_imu: bool = True) -> Navigation:
+    """Read `drive/oxts`, and the IMU from the first of the 100 Hz `twins` that is there.
+
+    Without `with_imu`, the thousands of files of a twin are not read. Raises DataError.
+    """
     oxts_ns, oxts, skips = oxts_rows(drive)
     stamps = _seconds(oxts_ns, int(oxts_ns[0]))
     is_fix, invalid = valid_fixes(stamps, oxts[:, [LAT, LON, ALT]], oxts[:, [POSITION_ACCURACY]])
@@ -88,25 +131,17 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     gnss = GnssFixes(
         stamps[is_fix], frame.to_map(*fixes[:, [LAT, LON, ALT]].T), np.repeat(accuracy[:, None], 3, axis=1)
     )
-    reference = Trajectory(gnss.stamps, _reference_poses(gnss.positions, fixes))
     imu_stamps, imu_rows, imu_skips = (
-        _imu_rows(drive, epoch_ns, stamps, oxts) if with_imu else (stamps, oxts, [])
+        _imu_rows(twins, epoch_ns, stamps, oxts) if with_imu else (stamps, oxts, [])
     )
-    scans, scan_skips = _scans(drive, epoch_ns)
-    images, image_skips = _images(drive, epoch_ns, calibration.image_sizes.get(""))
-    return SensorLog(
-        name=shown(drive.name or drive.resolve().name),
+    return Navigation(
         epoch_ns=epoch_ns,
-        calibration=calibration,
-        scans=scans,
-        images=images,
         frame=frame,
         imu=ImuSamples(imu_stamps, imu_rows[:, SPECIFIC_FORCE], imu_rows[:, ANGULAR_RATE]),
         gnss=gnss,
-        imu_noise=OXTS_NOISE,
-        initial_attitude=AttitudePrior(_attitudes(imu_rows[:1])[0], ATTITUDE_STDDEVS_RAD),
-        reference=reference,
-        skips=(*skips, *fix_skips, *imu_skips, *scan_skips, *image_skips),
+        attitude=AttitudePrior(_attitudes(imu_rows[:1])[0], ATTITUDE_STDDEVS_RAD),
+        reference=Trajectory(gnss.stamps, _reference_poses(gnss.positions, fixes)),
+        skips=[*skips, *fix_skips, *imu_skips],
     )
 
 
@@ -149,7 +184,7 @@ def lidar_from_imu(date: Path) -> Array:
     return kitti_calibration.transform(rows["R"], rows["T"], f"{shown(file)}: R")
 
 
-def _stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
+def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
     """Unix nanoseconds by frame number; blank lines are missing frames, stamps of impossible years are skipped."""
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
@@ -185,7 +220,7 @@ def _seconds(stamps_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 def oxts_rows(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows of the navigation unit, sorted, without repeated stamps; and the skipped rows."""
     found = frames.numbered("oxts", drive / "oxts" / "data", ".txt")
-    stamps, skips = _stamps_ns(drive / "oxts" / "timestamps.txt")
+    stamps, skips = stamps_ns(drive / "oxts" / "timestamps.txt")
     skips += found.skips + frames.missing("oxts", drive / "oxts", stamps, found.files)
     rows: dict[int, Array] = {}
     for number, path in found.files.items():
@@ -231,14 +266,18 @@ def _oxts_row(path: Path) -> tuple[str, Array]:
     return "", row
 
 
-def _imu_rows(drive: Path, epoch_ns: int, stamps: Array, oxts: Array) -> tuple[Array, Array, list[Skip]]:
-    """The 100 Hz rows of the `_extract` twin of the drive, else the 10 Hz rows of the drive.
+def _twins(drive: Path) -> tuple[Path, ...]:
+    """Where the `_extract` twin of a drive may be: beside it, or beside its target if it is a link."""
+    places = [place for place in (drive, drive.resolve()) if "_sync" in place.name]
+    return tuple(place.parent / place.name.replace("_sync", "_extract") for place in places)
 
-    The twin is beside the drive, or beside its target if `drive` is a link.
-    """
-    for place in (drive, drive.resolve()):
-        twin = place.parent / place.name.replace("_sync", "_extract")
-        if "_sync" in place.name and is_folder(twin / "oxts" / "data"):
+
+def _imu_rows(
+    twins: tuple[Path, ...], epoch_ns: int, stamps: Array, oxts: Array
+) -> tuple[Array, Array, list[Skip]]:
+    """The 100 Hz rows of a twin of the drive, else the 10 Hz rows of the drive."""
+    for twin in twins:
+        if is_folder(twin / "oxts" / "data"):
             twin_ns, rows, skips = oxts_rows(twin)
             return _seconds(twin_ns, epoch_ns), rows, skips
     return stamps, oxts, []
@@ -268,7 +307,7 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
     if not found.files:
         return (), found.skips + _all_missing("scan", folder)
     (middle, skips), (start, in_start), (end, in_end) = (
-        _stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
+        stamps_ns(folder / f"timestamps{part}.txt") for part in ("", "_start", "_end")
     )
     skips += in_start + in_end + found.skips + frames.missing("scan", folder, middle, found.files)
     scans = []
@@ -281,12 +320,13 @@ def _scans(drive: Path, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
         if fault is not None:
             skips.append(Skip("scan", shown(path), fault))
         else:
-            read = partial(_read_sweep, path, stamp, begun, ended, frames.state_of(path))
+            read = partial(read_sweep, path, stamp, begun, ended, frames.state_of(path))
             scans.append(Scan(path.stem, number, stamp, read, (begun, ended)))
     return in_order("scan", scans, skips), skips
 
 
-def _read_sweep(path: Path, stamp: float, start: float, end: float, state: frames.State | None) -> Points:
+def read_sweep(path: Path, stamp: float, start: float, end: float, state: frames.State | None) -> Points:
+    """A scan whose points are measured from `start` to `end`, s, see `seconds_after`."""
     rows = frames.read_points(path, state=state)
     stamps = seconds_after(rows, stamp, start, end).astype(np.float64)
     stamps += stamp
@@ -311,7 +351,7 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
     found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
     if not found.files:
         return (), found.skips + _all_missing("image", folder)
-    stamps, skips = _stamps_ns(folder / "timestamps.txt")
+    stamps, skips = stamps_ns(folder / "timestamps.txt")
     skips += found.skips + frames.missing("image", folder, stamps, found.files)
     images = []
     for number, path in found.files.items():
@@ -326,4 +366,4 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
 def _all_missing(what: str, folder: Path) -> list[Skip]:
     """The frames of a sensor that has no file at all, if it has stamps."""
     path = folder / "timestamps.txt"
-    return frames.missing(what, folder, _stamps_ns(path)[0], {}) if is_file(path) else []
+    return frames.missing(what, folder, stamps_ns(path)[0], {}) if is_file(path) else []

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
-from scipy.special import betaincc, ndtr
+from scipy.special import betaincc
 
-from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
+from gnss_sem_map.dynamics.own_motion import motion_of
+from gnss_sem_map.dynamics.standing import is_occupied
+from gnss_sem_map.dynamics.tracking import Segment, track
 
 LEAST_TRACKED_POINTS = 5
 """Smaller segments are not tracked; each is classified on its own."""
@@ -19,8 +21,8 @@ MISSES_OF_ONE_SEGMENT = 20
 """A segment with more misses than this, and twice as many misses as hits, has moved, whatever its track says."""
 LENGTH_M = 5.0
 """Length of a car."""
-SHIFT_STDDEV_M = 0.5
-"""Standard deviation of the measured shift of an object's ends."""
+FARTHEST_APART_M = 1.5
+"""Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
 
 
 class Motion(StrEnum):
@@ -54,15 +56,15 @@ class MotionSettings(BaseModel):
         gt=0,
         description="An object has moved if its points have more misses per hit than this,",
     )
-    lidar_odometry_misses_per_hit: float = Field(
-        default=0.4,
+    sharp_misses_per_hit: float = Field(
+        default=0.3,
         gt=0,
-        description="or than this, if the poses come from LiDAR odometry (they blur static objects less).",
+        description="or than this, if the scans show that poses blur static objects little.",
     )
-    least_shift_m: float = Field(default=1.5, gt=0, description="Displacement: both ends moved this far, m,")
-    least_speed_m_s: float = Field(default=1.0, gt=0, description="and at least this fast, m/s,")
     displaced_misses_per_hit: float = Field(
-        default=0.25, ge=0, description="and the points of the track have at least so many misses per hit."
+        default=0.25,
+        ge=0,
+        description="An object that went elsewhere has moved if its points there have more misses per hit than this.",
     )
     farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
     window_scans: int = Field(
@@ -73,7 +75,7 @@ class MotionSettings(BaseModel):
     )
     farthest_object_m: float = Field(default=60.0, gt=0, description="Largest range of objects, m.")
     grow_m: float = Field(
-        default=0.5, ge=0, description="Points above ground this close to a moving segment belong to it, m."
+        default=0.35, ge=0, description="Points above ground this close to a moving segment belong to it, m."
     )
 
 
@@ -101,34 +103,33 @@ def classify_motion(
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
     settings: MotionSettings,
-    from_lidar_odometry: bool = False,
+    is_sharp: bool = False,
 ) -> list[TrackedObject]:
     """Track the segments and give every object its motion state.
 
     `hits` and `misses` (s,) count how often other scans hit the points of a segment and how often they saw through
-    them. `from_lidar_odometry`: the poses come from LiDAR odometry. A car ahead that moves by 0.4 of its length while
-    observed has 0.4 misses per hit, by 0.8 of its length 1.0 (measured in the simulated street of the tests). Parked
-    cars reach 0.3 misses per hit with poses from LiDAR odometry, and more than 1 without (six simulated drives, KITTI
-    0005).
+    them. `is_sharp`: the poses blur static objects little. Then what stands has 0.00 to 0.15 misses per hit, labels
+    or not, a car that creeps for a third of its length 0.4, and what drives on more than 1 (three simulated drives,
+    KITTI 0005); without sharp poses parked cars reach more than 1, and what no image shows must have gone elsewhere.
 
     This takes the place of eq. 13, which calls long and dense clusters of the map moving vehicles.
     """
-    misses_per_hit = (
-        settings.lidar_odometry_misses_per_hit if from_lidar_odometry else settings.misses_per_hit
-    )
+    misses_per_hit = settings.sharp_misses_per_hit if is_sharp else settings.misses_per_hit
     large = [n for n, segment in enumerate(segments) if segment.points >= LEAST_TRACKED_POINTS]
     alone = [n for n, segment in enumerate(segments) if segment.points < LEAST_TRACKED_POINTS]
     objects = []
     mostly_free = (misses > settings.misses_per_hit * hits)[large]
     for one in track([segments[n] for n in large], settings.gate_m, mostly_free):
         members = [large[place] for place in one.segments]
-        if not any(segments[n].shown for n in members):
-            objects += _motion_without_labels(members, segments, hits, misses, settings)
+        is_shown = any(segments[n].shown for n in members)
+        elsewhere = settings.displaced_misses_per_hit if is_shown or is_sharp else misses_per_hit
+        whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere)
+        if not (is_shown or is_sharp or whole.displaced):
             continue
-        whole = _motion_of_track(members, segments, hits, misses, settings, misses_per_hit)
         gone = [n for n in members if misses[n] > max(2 * hits[n], MISSES_OF_ONE_SEGMENT)]
         if whole.motion in GONE or not gone:
-            objects.append(whole)
+            if whole.motion in GONE or is_shown:
+                objects.append(whole)
             continue
         alone += gone
         if rest := [n for n in members if n not in set(gone)]:
@@ -146,30 +147,30 @@ def _motion_of_track(
     segments: list[Segment],
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
-    settings: MotionSettings,
     misses_per_hit: float,
+    elsewhere_misses_per_hit: float,
 ) -> TrackedObject:
-    """Motion state of a track: it was displaced, or its volume was free at other times."""
+    """Motion state of a track: it went elsewhere, or its volume was free at other times."""
     hit, missed = float(hits[members].sum()), float(misses[members].sum())
     vanished = _probability(missed, misses_per_hit * hit)
-    moved = displacement_of([segments[n] for n in members])
-    displaced = 0.0
-    if moved and moved.speed_m_s > settings.least_speed_m_s and moved.shift_m > 0:
-        hit_elsewhere, missed_elsewhere = _elsewhere(members, segments, hits, misses, settings.least_shift_m)
-        # an object that moved less than its length hides the volume where it was: it must be free more often
-        least = settings.displaced_misses_per_hit * max(1.0, LENGTH_M / moved.shift_m)
-        if missed_elsewhere > least * hit_elsewhere:
-            displaced = float(ndtr((moved.shift_m - settings.least_shift_m) / SHIFT_STDDEV_M))
+    moved = motion_of([segments[n] for n in members])
+    displaced = False
+    if moved and moved.is_moving:
+        reach = min(moved.shift_m / 4, FARTHEST_APART_M)
+        hit_elsewhere, missed_elsewhere = _elsewhere(members, segments, hits, misses, reach)
+        # the volume that it left or came into is free at other times, as far as it did not cover it itself
+        least = elsewhere_misses_per_hit * min(1.0, moved.shift_m / LENGTH_M)
+        displaced = missed_elsewhere > least * hit_elsewhere and not bool(is_occupied(hit, missed))
     reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
-    if moved and displaced > 0.5:
+    if moved and displaced:
         motion = Motion.MOVING
-        reason = f"both ends moved {moved.shift_m:.1f} m at {moved.speed_m_s:.1f} m/s, {reason}"
+        reason = f"went {moved.shift_m:.1f} m, known to {moved.stddev_m:.1f} m, {reason}"
     elif vanished > 0.5:
-        stood = moved is not None and moved.speed_m_s < settings.least_speed_m_s and hit > 0
+        stood = moved is not None and not moved.is_moving and hit > 0
         motion = Motion.STOPPED_AND_LEFT if stood else Motion.MOVING
     else:
         motion = Motion.PARKED if hit > 0 else Motion.UNKNOWN
-    return _tracked_object(members, segments, motion, max(vanished, displaced), reason, displaced > 0.5)
+    return _tracked_object(members, segments, motion, max(vanished, float(displaced)), reason, displaced)
 
 
 def _elsewhere(
@@ -186,21 +187,6 @@ def _elsewhere(
     once = 1 / tree.query_ball_point(centroids[away], reach_m, return_length=True)
     of_track = np.array(members)[away]
     return float(once @ hits[of_track]), float(once @ misses[of_track])
-
-
-def _motion_without_labels(
-    members: list[int],
-    segments: list[Segment],
-    hits: NDArray[np.float64],
-    misses: NDArray[np.float64],
-    settings: MotionSettings,
-) -> list[TrackedObject]:
-    """Motion state of a track without vehicle labels: it must be displaced, and its volume free at other times."""
-    hit, missed = _elsewhere(members, segments, hits, misses, settings.least_shift_m)
-    if missed <= settings.misses_per_hit * hit:
-        return []
-    whole = _motion_of_track(members, segments, hits, misses, settings, settings.misses_per_hit)
-    return [whole] if whole.displaced else []
 
 
 def _probability(misses: float, hits: float) -> float:

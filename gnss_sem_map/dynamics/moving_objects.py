@@ -6,11 +6,12 @@ and misses of their voxels in all of them, and tells which have moved. `moved_po
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
@@ -24,10 +25,21 @@ from gnss_sem_map.dynamics.ground_grid import (
 )
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
+from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.standing import is_occupied, standing
 from gnss_sem_map.dynamics.tracking import Segment
-from gnss_sem_map.dynamics.visibility import KeyframeScans, RangeImage, hits_and_misses, spatial_order
+from gnss_sem_map.dynamics.visibility import (
+    SCANS_PER_PART,
+    Keyframes,
+    KeyframeScans,
+    RangeImage,
+    hits_and_misses,
+    spatial_order,
+)
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.voxels.hash_unique import distinct
+
+Array = NDArray[np.float64]
 
 FOOT_HEIGHT_M, BODY_HEIGHT_M = 0.05, 0.2
 """Heights over the lowest ground around: the body of an object begins at BODY_HEIGHT_M, its foot at FOOT_HEIGHT_M."""
@@ -37,8 +49,6 @@ CELL_M_PER_DEG, LARGEST_CELL_M = 1.0, 2.0
 object."""
 HIDING_M = 0.5
 """Something nearer by this hides the side of an object."""
-SCANS_AT_A_TIME = 64
-"""Range images that are copied side by side for counting: 8 MB. All of a chunk would add 75 MB to the peak of a run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,24 +83,26 @@ class Decision:
     """For each scan, which of the voxels (v,) of its segments."""
     objects: tuple[TrackedObject, ...]
     """Those that are first seen in one of these scans."""
+    is_sharp: bool
+    """The poses blur what stands so little that rays tell what is free."""
 
 
 def decide(
     observations: Sequence[Observation],
     count: int,
-    before: Sequence[RangeImage],
+    before: Keyframes | None,
     settings: MotionSettings,
-    from_lidar_odometry: bool = False,
 ) -> Decision:
     """Decide what moved in the first `count` of the observations, in time order, by the evidence of all.
 
-    The scans `before` count as evidence too. `from_lidar_odometry`: the poses come from LiDAR odometry, so that static
-    objects are not blurred. Raises DataError when the stamps do not increase.
+    The scans `before` count as evidence too, if there are some. Raises DataError when the stamps do not increase.
     """
     _check_order(observations)
     if not observations:
-        return Decision([], ())
-    counts = _observations_by_others(observations, before, settings.farthest_m)
+        return Decision([], (), False)
+    places = _places(observations)
+    counts = _observations_by_others(observations, places, before, settings.farthest_m)
+    is_sharp = are_sharp(counts)
     segments = [
         split_segments(
             seen.segments, counted[0], counted[1], settings.segment_eps_m, settings.displaced_misses_per_hit
@@ -101,13 +113,24 @@ def decide(
         [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
     )
     listed = _all_segments(observations, segments)
-    objects = classify_motion(listed, hits, misses, settings, from_lidar_odometry)
+    objects = classify_motion(listed, hits, misses, settings, is_sharp)
     gone = np.zeros(len(listed), np.bool_)
     for one in objects:
         gone[list(one.segments)] = one.motion in GONE
-    gone_of = np.split(gone, np.cumsum([len(of_scan.truncated) for of_scan in segments]))
-    moved = [gone_of[scan][segments[scan].number] for scan in range(count)]
-    return Decision(moved, tuple(one for one in objects if listed[one.segments[0]].scan < count))
+    is_whole = np.array([not one.truncated for one in listed], np.bool_)
+    stood = is_whole & ~gone & is_occupied(hits, misses)
+    moved_of, stood_of = _of_voxels(gone, segments), _of_voxels(stood, segments)
+    stays = standing(places, counts, moved_of, stood_of)
+    moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
+    first_seen_here = tuple(one for one in objects if listed[one.segments[0]].scan < count)
+    return Decision(moved, first_seen_here, is_sharp)
+
+
+def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> list[NDArray[np.bool_]]:
+    """For each scan, for its voxels (v,) what is true of their segments (s,), which are those of all scans."""
+    ends = np.cumsum([len(of_scan.truncated) for of_scan in segments])[:-1]
+    parts = zip(np.split(of_segments, ends), segments, strict=True)
+    return [part[of_scan.number] for part, of_scan in parts]
 
 
 def _check_order(observations: Sequence[Observation]) -> None:
@@ -119,25 +142,48 @@ def _check_order(observations: Sequence[Observation]) -> None:
             )
 
 
+def _places(observations: Sequence[Observation]) -> list[NDArray[np.int32]]:
+    """For each scan the numbers of its voxels (v,), the same in all scans."""
+    keys = [seen.segments.keys for seen in observations]
+    _, place = distinct(np.concatenate(keys))
+    return np.split(place, np.cumsum([len(of_scan) for of_scan in keys])[:-1])
+
+
 def _observations_by_others(
-    observations: Sequence[Observation], before: Sequence[RangeImage], farthest_m: float
+    observations: Sequence[Observation],
+    places: Sequence[NDArray[np.int32]],
+    before: Keyframes | None,
+    farthest_m: float,
 ) -> list[NDArray[np.int32]]:
     """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
-    parts = [seen.segments.parts for seen in observations]
-    _, row = distinct(np.concatenate([seen.segments.keys for seen in observations]))
-    points = np.bincount(row, np.concatenate([part.points for part in parts]))
-    centroids = np.empty((len(points), 3))
-    for axis in range(3):  # one at a time: all of a chunk take 60 MB
-        centroids[:, axis] = np.bincount(row, np.concatenate([part.sums[:, axis] for part in parts])) / points
-    images = [*before, *(seen.seen for seen in observations)]
+    count = 1 + max(int(place.max(initial=-1)) for place in places)
+    points, centroids = np.zeros(count), np.zeros((count, 3))
+    for seen, place in zip(observations, places, strict=True):  # side by side, all of a chunk take 60 MB
+        _add(seen.segments.parts.points, seen.segments.parts.sums, place, points, centroids)
+    centroids /= points[:, None]
     order = spatial_order(centroids)
     centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
-    for start in range(0, len(images), SCANS_AT_A_TIME):
-        some = KeyframeScans.of(images[start : start + SCANS_AT_A_TIME])
+    for some in chain(() if before is None else before.parts(), _parts(observations)):
         counts += hits_and_misses(centroids, some, farthest_m)
     counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
-    return np.split(counts[:, row], np.cumsum([len(part.points) for part in parts])[:-1], axis=1)
+    return [counts[:, place] for place in places]
+
+
+@njit(cache=True, nogil=True)
+def _add(
+    points: NDArray[np.int32], sums: Array, row: NDArray[np.int32], all_points: Array, all_sums: Array
+) -> None:
+    for i in range(len(row)):
+        all_points[row[i]] += points[i]
+        for axis in range(3):
+            all_sums[row[i], axis] += sums[i, axis]
+
+
+def _parts(observations: Sequence[Observation]) -> Iterator[KeyframeScans]:
+    """The scans, some at a time: side by side, all images of a chunk would add 75 MB to the peak of a run."""
+    for start in range(0, len(observations), SCANS_PER_PART):
+        yield KeyframeScans.of([one.seen for one in observations[start : start + SCANS_PER_PART]])
 
 
 def observe(
@@ -160,9 +206,7 @@ def observe(
     heights, centre = height_over_ground(p_map, cell_m), T_map_lidar[:2, 3]
     above = (heights > FOOT_HEIGHT_M) & within_radius(p_map, centre, settings.farthest_object_m)
     is_body = heights > BODY_HEIGHT_M
-    # beyond this range there is no evidence: only labelled points become candidates there
-    unknown = ~is_known & within_radius(p_map, centre, settings.farthest_m)
-    candidates = np.flatnonzero(above & is_body & (is_object | unknown))
+    candidates = np.flatnonzero(above & is_body & (is_object | ~is_known))
     points = p_map.take(candidates, axis=0)
     gaps = range_images.gaps_at(points, seen.T_lidar_map, rows)
     segments, voxel_of_candidates = find_segments(
@@ -191,17 +235,19 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
     for scan, (seen, of_scan) in enumerate(zip(observations, segments, strict=True)):
         whole = of_scan.whole
         centroids = whole.sums[:, :2] / whole.points[:, None]
+        outlines = of_scan.outlines()
+        seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
             listed.append(
                 Segment(
                     scan=scan,
                     stamp=seen.stamp,
                     centroid=centroids[number],
-                    lowest=whole.lowest[number],
-                    highest=whole.highest[number],
                     points=int(whole.points[number]),
                     shown=bool(whole.labelled[number]),
                     truncated=truncated,
+                    outline=outlines[number],
+                    seen_from=seen_from,
                 )
             )
     return listed

@@ -6,18 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 LONGEST_GAP = 5
 """A track ends after more scans than this without a segment."""
 NEW_SHARE = 0.3
 """Weight of a new step in the velocity of a track (exponential smoothing)."""
-LEAST_ENDS = 4
-"""Displacement is measured from at least so many segments."""
-SMOOTHED = 5
-"""Segments in the running median of a track's boxes."""
-SPEED_OVER_S = 0.5
-"""Speed is measured over this time."""
 FASTEST_M_S = 45.0
 """Gate of a track with a single segment that is mostly free: this speed times the time between scans."""
 
@@ -31,15 +24,15 @@ class Segment:
     stamp: float
     centroid: NDArray[np.float64]
     """(2,) m, east and north in the map frame."""
-    lowest: NDArray[np.float64]
-    """(2,) m: lower corner of the bounding box."""
-    highest: NDArray[np.float64]
-    """(2,) m: upper corner of the bounding box."""
     points: int
     shown: bool
     """An image labels some of its points as vehicle."""
     truncated: bool
     """It is cut off by the edge of the image or hidden in part: its box is not that of the object."""
+    outline: NDArray[np.floating]
+    """(v, 2) m: the points of its voxels on average, which tell its extent in any direction."""
+    seen_from: NDArray[np.float64]
+    """(2,) m: where the LiDAR was."""
 
 
 @dataclass(eq=False)
@@ -137,41 +130,3 @@ def _nearest_first(
     near = np.argwhere(distances <= gate_m)
     order = np.argsort(distances[near[:, 0], near[:, 1]], kind="stable")
     return [(numbers[i], int(j)) for i, j in near[order]]
-
-
-@dataclass(frozen=True)
-class Displacement:
-    """How far and how fast an object moved."""
-
-    shift_m: float
-    """Smaller one of the shifts of its two ends, between the two times at which its centroids are farthest apart."""
-    speed_m_s: float
-    """Highest speed over half a second."""
-
-
-def displacement_of(segments: list[Segment]) -> Displacement | None:
-    """Displacement of a track, measured at both ends of its boxes; None for a track of few segments.
-
-    One end alone also moves when more of a parked object becomes visible. The object may stand before or after: the two
-    times are those at which its centroids, smoothed by a running median, are farthest apart. Truncated segments
-    are left out.
-    """
-    whole = [s for s in segments if not s.truncated]
-    if len(whole) < LEAST_ENDS:
-        return None
-    stamps = np.array([s.stamp for s in whole])
-    centroids, low, high = (
-        median_filter(np.array(values), size=(SMOOTHED, 1), mode="nearest")
-        for values in zip(*((s.centroid, s.lowest, s.highest) for s in whole), strict=True)
-    )
-    distances = np.linalg.norm(centroids[:, None] - centroids[None], axis=2)
-    start, end = np.unravel_index(distances.argmax(), distances.shape)
-    if distances[start, end] == 0:
-        return Displacement(0.0, 0.0)
-    along = (centroids[end] - centroids[start]) / distances[start, end]
-    middle, half = (low + high) / 2 @ along, (high - low) / 2 @ abs(along)
-    shift = min(side[end] - side[start] for side in (middle - half, middle + half))
-    later = np.minimum(np.searchsorted(stamps, stamps + SPEED_OVER_S), len(whole) - 1)
-    spans = stamps[later] - stamps
-    speeds = distances[np.arange(len(whole)), later] / np.maximum(spans, SPEED_OVER_S)
-    return Displacement(float(shift), float(speeds.max()))

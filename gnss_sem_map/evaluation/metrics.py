@@ -153,11 +153,17 @@ def calibration_counts(
     return np.stack(columns, axis=1)
 
 
-def calibration(counts: NDArray[np.float64]) -> dict[str, float | None]:
-    """Expected calibration error: mean of |share right - mean confidence| over bins, weighted by points."""
+def calibration(counts: NDArray[np.float64]) -> dict[str, Any]:
+    """Expected calibration error: mean of |share right - mean confidence| over bins, weighted by points.
+
+    `bins`: the reliability curve, of every bin with points their number, mean confidence and share that is right.
+    """
     points, right, sure = counts.T
     total = float(points.sum())
-    return {"ece": float(np.abs(right - sure).sum() / total) if total else None}
+    bins = [
+        {"points": int(n), "confidence": float(s / n), "right": float(r / n)} for n, r, s in counts if n > 0
+    ]
+    return {"ece": float(np.abs(right - sure).sum() / total) if total else None, "bins": bins}
 
 
 def _share(part: int, whole: int) -> float | None:

@@ -1,19 +1,24 @@
-"""Report of a run on one HTML page: inputs, skips with reasons, quality of the result, and a list of the files."""
+"""Report of a run on one HTML page: a verdict in words, pictures, and folded below it all that is known of the run."""
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from html import escape
-from importlib import resources
 from pathlib import Path
-from string import Template
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
+
+from gnss_sem_map.export.charts import Chart, Curve, chart
 from gnss_sem_map.export.formats import FORMATS
+from gnss_sem_map.export.overview import Overview, coverage_pixels, label_pixels, overview_of
+from gnss_sem_map.export.page import page, percent, png
+from gnss_sem_map.export.track import Track, read_track
+from gnss_sem_map.export.verdict import verdict_of
 from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.files.untrusted import is_file, read_text
+from gnss_sem_map.voxels import tiles
 
 PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
@@ -45,108 +50,77 @@ FILES = {
     "run.json": "the content of this page about the run, machine-readable",
     "metrics.json": "the content of this page about the evaluation, machine-readable",
 }
-WORDS = {
-    "SA": "static points kept (SA)",
-    "DA": "points on moving vehicles removed (DA)",
-    "AA": "both, geometric mean (AA)",
-    "SA_vehicle": "points on parked vehicles kept",
-    "ece": "expected calibration error (ECE)",
-    "ate_m": "absolute trajectory error (m)",
-    "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of freedom)",
-    "position_nees_per_dof": "squared position error / claimed variance (NEES per degree of freedom)",
-    "orientation_nees_per_dof": "squared orientation error / claimed variance (NEES per degree of freedom)",
-    **{
-        f"{part}_inside_{share}": f"{part}: errors inside the ellipsoid that should hold {share} %"
-        for part in ("position", "horizontal")
-        for share in (50, 90, 95)
-    },
-    "position_scale_gap": "position: scale gap k, above 1 the variances are too small",
-    "horizontal_scale_gap": "horizontal: scale gap k, above 1 the variances are too small",
-}
-UNITS = {"m": "m", "s": "s", "deg": "°", "mb": "MB", "ns": "ns", "px": "px"}
-BAR_PX = 260
 MANY_SKIPS = 200
 """Number of skips on the page; run.json lists all."""
+MANY_MOVERS = 40
+"""Number of moving objects on the page, those of most points first."""
+MAPS = {"map": "before refinement", "refined": "after refinement"}
 
 
 def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
     """Write `report.html` into a run folder: one self-contained page, its pictures embedded.
 
-    `run` and `metrics` are the contents of run.json and metrics.json; a section appears only when its data, or its
-    picture in the folder, exist. Raises DataError when the file cannot be written.
+    `run` and `metrics` are the contents of run.json and metrics.json; maps and trajectories are read from the folder. A
+    section appears only when its data exist; what the verdict does not know it says. Raises DataError when the file
+    cannot be written or a map is damaged, and MeasurementError for a damaged trajectory.
     """
     folder = Path(folder)
     title = f"Semantic map of {run.get('name', folder.name)}"
-    sections = [
-        f"<h1>{escape(title)}</h1>",
-        _facts(run),
-        _picture(folder, "perspective.png"),
-        _warnings(run.get("warnings", ())),
-        _section("Drives", _drives(run.get("drives", {}), run.get("failed", {}))),
-        _section("Places passed again", _passes(run.get("passes", ()))),
-        _section("What changed", _changes(run.get("changes", ()))),
-        _section("Pre-flight", findings_table(run.get("preflight", {}).get("findings", ()))),
-        _section("What went in", _pairs(run.get("counts", {}))),
-        _section("What was left out", _skips(run.get("skips", {}))),
-        _section(
-            "Map", _picture(folder, "topview.png"), _classes(run.get("map", {}), metrics.get("semantics", {}))
-        ),
-        _section("Refinement", _refinement(run.get("map", {}).get("refinement", {}))),
-        _section("Moving vehicles", _pairs(_shares(metrics.get("dynamic", {})))),
-        _section("Confidence", _pairs(_shares(metrics.get("calibration", {})))),
-        _section(
-            "Trajectory",
-            _picture(folder, "trajectory.png"),
-            _pairs(run.get("trajectory") or {}),
-            _pairs(metrics.get("trajectory", {})),
-        ),
-        _section("Sharpness", _sharpness(metrics.get("sharpness", {}))),
-        _section("Time and memory", _stages(run.get("seconds", {}), run.get("peak_memory_mb", {}))),
-        _section("Files", _files(folder)),
-        _section("Versions", _pairs(run.get("versions", {}))),
-    ]
-    amend(folder, "report.html", page_of(title, sections))
+    overviews, tracks = _overviews(folder), _tracks(folder, run)
+    refined = overviews.get("refined")
+    about_map = run.get("map", {})
+    refinement = about_map.get("refinement", {})
+    content = {
+        "title": title,
+        "facts": _facts(run),
+        "verdict": verdict_of(run, metrics, refined, list(tracks.values())),
+        "pictures": {name: _picture(folder / name) for name in PICTURES},
+        "captions": PICTURES,
+        "overviews": list(_coarse_pictures(overviews)),
+        "legend": [] if refined is None else list(refined.colours.items()),
+        "warnings": [str(warning) for warning in run.get("warnings", ())],
+        "map_figures": {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map},
+        "calibration": _shares(metrics.get("calibration", {})),
+        "looks": [] if refined is None else list(_looks(refined)),
+        "reliability": _reliability(metrics.get("calibration", {}).get("bins", ())),
+        "dynamic": _shares(metrics.get("dynamic", {})),
+        "path": _path(tracks, refinement.get("tracked", ())),
+        "band": _band(tracks),
+        "trajectory": run.get("trajectory") or {},
+        "trajectory_scores": metrics.get("trajectory", {}),
+        "findings": run.get("preflight", {}).get("findings", ()),
+        "counts": run.get("counts", {}),
+        "files": list(_files(folder)),
+        "settings": read_text(folder / "config.yaml") if is_file(folder / "config.yaml") else "",
+        "versions": run.get("versions", {}),
+    }  # fmt: skip
+    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined), _movers(refinement),
+                 _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
+                 _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
+        content |= part
+    amend(folder, "report.html", page("report.html.j2", **content))
 
 
-def findings_table(findings: Iterable[Mapping[str, str]]) -> str:
-    """The findings of a pre-flight as a table, each row coloured by its level."""
-    rows = "".join(
-        f'<tr class="{escape(found["level"])}">{_cell(found["level"])}{_cell(found["check"])}{_cell(found["evidence"])}'
-        f"{_cell(found['mistake'])}{_cell(found['remedy'])}</tr>"
-        for found in findings
-    )
-    titles = "".join(
-        f"<th>{title}</th>" for title in ("", "check", "found", "probable mistake", "what to do")
-    )
-    return f'<div class="scroll"><table><tr>{titles}</tr>{rows}</table></div>' if rows else ""
+def _overviews(folder: Path) -> dict[str, Overview]:
+    """Of the maps before and after refinement, as far as the folder has them."""
+    found = {
+        name: overview_of(tiles.open_map(folder / name))
+        for name in MAPS
+        if is_file(folder / name / "map.json")
+    }
+    return {name: overview for name, overview in found.items() if overview is not None}
 
 
-def page_of(title: str, sections: Iterable[str]) -> bytes:
-    """One self-contained page of HTML sections."""
-    template = (resources.files("gnss_sem_map.export") / "assets" / "report.html").read_text("utf-8")
-    page = Template(template).substitute(title=escape(title), body="\n".join(filter(None, sections)))
-    return page.encode("utf-8", "backslashreplace")
+def _tracks(folder: Path, run: Mapping[str, Any]) -> dict[str, Track]:
+    """Of every drive of the map, by name; empty where the folder has none."""
+    if "drives" in run:
+        places = {name: folder / "drives" / name / "trajectory.parquet" for name in run["drives"]}
+        return {name: read_track(path) for name, path in places.items() if is_file(path)}
+    path, scans_s = folder / "trajectory.parquet", run.get("scans_s")
+    return {str(run.get("name", folder.name)): read_track(path, scans_s)} if is_file(path) else {}
 
 
-def _section(title: str, *parts: str) -> str:
-    content = "\n".join(filter(None, parts))
-    return f"<section><h2>{escape(title)}</h2>\n{content}</section>" if content else ""
-
-
-def _sharpness(sharpness: Mapping[str, Mapping[str, Any]]) -> str:
-    """Surface thickness of the map, and of a map from GNSS and IMU alone: a wrong calibration blurs surfaces."""
-    if not sharpness:
-        return ""
-    figures = list(dict.fromkeys(name for values in sharpness.values() for name in values))
-    rows = [(name.replace("_", " "), *(_number(v.get(name)) for v in sharpness.values())) for name in figures]
-    return _table(("figure", *sharpness), rows)
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
-
-
-def _facts(run: Mapping[str, Any]) -> str:
+def _facts(run: Mapping[str, Any]) -> list[str]:
     facts = []
     if run.get("epoch_ns") is not None:
         facts.append(f"{datetime.fromtimestamp(run['epoch_ns'] / 1e9, UTC):%d %B %Y, %H:%M:%S} UTC")
@@ -159,37 +133,85 @@ def _facts(run: Mapping[str, Any]) -> str:
         facts.append("not georeferenced")
     if delivery := run.get("delivery"):
         facts.append(f"files in {delivery['crs']} (EPSG:{delivery['epsg']}), heights {delivery['heights']}")
-    return f'<p class="facts">{escape(" · ".join(facts))}</p>'
+    return facts
 
 
-def _picture(folder: Path, name: str) -> str:
-    if not (folder / name).is_file():
-        return ""
-    data = base64.b64encode((folder / name).read_bytes()).decode("ascii")
-    caption = escape(PICTURES[name])
-    return (
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+def _picture(path: Path) -> str:
+    return png(path.read_bytes()) if is_file(path) else ""
 
 
-def _warnings(warnings: Iterable[str]) -> str:
-    return "\n".join(f'<p class="warning">{escape(str(warning))}</p>' for warning in warnings)
+def _coarse_pictures(overviews: Mapping[str, Overview]) -> Iterator[tuple[str, str]]:
+    """Source and caption of the coverage and of the classes before and after refinement."""
+    if overviews:
+        coverage = png(coverage_pixels(list(overviews.values())[-1]))
+        yield coverage, "Coverage: the darker, the more laser points; white: not seen. North is up."
+    for name, overview in overviews.items():
+        yield png(label_pixels(overview)), f"Classes from above, {MAPS[name]}."
 
 
-def _skips(skips: Mapping[str, Any]) -> str:
-    listed = skips.get("listed", ())
-    if not listed:
-        return ""
-    rows = [(skip["what"], skip["where"], skip["reason"]) for skip in listed[:MANY_SKIPS]]
-    more = skips.get("count", len(listed)) - len(rows)
-    return _table(("what", "where", "why"), rows) + (
-        f"<p>and {more:,} more, which run.json lists</p>" if more > 0 else ""
-    )
+def _looks(overview: Overview) -> Iterator[tuple[str, int, str | None]]:
+    """Rows of the confidence by LiDAR points of a voxel."""
+    ends = [*(str(low - 1) for low in list(overview.by_looks)[1:]), ""]
+    for (low, (voxels, mean)), end in zip(overview.by_looks.items(), ends, strict=True):
+        if voxels:
+            group = f"{low} and more" if not end else end if end == str(low) else f"{low} to {end}"
+            yield group, voxels, percent(mean)
 
 
-def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
-    """Table of voxels, accuracy and IoU per class, before and after refinement, as far as known."""
+def _reliability(bins: Sequence[Mapping[str, float]]) -> Chart | None:
+    """Share of right labels over stated confidence; None without truth."""
+    if not bins:
+        return None
+    x, y = [each["confidence"] for each in bins], [each["right"] for each in bins]
+    return chart(
+        "How often labels of a stated confidence are right, measured against truth; on the dashed line both agree.",
+        "stated confidence", "share that is right", [("ideal", "c", (0, 1), (0, 1)), ("measured", "a", x, y)],
+        (0, 1), (0, 1), width=420, height=340,
+    )  # fmt: skip
+
+
+def _path(tracks: Mapping[str, Track], tracked: Sequence[Mapping[str, Any]]) -> Chart | None:
+    """Where the drives went, and where what moved went."""
+    if not tracks:
+        return None
+    movers = [np.array(thing["path"]) for thing in tracked if thing["motion"] == "moving" and thing["path"]]
+    curves: list[Curve] = [("moving object", "b", way[:, 0], way[:, 1]) for way in movers]
+    curves += [(name, "a", track.positions[:, 0], track.positions[:, 1]) for name, track in tracks.items()]
+    moved = "; orange: what moved" if movers else ""
+    return chart(f"The way of the vehicle (blue), north up{moved}.", "east, m", "north, m", curves,
+                 height=420, is_equal=True)  # fmt: skip
+
+
+def _band(tracks: Mapping[str, Track]) -> Chart | None:
+    """How uncertain positions are over time, as the smoother states."""
+    curves: list[Curve] = []
+    for name, track in tracks.items():
+        since = track.stamps - track.stamps[0]
+        radii = (("horizontal", "a", track.horizontal_95_m), ("height", "b", track.vertical_95_m))
+        curves += [
+            (f"{name}, {what}", css, since, values) for what, css, values in radii if values is not None
+        ]
+    if not curves:
+        return None
+    highest = max(float(np.max(y)) for _, _, _, y in curves)
+    return chart("Uncertainty of the position that is not exceeded with 95 % probability, as estimated: horizontal"
+                 " (blue) and height (orange).", "time, s", "m", curves, y_range=(0, 1.1 * highest or 1.0))  # fmt: skip
+
+
+def _drives(run: Mapping[str, Any]) -> dict[str, Any]:
+    """Rows of the drives of the map, each with its own report; and why others are not in it."""
+    drives: Mapping[str, Mapping[str, Any]] = run.get("drives", {})
+    return {
+        "drive_keys": list(next(iter(drives.values()), {})),
+        "drives": [(name, f"drives/{quote(name)}/report.html", about) for name, about in drives.items()],
+        "failed": list(run.get("failed", {}).items()),
+    }
+
+
+def _classes(
+    about_map: Mapping[str, Any], semantics: Mapping[str, Any], refined: Overview | None
+) -> dict[str, Any]:
+    """Table of voxels, accuracy, IoU and confidence per class, before and after refinement, as far as known."""
     counts = about_map.get("labelled", {})
     names = list(dict.fromkeys(n for s in ("raw", "refined") for n in _class_names(counts, semantics, s)))
     columns: list[tuple[str, list[Any]]] = []
@@ -201,116 +223,109 @@ def _classes(about_map: Mapping[str, Any], semantics: Mapping[str, Any]) -> str:
     for stage, scores in semantics.items():
         for key in ("accuracy", "iou"):
             each = [(scores.get("classes", {}).get(name) or {}).get(key) for name in names]
-            columns.append((f"{key}, {stage}", [*map(_percent, each), _percent(scores.get(f"mean_{key}"))]))
-    if not columns:
-        return ""
-    rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
+            columns.append((f"{key}, {stage}", [*map(percent, each), percent(scores.get(f"mean_{key}"))]))
+    if columns and refined is not None:
+        means = (refined.confidence.get(name, (0, 0.0)) for name in names)
+        stated = [percent(mean) if voxels else None for voxels, mean in means]
+        columns.append(("mean stated confidence", [*stated, None]))
     remarks = {}
     for stage, scores in semantics.items():
         strict = scores.get("strict", {}).get("mean_iou")
-        remarks[f"evaluated points that the {stage} map labels"] = _percent(scores.get("coverage"))
-        remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = _percent(strict)
-    known = {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map}
-    return _pairs(known) + _table(("class", *(title for title, _ in columns)), rows) + _pairs(remarks)
+        remarks[f"evaluated points that the {stage} map labels"] = percent(scores.get("coverage"))
+        remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = percent(strict)
+    rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
+    return {
+        "class_head": ("class", *(title for title, _ in columns)),
+        "class_rows": rows if columns else [],
+        "class_remarks": remarks,
+    }
 
 
 def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage: str) -> list[str]:
     return [*counts.get(stage, {}), *semantics.get(stage, {}).get("classes", {})]
 
 
-def _refinement(refinement: Mapping[str, Any]) -> str:
-    steps = refinement.get("steps", ())
-    changed = [
+def _movers(refinement: Mapping[str, Any]) -> dict[str, Any]:
+    """What was tracked, counted; and those that moved, with the evidence."""
+    tracked = refinement.get("tracked", ())
+    motions = [str(thing["motion"]) for thing in tracked]
+    moving = sorted((t for t in tracked if t["motion"] == "moving"), key=lambda t: -t["points"])[:MANY_MOVERS]
+    return {
+        "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},
+        "mover_rows": [
+            (t["motion"], percent(t["probability"]), t["reason"], t["points"],
+             *(f"{round(t[end], 1) + 0.0:.1f}" for end in ("first_stamp", "last_stamp")))
+            for t in moving
+        ],
+    }  # fmt: skip
+
+
+def _passed(run: Mapping[str, Any]) -> dict[str, Any]:
+    """How far the surfaces of two passes lay from each other, and lie now; and what stands in one drive only."""
+    return {
+        "passes": [
+            (row["first"], row["second"], row["places"], row["bound"],
+             f"{100 * row['before_m']:.1f}", f"{100 * row['after_m']:.1f}")
+            for row in run.get("passes", ())
+        ],
+        "changes": [
+            (row["change"], row["class"], row["kind"], f"{row['before']} and {row['after']}",
+             ",\u00a0".join(f"{axis:.1f}" for axis in row["centre_m"]),
+             "\u00a0x\u00a0".join(f"{axis:.1f}" for axis in row["size_m"]),
+             row["voxels"], f"{row['seen_through']:g}")
+            for row in run.get("changes", ())
+        ],
+    }  # fmt: skip
+
+
+def _left_out(skips: Mapping[str, Any]) -> dict[str, Any]:
+    listed = skips.get("listed", ())
+    rows = [(skip["what"], skip["where"], skip["reason"]) for skip in listed[:MANY_SKIPS]]
+    return {"skips": rows, "more_skips": skips.get("count", len(listed)) - len(rows) if rows else 0}
+
+
+def _refined(refinement: Mapping[str, Any]) -> dict[str, Any]:
+    """Steps of the refinement, and how many vehicles it found to stand or move."""
+    motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
+    figures: dict[str, Any] = {
+        f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))
+    }
+    if "systematic_errors" in refinement:
+        share = percent(refinement["systematic_errors"])
+        figures["systematic label error rate, estimated without truth"] = share
+    steps = [
         (
             step["name"],
             step.get("voxels_changed"),
             "; ".join(f"{change}: {count:,}" for change, count in step.get("changes", {}).items())
             or step.get("skipped", ""),
         )
-        for step in steps
+        for step in refinement.get("steps", ())
     ]
-    motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
-    vehicles = {f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))}
-    table = _table(("step", "voxels changed", "of these"), changed) if changed else ""
-    errors = {
-        "systematic label error rate, estimated without truth": _percent(refinement.get("systematic_errors"))
-    }
-    return table + _pairs(vehicles | (errors if "systematic_errors" in refinement else {}))
+    return {"steps": steps, "refinement": figures}
 
 
-def _drives(drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> str:
-    """A row for every drive of the map, with its own report; and why others are not in it."""
-    if not drives:
-        return ""
-    keys = list(next(iter(drives.values())))
-    rows = "".join(
-        f'<tr><td><a href="{escape(f"drives/{quote(name)}/report.html")}">{escape(name)}</a></td>'
-        f"{''.join(_cell(_value(about.get(key)), number=True) for key in keys)}</tr>"
-        for name, about in drives.items()
-    )
-    head = f'<tr><th>drive</th>{"".join(f"""<th class="number">{escape(_words(key))}</th>""" for key in keys)}</tr>'
-    return f'<div class="scroll"><table>{head}{rows}</table></div>' + (
-        f"<h3>Left out</h3>{_table(('drive', 'why'), list(failed.items()))}" if failed else ""
-    )
-
-
-def _passes(passes: Sequence[Mapping[str, Any]]) -> str:
-    """How far the surfaces of two passes lay from each other, and lie now."""
-    if not passes:
-        return ""
-    head = ("first pass", "again", "places registered", "bound", "surfaces apart before, cm", "after, cm")
+def _sharpness(sharpness: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Surface thickness of the map, and of a map from GNSS and IMU alone: a wrong calibration blurs surfaces."""
+    figures = list(dict.fromkeys(name for values in sharpness.values() for name in values))
     rows = [
-        (row["first"], row["second"], row["places"], row["bound"],
-         f"{100 * row['before_m']:.1f}", f"{100 * row['after_m']:.1f}")
-        for row in passes
-    ]  # fmt: skip
-    return _table(head, rows)
+        (name.replace("_", " "), *(values.get(name) for values in sharpness.values())) for name in figures
+    ]
+    return {"sharpness_head": ("figure", *sharpness), "sharpness": rows}
 
 
-def _changes(changes: Sequence[Mapping[str, Any]]) -> str:
-    """Objects that stand in one session and not in the other one."""
-    head = (
-        "",
-        "what",
-        "kind",
-        "between",
-        "where (east, north, up), m",
-        "size, m",
-        "voxels",
-        "seen through by scans",
-    )
-    rows = [
-        (row["change"], row["class"], row["kind"], f"{row['before']} and {row['after']}",
-         ",\u00a0".join(f"{axis:.1f}" for axis in row["centre_m"]),
-         "\u00a0x\u00a0".join(f"{axis:.1f}" for axis in row["size_m"]),
-         row["voxels"], f"{row['seen_through']:g}")
-        for row in changes
-    ]  # fmt: skip
-    return _table(head, rows) if rows else ""
-
-
-def _stages(seconds: Mapping[str, float], memory_mb: Mapping[str, float]) -> str:
+def _stages(run: Mapping[str, Any]) -> dict[str, Any]:
+    seconds, memory_mb = run.get("seconds", {}), run.get("peak_memory_mb", {})
     longest = max(seconds.values(), default=0) or 1
-    rows = "".join(
-        f"<tr><td>{escape(stage)}</td>{_cell(f'{value:,.2f} s', number=True)}"
-        f"{_cell(_value(memory_mb.get(stage)), number=True)}"
-        f'<td><span class="bar" style="width:{BAR_PX * value / longest:.0f}px"></span></td></tr>'
-        for stage, value in seconds.items()
-    )
-    head = (
-        '<tr><th>stage</th><th class="number">time</th><th class="number">peak memory (MB)</th><th></th></tr>'
-    )
-    return f"<table>{head}{rows}</table>" if rows else ""
+    return {
+        "stages": [(stage, value, memory_mb.get(stage), value / longest) for stage, value in seconds.items()]
+    }
 
 
-def _files(folder: Path) -> str:
-    rows = "".join(
-        f'<tr><td><a href="{escape(name)}">{escape(name)}</a></td>'
-        f"{_cell(_size(folder / name), number=True)}<td>{escape(what)}</td></tr>"
-        for name, what in FILES.items()
-        if (folder / name).exists()
-    )
-    return f"<table>{rows}</table>" if rows else ""
+def _files(folder: Path) -> Iterator[tuple[str, str, str]]:
+    for name, what in FILES.items():
+        if (folder / name).exists():
+            yield name, _size(folder / name), what
 
 
 def _size(path: Path) -> str:
@@ -319,58 +334,10 @@ def _size(path: Path) -> str:
     return f"{path.stat().st_size / 1e3:,.1f} kB"
 
 
-def _pairs(values: Mapping[str, Any]) -> str:
-    """A table of names and values; absent values and nested tables are left out."""
-    rows = [(_words(k), _value(v)) for k, v in values.items() if v is not None and not isinstance(v, Mapping)]
-    return (
-        f"<table>{''.join(f'<tr><th>{escape(k)}</th>{_cell(v)}</tr>' for k, v in rows)}</table>"
-        if rows
-        else ""
-    )
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    lines = [f"<tr>{''.join(_cell(_value(v), number=_is_number(v)) for v in row)}</tr>" for row in rows]
-    titles = "".join(f"<th>{escape(title)}</th>" for title in head)
-    return f'<div class="scroll"><table><tr>{titles}</tr>{"".join(lines)}</table></div>'
-
-
-def _cell(text: str, number: bool = False) -> str:
-    return f'<td class="number">{escape(text)}</td>' if number else f"<td>{escape(text)}</td>"
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) or (isinstance(value, str) and value.endswith(" %"))
-
-
-def _percent(share: float | None) -> str | None:
-    return None if share is None else f"{100 * share:.1f} %"
-
-
 def _shares(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The same metrics with fractions as percentages."""
-    return {key: _percent(value) if isinstance(value, float) else value for key, value in values.items()}
-
-
-def _value(value: Any) -> str:
-    match value:
-        case None:
-            return "-"
-        case bool():
-            return "yes" if value else "no"
-        case int():
-            return f"{value:,}"
-        case float():
-            return f"{value:.4g}"
-        case list() | tuple():
-            return ", ".join(map(_value, value))
-        case _:
-            return str(value)
-
-
-def _words(key: str) -> str:
-    """`peak_memory_mb` -> `peak memory (MB)`, and some abbreviations spelt out."""
-    if key in WORDS:
-        return WORDS[key]
-    *words, last = key.split("_")
-    return " ".join([*words, f"({UNITS[last]})"] if words and last in UNITS else [*words, last])
+    """The same metrics with fractions as percentages, without tables."""
+    return {
+        key: percent(value) if isinstance(value, float) else value
+        for key, value in values.items()
+        if not isinstance(value, list)
+    }

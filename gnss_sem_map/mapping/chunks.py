@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import TrackedObject
 from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, decide, moved_points
-from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSelector, RangeImage
+from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSelector
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import edge_windows
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_scan
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
+from gnss_sem_map.mapping.waiting_images import WaitingImages
 from gnss_sem_map.mapping.waiting_points import WaitingPoints
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
@@ -58,7 +59,7 @@ class MappedChunk:
     objects: tuple[TrackedObject, ...]
     """Those that are first seen in this chunk."""
     keyframes: KeyframeScans | None
-    """Scans for free-space evidence; None unless the poses come from LiDAR odometry."""
+    """Scans for free-space evidence; None where the poses are not sharp enough for it."""
     stats: RunStats
     """Its counts and skips."""
 
@@ -104,7 +105,10 @@ def _map_chunks(
     is_sought = drive.settings.dynamics.enabled
     if is_sought:
         _ = drive.image_rows  # the scans that tell them are kept for their turn
-    before = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
+    images = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
+    with writing_to(folder):
+        before = WaitingImages.write(images, folder)
+    del images
     undecided: _Chunk | None = None
     done = 0
     for number in numbers:
@@ -183,7 +187,7 @@ class _Chunk:
         self._drive, self._number, self._first, self._folder = drive, number, first, folder
         self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
         self.observations: list[Observation] = []
-        self.last_images: list[RangeImage] = []
+        self.last_images: WaitingImages | None = None
         """Of its last window of scans, once it is decided."""
         self.stats = RunStats()
 
@@ -198,19 +202,16 @@ class _Chunk:
             self._keyframes.add(observation.stamp, observation.seen)
             self.observations.append(observation)
 
-    def decided(self, before: Sequence[RangeImage], after: Sequence[Observation]) -> MappedChunk:
+    def decided(self, before: WaitingImages | None, after: Sequence[Observation]) -> MappedChunk:
         """The chunk, once the scans before and after it are known."""
         release_memory()  # of the scans, freed by other threads: 250 MB after three hundred scans
         settings, numbers = self._drive.settings, [one.number for one in self.observations]
-        decision = decide(
-            [*self.observations, *after],
-            len(numbers),
-            before,
-            settings.dynamics,
-            self._drive.from_lidar_odometry,
-        )
+        decision = decide([*self.observations, *after], len(numbers), before, settings.dynamics)
         last = self._last_window()
-        self.last_images = [one.seen for one in self.observations if one.number in last]
+        images = [one.seen for one in self.observations if one.number in last]
+        with writing_to(self._folder):
+            self.last_images = WaitingImages.write(images, self._folder)
+        del images
         self.observations.clear()
         release_memory()  # 110 MB
 
@@ -224,7 +225,7 @@ class _Chunk:
             moving[numbers[place]] = points.near.indices[moved].astype(np.int64)
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
-        keyframes = self._keyframes.keyframes() if self._drive.from_lidar_odometry else None
+        keyframes = self._keyframes.keyframes() if decision.is_sharp else None
         static = self._all.to_map() - gone
         number = self._first + self._number
         return MappedChunk(

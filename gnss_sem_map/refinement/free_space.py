@@ -48,7 +48,7 @@ def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     """Remove the voxels that rays traverse repeatedly; see `traversed`."""
     if state.beside.keyframes is None:
-        raise NotApplicable("no keyframe scans with poses from LiDAR odometry")
+        raise NotApplicable("no keyframe scans: the poses are not sharp enough to tell what is free")
     assert state.decided is not None
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= state.decided.states != State.SPLIT  # a kerb is ground
@@ -59,7 +59,7 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
 def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
     """Which voxels (v,) are free space, by the rays through their centres.
 
-    Needs poses from LiDAR odometry: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
+    Needs sharp poses: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
     because grazing rays traverse them. Scans are read part by part. A voxel is asked about no longer once even misses
     in all the scans left would not make it free.
     """

@@ -74,5 +74,5 @@ def against(
     result = np.zeros((len(heights), len(label_set.names)), np.float32)
     for name, broken, weight in rules:
         if name in label_set.names:
-            result[broken, label_set.index(name)] -= np.float32(weight * settings.against_nat)
+            result[:, label_set.index(name)] -= np.float32(weight * settings.against_nat) * broken
     return result

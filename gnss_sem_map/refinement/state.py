@@ -48,7 +48,7 @@ class Evidence:
     sensor_model: LabelCalibration | None = None
     """Where the classes were found to stand, in place of rules, and a temperature."""
     keyframes: Keyframes | None = None
-    """Scans that say which space is free; only with poses sharp enough for it, so from LiDAR odometry."""
+    """Scans that say which space is free; only with poses sharp enough for it."""
 
 
 @dataclass(frozen=True, eq=False)

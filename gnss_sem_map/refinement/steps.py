@@ -87,7 +87,7 @@ class RefinementSettings(BaseModel):
     )
     free_space: FreeSpaceSettings = Field(
         default=FreeSpaceSettings(),
-        description="Voxels that rays traverse again and again are removed, where poses come from LiDAR odometry.",
+        description="Voxels that rays traverse again and again are removed, where poses are sharp enough.",
     )
     removed_layer: RemovedLayerSettings = Field(
         default=RemovedLayerSettings(),

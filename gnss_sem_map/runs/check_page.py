@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
-from gnss_sem_map.export.report import findings_table, page_of
+from gnss_sem_map.export.page import page as html_page
 from gnss_sem_map.files.atomic import replacing
 
 SUMMARIES = {
@@ -29,8 +28,11 @@ def check_writable(path: Path) -> None:
 def write_check_page(path: Path, name: str, page: Preflight) -> None:
     """Write the findings of a drive as one self-contained page, replacing an earlier one; raises DataError."""
     check_writable(path)
-    facts = f'<p class="facts">{escape(SUMMARIES[page.level])} Checked in {page.seconds:.1f} s.</p>'
-    title = f"Pre-flight of {name}"
-    body = (f"<h1>{escape(title)}</h1>", facts, findings_table(page.as_dict()["findings"]))
+    content = html_page(
+        "check.html.j2",
+        title=f"Pre-flight of {name}",
+        facts=f"{SUMMARIES[page.level]} Checked in {page.seconds:.1f} s.",
+        findings=page.as_dict()["findings"],
+    )
     with replacing(path) as file:
-        file.write(page_of(title, body))
+        file.write(content)

@@ -35,6 +35,10 @@ LENS = 16
 """Numbers of a lens: kind, least cosine, xi, fx, skew, cx, fy, cy, and eight coefficients."""
 STEP_DEG, DIRECTIONS = 0.1, 72
 """Grid on which the turning back of a lens is looked for."""
+NEWTON_STEPS, NEWTON_STEP_RAD = 6, 1e-6
+"""Of `Distortion.straightened`: so many steps, each with differences over so small an angle."""
+LENS_EDGE = 1.05
+"""How much farther out than along x a lens may show its last angle: it is bent sidewards, too."""
 WIDEST_DEG = {"brown": 89.5, "fisheye": 179.5, "mei": 179.5}
 
 
@@ -79,6 +83,35 @@ class Distortion(BaseModel):
         last = int(turned.argmax()) - 1 if turned.any() else len(angles) - 1
         return float(np.cos(angles[last])) if last >= 0 else 1.0
 
+    def straightened(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Rays of length 1 that meet the image plane at focal length 1 in x and y: `bent` turned back, by Newton.
+
+        Beyond the last angle that the lens maps one to one, rays of that angle.
+        """
+        most = float(np.arccos(self.least_cosine))
+        angles, zero = np.linspace(0.0, most, 1000), np.zeros(1000)
+        out = self.bent(np.stack([np.sin(angles), zero, np.cos(angles)]))[0]
+        r = np.hypot(x, y)
+        first = np.interp(r, out, angles) / np.where(r > 0, r, 1.0)
+        a, b = x * first, y * first  # the angle to the axis, along x and y
+        h = NEWTON_STEP_RAD
+        for _ in range(NEWTON_STEPS):
+            here, beside_a, beside_b = (
+                self.bent(_rays(a + da, b + db)) for da, db in ((0, 0), (h, 0), (0, h))
+            )
+            (xa, ya), (xb, yb) = (
+                ((beside[0] - here[0]) / h, (beside[1] - here[1]) / h) for beside in (beside_a, beside_b)
+            )
+            dx, dy, area = here[0] - x, here[1] - y, xa * yb - xb * ya
+            area = np.where(
+                (r < LENS_EDGE * out[-1]) & (area > 0), area, np.inf
+            )  # beyond, nothing to be found
+            a, b = a - (yb * dx - xb * dy) / area, b - (xa * dy - ya * dx) / area
+            shrink = np.minimum(1.0, most / np.maximum(np.hypot(a, b), 1e-12))
+            a, b = a * shrink, b * shrink
+        X, Y, Z = _rays(a, b)
+        return X, Y, Z
+
     def bent(self, rays: Array) -> tuple[Array, Array]:
         """Where rays (3, ...) of length 1 meet the image plane at focal length 1."""
         X, Y, Z = rays
@@ -88,7 +121,8 @@ class Distortion(BaseModel):
             r = np.hypot(X, Y)
             angle = np.arctan2(r, Z)
             square = angle * angle
-            out = angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3])))) / r
+            out = angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+            out = out / np.maximum(r, 1e-300)  # nothing is bent on the axis
             return X * out, Y * out
         x, y = X / (Z + self.xi), Y / (Z + self.xi)
         r2 = x * x + y * y
@@ -97,6 +131,13 @@ class Distortion(BaseModel):
             x * out + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x),
             y * out + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y,
         )
+
+
+def _rays(a: Array, b: Array) -> Array:
+    """Rays (3, ...) of length 1 whose angle to the axis is a along x and b along y."""
+    angle = np.hypot(a, b)
+    side = np.sinc(angle / np.pi)
+    return np.stack([a * side, b * side, np.cos(angle)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,18 +13,21 @@ from gnss_sem_map.datasets.kitti_calibration import quaternion_of
 from gnss_sem_map.datasets.ros.decoding import typestore
 from gnss_sem_map.datasets.ros.static_tf import TOPIC as TF_STATIC
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.sensor_log.cameras import Distortion
 
 Array = NDArray[np.float64]
 
 ATTITUDE_VARIANCES = np.array([0.005**2, 0.005**2, 0.01**2])
 CLOUD_FIELDS = ("x", "y", "z", "intensity", "time")
+LENSES = {"brown": "plumb_bob", "fisheye": "equidistant"}
+"""Names of our models in a CameraInfo."""
 FLOAT32 = 7
 ROS2_VERSION: Final = 9
 """Of the bag's metadata: that of ROS 2 Jazzy."""
 
 
 class BagWriter:
-    """Topics /imu, /fix, /points, /camera/... and /tf_static; the arrival of a message is its stamp."""
+    """Topics /imu, /fix, /tf_static, and those of LiDARs and cameras; the arrival of a message is its stamp."""
 
     def __init__(self, folder: Path, is_ros1: bool) -> None:
         if find_spec("rosbags") is None:
@@ -64,16 +67,20 @@ class BagWriter:
             )  # fmt: skip
         self._write(TF_STATIC, self._make("tf2_msgs/msg/TFMessage", transforms=transforms), ns)
 
-    def write_imu(self, ns: int, row: Array, quaternion_xyzw: Array) -> None:
-        """A row of the navigation unit (30,), and its attitude."""
+    def write_imu(self, ns: int, force: Array, rate: Array, quaternion_xyzw: Array | None) -> None:
+        """Specific force (3,), angular rate (3,), and the attitude, where it is known."""
+        attitude = np.array([0.0, 0.0, 0.0, 1.0]) if quaternion_xyzw is None else quaternion_xyzw
+        covariance = np.diag(ATTITUDE_VARIANCES).ravel()
+        if quaternion_xyzw is None:
+            covariance = np.array([-1.0, *[0.0] * 8])  # as sensor_msgs/Imu says it
         message = self._make(
             "sensor_msgs/msg/Imu",
             header=self._header(ns, "imu"),
-            orientation=self._quaternion(quaternion_xyzw),
-            orientation_covariance=np.diag(ATTITUDE_VARIANCES).ravel(),
-            angular_velocity=self._vector(row[17:20]),
+            orientation=self._quaternion(attitude),
+            orientation_covariance=covariance,
+            angular_velocity=self._vector(rate),
             angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=self._vector(row[11:14]),
+            linear_acceleration=self._vector(force),
             linear_acceleration_covariance=np.zeros(9),
         )
         self._write("/imu", message, ns)
@@ -89,7 +96,9 @@ class BagWriter:
         )  # fmt: skip
         self._write("/fix", message, ns)
 
-    def write_cloud(self, ns: int, rows: NDArray[np.float32]) -> None:
+    def write_cloud(
+        self, ns: int, rows: NDArray[np.float32], topic: str = "/points", frame: str = "lidar"
+    ) -> None:
         """x, y, z, intensity and the time after the stamp (n, 5)."""
         fields = [
             self._make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=FLOAT32, count=1)
@@ -97,31 +106,40 @@ class BagWriter:
         ]
         message = self._make(
             "sensor_msgs/msg/PointCloud2",
-            header=self._header(ns, "lidar"), height=1, width=len(rows), fields=fields, is_bigendian=False,
+            header=self._header(ns, frame), height=1, width=len(rows), fields=fields, is_bigendian=False,
             point_step=20, row_step=20 * len(rows), data=np.frombuffer(rows.astype("<f4").tobytes(), np.uint8),
             is_dense=True,
         )  # fmt: skip
-        self._write("/points", message, ns)
+        self._write(topic, message, ns)
 
-    def write_image(self, ns: int, file: Path, K: Array, size: tuple[int, int]) -> None:
-        """A PNG as it is, and the calibration beside it."""
+    def write_image(self, ns: int, file: Path, topic: str, frame: str) -> None:
+        """A PNG as it is."""
         pixels = np.frombuffer(file.read_bytes(), np.uint8)
         image = self._make(
-            "sensor_msgs/msg/CompressedImage", header=self._header(ns, "camera"), format="png", data=pixels
+            "sensor_msgs/msg/CompressedImage", header=self._header(ns, frame), format="png", data=pixels
         )
+        self._write(topic, image, ns)
+
+    def write_info(
+        self, ns: int, topic: str, frame: str, K: Array, size: tuple[int, int], lens: Distortion | None = None
+    ) -> None:
+        """The calibration of a camera; `lens` None: its images are rectified. ROS has no message for Mei's model."""
+        model, coefficients = "plumb_bob", np.zeros(5)
+        if lens is not None:
+            model, coefficients = LENSES[lens.model], np.zeros(4 if lens.model == "fisheye" else 5)
+            coefficients[: len(lens.coefficients)] = lens.coefficients
         names = ("K", "R", "P", "D") if self._is_ros1 else ("k", "r", "p", "d")
         P = np.column_stack([K, np.zeros(3)])
-        values = dict(zip(names, (K.ravel(), np.eye(3).ravel(), P.ravel(), np.zeros(5)), strict=True))
+        values = dict(zip(names, (K.ravel(), np.eye(3).ravel(), P.ravel(), coefficients), strict=True))
         region = self._make(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         info = self._make(
             "sensor_msgs/msg/CameraInfo",
-            header=self._header(ns, "camera"), width=size[0], height=size[1], distortion_model="plumb_bob",
+            header=self._header(ns, frame), width=size[0], height=size[1], distortion_model=model,
             binning_x=0, binning_y=0, roi=region, **values,
         )  # fmt: skip
-        self._write("/camera/image_rect_color/compressed", image, ns)
-        self._write("/camera/camera_info", info, ns)
+        self._write(topic, info, ns)
 
     def _header(self, ns: int, frame: str) -> Any:
         time = self._make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)

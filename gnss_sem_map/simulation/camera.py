@@ -2,10 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from gnss_sem_map.sensor_log.cameras import Distortion
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
 from gnss_sem_map.simulation.ground import FAR, to_town
 from gnss_sem_map.simulation.id_buffer import pixel_ray, see
@@ -26,13 +28,31 @@ _DISPLAY = np.round(255.0 * (0.55 * _TONES + 0.45 * _TONES**2 * (3.0 - 2.0 * _TO
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera; the defaults are KITTI's rectified colour camera (focal length and centre in pixels)."""
+    """A camera; the defaults are KITTI's rectified colour camera (focal length and centre in pixels)."""
 
     width: int = 1242
     height: int = 375
     focal_px: float = 721.5377
     centre_u_px: float = 609.5593
     centre_v_px: float = 172.854
+    distortion: Distortion | None = None
+    """None: a pinhole."""
+
+    @property
+    def K(self) -> Floats:
+        """(3, 3) px."""
+        f = self.focal_px
+        return np.array([[f, 0.0, self.centre_u_px], [0.0, f, self.centre_v_px], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def rays(self) -> Floats:
+        """The ray of every pixel in the camera's axes, and the factor that makes its length 1: (h, w, 4)."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        x, y = (u - self.centre_u_px) / self.focal_px, (v - self.centre_v_px) / self.focal_px
+        z = np.ones(x.shape)
+        if self.distortion is not None:
+            x, y, z = self.distortion.straightened(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        return np.stack([x, y, z, 1.0 / np.sqrt(x * x + y * y + z * z)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +113,7 @@ def _light(openness: int, nx: float, ny: float, nz: float, sun: Triple) -> Tripl
 def _expose(
     scene: Scene,
     T: Floats,
-    lens: Triple,
+    rays: Floats,
     sun: Triple,
     distance: Floats,
     things: Integers,
@@ -103,14 +123,14 @@ def _expose(
     depth: Singles,
     light: npt.NDArray[np.int8],
 ) -> None:
-    """Compute the colour of every pixel. `lens`: focal length and centre in pixels; `sun`: direction towards it.
+    """Compute the colour of every pixel. `rays` as in `pixel_ray`; `sun`: direction towards it.
 
     Shadows are traced once for two neighbouring pixels where these show the same shape, near the camera for four.
     """
     ox, oy, oz = T[0, 3], T[1, 3], T[2, 3]
     for v in range(linear.shape[0]):
         for u in range(linear.shape[1]):
-            dx, dy, dz, cosine = pixel_ray(T, lens, u, v)
+            dx, dy, dz, cosine = pixel_ray(T, rays, u, v)
             t, thing, shape = distance[v, u], things[v, u], shapes[v, u]
             if t >= FAR:
                 r, g, b = _sky(dx, dy, dz, sun[0], sun[1], sun[2])
@@ -196,10 +216,9 @@ def render_image(
     linear, kinds = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
     depth, light = np.zeros(size, np.float32), np.full(size, -1, np.int8)
     distance, things, shapes = np.zeros(size), np.zeros(size, np.int32), np.zeros(size, np.int32)
-    lens = (camera.focal_px, camera.centre_u_px, camera.centre_v_px)
     scene, sun = world.scene(stamp, stamp), sun_direction(seed)
-    see(scene, T_map_camera, lens, distance, things, shapes)
-    _expose(scene, T_map_camera, lens, sun, distance, things, shapes, linear, kinds, depth, light)
+    see(scene, T_map_camera, camera.rays, distance, things, shapes)
+    _expose(scene, T_map_camera, camera.rays, sun, distance, things, shapes, linear, kinds, depth, light)
     # exposure is metered on the lower half; it follows slow changes of light, with some oscillation
     brightness = max(float(linear[size[0] // 3 :: 4, ::4].mean()), 0.05)
     gain = 0.62 * (0.42 / brightness) ** 0.7 * (1.0 + 0.10 * np.sin(0.9 * stamp) + 0.05 * np.sin(2.3 * stamp))

@@ -26,6 +26,7 @@ _CLASSES[[0, 1, 2, 8]] = _ROAD, _SIDEWALK, _BUILDING, _VEGETATION
 _CLASSES[13:18] = _VEHICLE
 
 _FRAMES_PER_PATTERN: Final = 12
+_OTHER_CAMERA: Final = 1_000_003
 # confusions: the wrong class of each class, the threshold of the noise, and the strength
 _LOOKALIKES: Final = np.array([_SIDEWALK, _ROAD, _OTHER, _VEGETATION, _BUILDING, _BUILDING], np.int64)
 _THRESHOLDS: Final = np.array([0.84, 0.74, 0.84, 0.78, 0.76, 0.78])
@@ -102,15 +103,25 @@ def write_corrupted_labels(
 ) -> Path:
     """Corrupt all class images of a simulated drive's truth: `<folder>/<frame>.npz`, which `labels:FOLDER` reads.
 
-    Each holds `probabilities` and `class_names`. `progress(done, frames)` is called after every frame; `workers`
-    threads share the work (None: one per core). Raises DataError when the drive has no class images.
+    Each holds `probabilities` and `class_names`. Of several cameras, each has a folder of its name, and errs in its own
+    way. `progress(done, frames)` is called after every frame; `workers` threads share the work (None: one per core).
+    Raises DataError when the drive has no class images.
     """
-    paths = sorted((Path(drive) / "truth" / "train_ids").glob("*.png"))
+    truth = Path(drive) / "truth" / "train_ids"
+    paths = sorted(truth.rglob("*.png"))
     if not paths:
         raise DataError(f"{drive}: found no truth/train_ids/*.png, expected a simulated drive")
-    Path(folder).mkdir(parents=True, exist_ok=True)
+    cameras = sorted({path.parent for path in paths})
+    targets = {camera: Path(folder) / camera.relative_to(truth) for camera in cameras}
+    for target in targets.values():
+        target.mkdir(parents=True, exist_ok=True)
+    keys = {camera: seed + _OTHER_CAMERA * number for number, camera in enumerate(cameras)}
+
+    def write(path: Path) -> None:
+        _write_corrupted(path, targets[path.parent], keys[path.parent])
+
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        for done, _ in enumerate(pool.map(lambda path: _write_corrupted(path, Path(folder), seed), paths), 1):
+        for done, _ in enumerate(pool.map(write, paths), 1):
             if progress is not None:
                 progress(done, len(paths))
     return Path(folder)

@@ -20,9 +20,10 @@ from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.files.ownership import MARKER, read_list, write_list
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
+from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
 from gnss_sem_map.simulation.oxts import DATAFORMAT, Gnss, oxts_rows, row_text, sweep_rows
-from gnss_sem_map.simulation.rig import T_IMU_LIDAR, camera_in_imu, camera_in_lidar, write_calibration
+from gnss_sem_map.simulation.rigs import Rig, kitti
 from gnss_sem_map.simulation.sessions import Change, changes, session_of
 from gnss_sem_map.simulation.streets import around_the_block
 from gnss_sem_map.simulation.town import build_town
@@ -38,8 +39,7 @@ from gnss_sem_map.simulation.truth import (
 from gnss_sem_map.simulation.world import World
 
 SECONDS = 30.0  # of a drive, when nothing else is said
-IMAGE_AFTER_SCAN_S = 0.0105
-EXPOSURE_AFTER_SCAN_S = 0.0020  # 8.5 ms before the image's stamp, as measured on KITTI
+_OTHER_SENSOR = 20_011  # apart in the numbers of the noise: a drive of 2000 s has as many frames
 _MORNING = np.timedelta64(9 * 60 + 30, "m")  # UTC, stamp zero of the simulation
 _PLACE = LocalFrame(lat_deg=49.0131, lon_deg=8.4044, alt_m=115.0)
 
@@ -54,8 +54,7 @@ class Simulation:
     seed: int
     session: int
     world: World
-    lidar: Lidar
-    camera: Camera
+    rig: Rig
     sweeps: Floats
     """(frames, 2) s, start and end of every sweep."""
     oxts_stamps: Floats
@@ -68,6 +67,11 @@ class Simulation:
     """What came and went since session 0, in the simulation's own axes; see `to_map`."""
 
     @property
+    def name(self) -> str:
+        """Date and number of the drive."""
+        return f"{str(_date_of(self.session)).replace('-', '_')}_drive_{self.seed:04d}"
+
+    @property
     def day(self) -> int:
         """Seed of all that another day brings: traffic, light and noise."""
         return day_of(self.seed, self.session)
@@ -76,6 +80,16 @@ class Simulation:
     def morning_ns(self) -> int:
         """Unix time of stamp zero of the simulation."""
         return int((_date_of(self.session) + _MORNING).astype("datetime64[ns]").astype(np.int64))
+
+    @property
+    def lidar(self) -> Lidar:
+        """The first one."""
+        return self.rig.lidars[0].sensor
+
+    @property
+    def camera(self) -> Camera:
+        """The first one."""
+        return self.rig.cameras[0].sensor
 
     @property
     def stamps(self) -> Floats:
@@ -92,29 +106,43 @@ class Simulation:
         """The map's frame: the position that the first row of the drive's oxts reports."""
         return LocalFrame(*(float(v) for v in self.oxts[self.sync[0], :3]))
 
+    @property
+    def place(self) -> LocalFrame:
+        """The simulation's own axes."""
+        return _PLACE
+
     def to_map(self, points: Floats) -> Floats:
         """From the simulation's own axes (origin at `_PLACE`) to the map that readers of the drive will find."""
         return self.frame.to_map(*_PLACE.to_geodetic(points))
 
-    def scan(self, frame: int) -> SimulatedScan:
-        """The sweep of a frame."""
-        start, end = self.sweeps[frame]
-        return render_scan(self.world, T_IMU_LIDAR, start, end, lidar=self.lidar, seed=self.day, frame=frame)
+    def scan(self, frame: int, number: int = 0) -> SimulatedScan:
+        """The sweep of a frame by a LiDAR of the rig."""
+        lidar = self.rig.lidars[number]
+        start, end = self.sweeps[frame] + lidar.sweep_after_s
+        return render_scan(
+            self.world, lidar.T_imu_lidar, start, end,
+            lidar=lidar.sensor, seed=self.day, frame=frame + number * _OTHER_SENSOR,
+        )  # fmt: skip
 
-    def image(self, frame: int) -> SimulatedImage:
-        """The image of a frame, at its moment of exposure."""
-        moment = self.stamps[frame] + EXPOSURE_AFTER_SCAN_S
-        T_map_camera = self.world.ego.poses([moment])[0] @ camera_in_imu(self.camera)
-        return render_image(self.world, T_map_camera, moment, camera=self.camera, seed=self.day, frame=frame)
+    def image(self, frame: int, number: int = 0) -> SimulatedImage:
+        """The image of a frame by a camera of the rig, at its moment of exposure."""
+        camera = self.rig.cameras[number]
+        moment = self.stamps[frame] + camera.exposure_after_s
+        T_map_camera = self.world.ego.poses([moment])[0] @ camera.T_imu_camera
+        return render_image(
+            self.world, T_map_camera, moment,
+            camera=camera.sensor, seed=self.day, frame=frame + number * _OTHER_SENSOR,
+        )  # fmt: skip
 
     def project(
         self, frame: int, scan: SimulatedScan
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Floats]:
-        """Pixels u, v and depths of a scan's points in the frame's image: each point at its position of its own stamp,
-        the camera at its pose of the exposure."""
+        """Pixels u, v and depths of the first LiDAR's points in the first camera's image, which is no lens: each point
+        at its position of its own stamp, the camera at its pose of the exposure."""
         start, end = self.sweeps[frame]
         columns, column = np.unique(scan.fractions, return_inverse=True)
-        stamps = np.append(start + columns * (end - start), self.stamps[frame] + EXPOSURE_AFTER_SCAN_S)
+        exposure = self.stamps[frame] + self.rig.cameras[0].exposure_after_s
+        stamps = np.append(start + columns * (end - start), exposure)
         T_map_lidar = self.world.ego.poses(stamps) @ T_IMU_LIDAR
         T = camera_in_lidar(self.camera) @ np.linalg.inv(T_map_lidar[-1]) @ T_map_lidar[:-1]
         p = scan.points[:, :3].astype(np.float64)
@@ -142,11 +170,13 @@ def prepare(
     laps: int = 1,
     session: int = 0,
     gnss: Gnss = "unit",
+    rig: Rig | None = None,
 ) -> Simulation:
     """Build the town, the traffic and the measurements of the navigation unit; nothing is rendered yet.
 
-    See `simulate`.
+    See `simulate`. `rig`: default is KITTI's, with `lidar` and `camera`.
     """
+    rig = rig or kitti(lidar, camera)
     usual = build_town(seed, crossings=4 + int((seconds or SECONDS) / 7.0))
     if laps > 1:
         usual = replace(usual, route=around_the_block(usual.route, laps))
@@ -171,12 +201,20 @@ def prepare(
     rows = oxts_rows(ego, oxts_stamps, _PLACE, rng, gnss, driven)
     sync = sweep_rows(oxts_stamps, sweeps.mean(axis=1), rng)
     world = World(town, ego, movers)
+    world.remember(_moments(rig, sweeps))
+    return Simulation(seed, session, world, rig, sweeps, oxts_stamps, rows, sync, changes(usual, built))
+
+
+def _moments(rig: Rig, sweeps: Floats) -> Floats:
+    """When the sensors measure: start, middle and end of every sweep, and every exposure."""
+    moments = []
+    for lidar in rig.lidars:
+        start, end = (sweeps + lidar.sweep_after_s).T
+        moments += [start, 0.5 * (start + end), end]
     middles = sweeps.mean(axis=1)
-    world.remember(np.concatenate([sweeps[:, 0], middles, sweeps[:, 1], middles + EXPOSURE_AFTER_SCAN_S]))
-    return Simulation(
-        seed, session, world, lidar or Lidar(), camera or Camera(), sweeps, oxts_stamps, rows, sync,
-        changes(usual, built),
-    )  # fmt: skip
+    return np.unique(
+        np.concatenate([*moments, *(middles + camera.exposure_after_s for camera in rig.cameras)])
+    )
 
 
 def simulate(
@@ -283,17 +321,24 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
     ):
         (partial / name).mkdir(parents=True)
     morning_ns = simulation.morning_ns
-    _write_oxts(
-        partial, morning_ns, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync]
-    )
-    _write_oxts(folder / "extract", morning_ns, simulation.oxts_stamps, simulation.oxts)
+    write_oxts(partial, morning_ns, simulation.oxts_stamps[simulation.sync], simulation.oxts[simulation.sync])
+    write_oxts(folder / "extract", morning_ns, simulation.oxts_stamps, simulation.oxts)
     stamps = {"": simulation.stamps, "_start": simulation.sweeps[:, 0], "_end": simulation.sweeps[:, 1]}
     for name, values in stamps.items():
-        _write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", morning_ns, values)
-    _write_stamps(partial / "image_02" / "timestamps.txt", morning_ns, simulation.stamps + IMAGE_AFTER_SCAN_S)
-    truth, frame = partial / "truth", simulation.frame
+        write_stamps(partial / "velodyne_points" / f"timestamps{name}.txt", morning_ns, values)
+    write_stamps(
+        partial / "image_02" / "timestamps.txt",
+        morning_ns,
+        simulation.stamps + simulation.rig.cameras[0].stamp_after_s,
+    )
+    write_truth(simulation, partial / "truth")
+
+
+def write_truth(simulation: Simulation, truth: Path) -> None:
+    """The truth that needs no rendering, into a folder that is there."""
+    frame = simulation.frame
     about = {
-        "epoch_ns": morning_ns + round(simulation.zero_s * 1e9),
+        "epoch_ns": simulation.morning_ns + round(simulation.zero_s * 1e9),
         "lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m, "seed": simulation.seed,
     }  # fmt: skip
     (truth / "world.json").write_text(json.dumps(about, indent=2) + "\n")
@@ -305,15 +350,16 @@ def _write_still(simulation: Simulation, folder: Path) -> None:
         write_changes(truth / "changes.json", simulation.session, simulation.changes, to_map)
 
 
-def _write_oxts(drive: Path, morning_ns: int, stamps: Floats, rows: Floats) -> None:
+def write_oxts(drive: Path, morning_ns: int, stamps: Floats, rows: Floats) -> None:
+    """`drive/oxts`: stamps and rows of the navigation unit."""
     (drive / "oxts" / "data").mkdir(parents=True)
     (drive / "oxts" / "dataformat.txt").write_text(DATAFORMAT)
-    _write_stamps(drive / "oxts" / "timestamps.txt", morning_ns, stamps)
+    write_stamps(drive / "oxts" / "timestamps.txt", morning_ns, stamps)
     for k, row in enumerate(rows):
         (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(row_text(row))
 
 
-def _write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
+def write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
     """One line `date time` with nanoseconds for each stamp."""
     times = (morning_ns + np.round(stamps * 1e9).astype(np.int64)).astype("datetime64[ns]")
     path.write_text("".join(str(time).replace("T", " ") + "\n" for time in times))
@@ -324,16 +370,17 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.
     name, scan, image = f"{k:010d}", simulation.scan(k), simulation.image(k)
     (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
     (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
-    _write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
+    write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
     unfiltered = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)  # ids are read four times as fast so
-    _write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids, *unfiltered)
+    write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids, *unfiltered)
     alone = seen_alone(image, *simulation.project(k, scan))
     (drive / "truth" / "single_frame" / f"{name}.label").write_bytes(alone.astype("<u4").tobytes())
     numbers, counts = np.unique(image.instances, return_counts=True)
     return numbers[(numbers > 0) & (counts >= 60)]
 
 
-def _write_png(path: Path, pixels: npt.NDArray[Any], *options: int) -> None:
+def write_png(path: Path, pixels: npt.NDArray[Any], *options: int) -> None:
+    """Write a PNG, with more options of OpenCV's encoder."""
     ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1, *options])
     if not ok:
         raise DataError(f"{path}: the image could not be encoded")

@@ -1,8 +1,6 @@
 """ID buffer: the visible shape of every pixel, and its distance."""
 
-import numpy as np
-
-from gnss_sem_map.simulation.compiled import Floats, Integers, Triple, inlined, kernel
+from gnss_sem_map.simulation.compiled import Floats, Integers, inlined, kernel
 from gnss_sem_map.simulation.ground import FAR, hit_ground
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray, into_thing
 from gnss_sem_map.simulation.shapes import hit_shape
@@ -13,14 +11,16 @@ _LEAVES, _FENCE = int(Surface.LEAVES), int(Surface.FENCE)
 
 
 @inlined
-def pixel_ray(T: Floats, lens: Triple, u: int, v: int) -> tuple[float, float, float, float]:
-    """Direction (3) in the map of a pixel's ray, and the cosine of its angle to the optical axis."""
-    x, y = (u - lens[1]) / lens[0], (v - lens[2]) / lens[0]
-    cosine = 1.0 / np.sqrt(x * x + y * y + 1.0)
-    dx = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * cosine
-    dy = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * cosine
-    dz = (T[2, 0] * x + T[2, 1] * y + T[2, 2]) * cosine
-    return dx, dy, dz, cosine
+def pixel_ray(T: Floats, rays: Floats, u: int, v: int) -> tuple[float, float, float, float]:
+    """Direction (3) in the map of a pixel's ray, and the cosine of its angle to the optical axis.
+
+    `rays` (h, w, 4): the ray in the camera's axes, and the factor that makes its length 1.
+    """
+    x, y, z, scale = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2], rays[v, u, 3]
+    dx = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) * scale
+    dy = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) * scale
+    dz = (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) * scale
+    return dx, dy, dz, z * scale
 
 
 @kernel
@@ -39,8 +39,8 @@ def _on_same(
 
 
 @kernel
-def see(scene: Scene, T: Floats, lens: Triple, distance: Floats, things: Integers, shapes: Integers) -> None:
-    """Fill distance (FAR in the sky), thing and shape of every pixel. `lens`: focal length and centre in pixels.
+def see(scene: Scene, T: Floats, rays: Floats, distance: Floats, things: Integers, shapes: Integers) -> None:
+    """Fill distance (FAR in the sky), thing and shape of every pixel; see `pixel_ray` for `rays`.
 
     Every second pixel of every second row is cast into the whole scene. Where the four of them around a pixel agree,
     only their shape is intersected: objects thinner than two pixels may be lost there.
@@ -56,7 +56,7 @@ def see(scene: Scene, T: Floats, lens: Triple, distance: Floats, things: Integer
                 right = left if right >= width else right
                 if (u == left and v == above) != coarse:
                     continue
-                dx, dy, dz, _ = pixel_ray(T, lens, u, v)
+                dx, dy, dz, _ = pixel_ray(T, rays, u, v)
                 if not coarse:
                     thing, shape, far = things[above, left], shapes[above, left], distance[above, left] >= FAR
                     agree = True

@@ -1,6 +1,7 @@
 """A simulated drive in other layouts than KITTI raw: a CSV log, a ROS 1 bag, a ROS 2 bag (MCAP).
 
-Stamps, points, pixels and calibration are those of the KITTI raw drive to the bit, and so is the map.
+Stamps, points, pixels and calibration are those of the KITTI raw drive to the bit, and so is the map. The drive of a
+rig with several sensors is written as a CSV log, and a bag from that.
 """
 
 from __future__ import annotations
@@ -14,24 +15,34 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from gnss_sem_map.datasets import kitti_raw
+from gnss_sem_map.datasets import csv_log, kitti_raw
 from gnss_sem_map.datasets.ros.rig import NAME as RIG
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.sensor_log import Scan, SensorLog, file_of
+from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
+from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.simulation.bags import BagWriter
+from gnss_sem_map.simulation.drive import Simulation
+from gnss_sem_map.simulation.kitti_360_drive import write_kitti_360
+from gnss_sem_map.simulation.table_drive import made_aside, write_table
 
 Array = NDArray[np.float64]
-Layout = Literal["kitti-raw", "table", "rosbag1", "mcap"]
+Progress = Callable[[int, int], None]
+Event = tuple[int, Callable[[int], None]]
+"""Unix ns, and what writes the message of that moment."""
+Layout = Literal["kitti-raw", "table", "rosbag1", "mcap", "kitti-360"]
 TRUTH: Final = "truth"
 LAT, LON, ALT = kitti_raw.LAT, kitti_raw.LON, kitti_raw.ALT
+FORCE, RATE = kitti_raw.SPECIFIC_FORCE, kitti_raw.ANGULAR_RATE
+IMAGE, INFO = "/camera/image_rect_color/compressed", "/camera/camera_info"
 
 
 def write_in_layout(
     out: Path,
     layout: Layout,
     simulate: Callable[[Path], Path],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """A drive in a layout, in `out`; `simulate` writes it in KITTI raw into a folder, and returns the drive's own."""
     if layout == "kitti-raw":
@@ -41,9 +52,7 @@ def write_in_layout(
         return rewrite(simulate(Path(folder)), out, layout, progress)
 
 
-def rewrite(
-    drive: Path, out: Path, layout: Layout, progress: Callable[[int, int], None] | None = None
-) -> Path:
+def rewrite(drive: Path, out: Path, layout: Layout, progress: Progress | None = None) -> Path:
     """Write a KITTI raw drive of the simulator in another layout, with its truth; returns its folder in `out`.
 
     Raises DataError when it is already there.
@@ -64,7 +73,7 @@ def rewrite(
     return target
 
 
-def _write_table(drive: Path, log: SensorLog, out: Path, progress: Callable[[int, int], None] | None) -> None:
+def _write_table(drive: Path, log: SensorLog, out: Path, progress: Progress | None) -> None:
     assert log.imu is not None
     (out / "lidar").mkdir(parents=True)
     (out / "images").mkdir()
@@ -106,9 +115,7 @@ def _about_table(drive: Path, log: SensorLog) -> dict[str, Any]:
     }
 
 
-def _write_bag(
-    drive: Path, log: SensorLog, out: Path, layout: Layout, progress: Callable[[int, int], None] | None
-) -> None:
+def _write_bag(drive: Path, log: SensorLog, out: Path, layout: Layout, progress: Progress | None) -> None:
     """Messages in the order of their stamps, as a recorder writes them."""
     with BagWriter(out, is_ros1=layout == "rosbag1") as bag:
         calibration = log.calibration
@@ -119,19 +126,18 @@ def _write_bag(
         start_ns = int(min(imu_ns[0], fix_ns[0]))
         bag.write_transforms(start_ns, [("camera", "lidar", T_camera_lidar), ("lidar", "imu", T_lidar_imu)])
         attitudes = kitti_raw.quaternions(imu)
-        events: list[tuple[int, Callable[[int], None]]] = []
+        events: list[Event] = []
         for k, ns in enumerate(imu_ns.tolist()):
-            events.append((ns, _later(bag.write_imu, imu[k], attitudes[k])))
+            events.append((ns, _later(bag.write_imu, imu[k, FORCE], imu[k, RATE], attitudes[k])))
         for k, ns in enumerate(fix_ns.tolist()):
             events.append((ns, _later(bag.write_fix, fixes[k], float(accuracy[k]))))
         for scan in log.scans:
             events.append((_ns(log, scan.stamp), _later(_write_cloud, bag, scan)))
         for image in log.images:
-            events.append((_ns(log, image.stamp), _later(bag.write_image, _file(image), K, size)))
-        for written, (ns, write) in enumerate(sorted(events, key=lambda event: event[0]), 1):
-            write(ns)
-            if progress is not None:
-                progress(written, len(events))
+            ns = _ns(log, image.stamp)
+            events.append((ns, _later(bag.write_image, _file(image), IMAGE, "camera")))
+            events.append((ns, _later(bag.write_info, INFO, "camera", K, size)))
+        _write_in_order(events, progress)
     rig = {
         "imu": {
             "topic": "/imu", "noise": None if log.imu_noise is None else log.imu_noise.model_dump(), "attitude": True,
@@ -140,7 +146,7 @@ def _write_bag(
         "lidars": {"lidar": {"topic": "/points"}},
         "cameras": {
             "camera": {
-                "topic": "/camera/image_rect_color/compressed", "info": "/camera/camera_info",
+                "topic": IMAGE, "info": INFO,
                 "time_offset_s": calibration.camera().time_offset_s,
             }
         },
@@ -148,8 +154,119 @@ def _write_bag(
     (out / RIG).write_text(json.dumps(rig, indent=1) + "\n")
 
 
+def _write_in_order(events: list[Event], progress: Progress | None) -> None:
+    for written, (ns, write) in enumerate(sorted(events, key=lambda event: event[0]), 1):
+        write(ns)
+        if progress is not None:
+            progress(written, len(events))
+
+
 def _write_cloud(ns: int, bag: BagWriter, scan: Scan) -> None:
     bag.write_cloud(ns, _cloud(scan))  # read when it is its turn
+
+
+def write_rig(
+    simulation: Simulation,
+    out: Path,
+    layout: Layout,
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> Path:
+    """Write the drive of a rig with its truth into a folder of `out`, see `write_table`; returns the folder."""
+    if layout == "kitti-raw":
+        raise DataError("KITTI raw has one LiDAR and one camera; choose the layout table, rosbag1 or mcap")
+    if layout == "kitti-360":
+        return write_kitti_360(simulation, out, progress, workers)
+    if layout == "table":
+        return write_table(simulation, out, progress, workers)
+    target = out / simulation.name
+    with made_aside(out, target) as partial:
+        drive = write_table(simulation, partial.parent / "table", progress, workers)
+        _write_rig_bag(csv_log.read(drive), partial, is_ros1=layout == "rosbag1")
+        shutil.move(drive / TRUTH, partial / TRUTH)
+    return target
+
+
+def _write_rig_bag(log: SensorLog, out: Path, is_ros1: bool) -> None:
+    """Topics /NAME/points, /NAME/image_raw/compressed and /NAME/camera_info; frames of cameras are NAME_optical."""
+    assert log.imu is not None
+    assert log.gnss is not None
+    assert log.frame is not None
+    assert log.initial_attitude is not None
+    out.rmdir()  # the writer of a bag makes it
+    cameras = log.calibration.cameras
+    with BagWriter(out, is_ros1) as bag:
+        T_imu_camera = {
+            camera.name: log.calibration.T_imu_lidar @ np.linalg.inv(camera.T_camera_lidar)
+            for camera in cameras
+        }
+        edges = [("imu", _name(of), of.calibration.T_imu_lidar) for of in log.by_lidar]
+        edges += [("imu", f"{name}_optical", T) for name, T in T_imu_camera.items()]
+        bag.write_transforms(_ns(log, float(log.imu.stamps[0])), edges)
+        first = Rotation.from_matrix(log.initial_attitude.R_map_imu).as_quat()
+        events: list[Event] = []
+        for k, stamp in enumerate(log.imu.stamps.tolist()):
+            force, rate = log.imu.specific_force[k], log.imu.angular_rate[k]
+            events.append((_ns(log, stamp), _later(bag.write_imu, force, rate, None if k else first)))
+        places = np.column_stack(log.frame.to_geodetic(log.gnss.positions))
+        for k, stamp in enumerate(log.gnss.stamps.tolist()):
+            accuracy = float(log.gnss.stddevs[k, 0])
+            events.append((_ns(log, stamp), _later(bag.write_fix, places[k], accuracy)))
+        for of in log.by_lidar:
+            for scan in of.scans:
+                events.append((_ns(log, scan.stamp), _later(_write_file, bag, scan, _name(of))))
+        for camera in cameras:
+            for image in log.images_of(camera.name):
+                events += _image_events(log, image, camera, bag)
+        _write_in_order(events, None)
+    (out / RIG).write_text(json.dumps(_about_rig(log), indent=1) + "\n")
+
+
+def _write_file(ns: int, bag: BagWriter, scan: Scan, lidar: str) -> None:
+    rows = np.fromfile(_file(scan), "<f4").reshape(-1, 5)
+    bag.write_cloud(ns, rows, f"/{lidar}/points", lidar)
+
+
+def _image_events(log: SensorLog, image: Image, camera: Camera, bag: BagWriter) -> list[Event]:
+    ns, name = _ns(log, image.stamp), camera.name
+    events = [(ns, _later(bag.write_image, _file(image), _image_topic(name), f"{name}_optical"))]
+    if not _has_no_info(camera):
+        given = (f"/{name}/camera_info", f"{name}_optical", camera.K, camera.image_size, camera.distortion)
+        events.append((ns, _later(bag.write_info, *given)))
+    return events
+
+
+def _name(of: SensorLog) -> str:
+    return of.lidar or "lidar"
+
+
+def _image_topic(camera: str) -> str:
+    return f"/{camera}/image_raw/compressed"
+
+
+def _has_no_info(camera: Camera) -> bool:
+    return camera.distortion is not None and camera.distortion.model == "mei"
+
+
+def _about_rig(log: SensorLog) -> dict[str, Any]:
+    """What the bag does not say: the noise of the IMU, delays of the cameras, and lenses that ROS does not know."""
+    cameras: dict[str, dict[str, Any]] = {}
+    for camera in log.calibration.cameras:
+        about: dict[str, Any] = {"topic": _image_topic(camera.name), "time_offset_s": camera.time_offset_s}
+        if _has_no_info(camera):
+            assert camera.distortion is not None
+            about |= {"K": camera.K.tolist(), "image_size": camera.image_size}
+            about |= {"distortion": camera.distortion.model_dump()}
+        else:
+            about |= {"info": f"/{camera.name}/camera_info"}
+        cameras[camera.name] = about
+    noise = None if log.imu_noise is None else log.imu_noise.model_dump()
+    return {
+        "imu": {"topic": "/imu", "noise": noise, "attitude": True},
+        "gnss": {"topic": "/fix"},
+        "lidars": {_name(of): {"topic": f"/{_name(of)}/points"} for of in log.by_lidar},
+        "cameras": cameras,
+    }
 
 
 def _later(write: Callable[..., None], *values: Any) -> Callable[[int], None]:

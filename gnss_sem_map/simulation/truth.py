@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.simulation import Motion
 from gnss_sem_map.simulation.camera import SimulatedImage
 from gnss_sem_map.simulation.compiled import Floats
+from gnss_sem_map.simulation.kitti_rig import T_LIDAR_IMU
 from gnss_sem_map.simulation.models import Model
-from gnss_sem_map.simulation.rig import T_LIDAR_IMU
 from gnss_sem_map.simulation.sessions import Change
 from gnss_sem_map.simulation.tracklets import Box, Tracklet
 from gnss_sem_map.simulation.world import World

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PRELOAD = [
-    "gnss_sem_map.cli",
+    "gnss_sem_map.cli.commands",
     "gnss_sem_map.pipeline",
     "gnss_sem_map.runs.run_folder",
     "gnss_sem_map.datasets.kitti_raw",

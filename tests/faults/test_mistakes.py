@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from faults import mistakes_inertial, mistakes_sweeps
+from faults import mistakes_camera, mistakes_inertial, mistakes_lidar
 from faults.layouts import as_odometry, as_table_log, copy_of
 from faults.mistakes import Mistake
 
@@ -26,8 +26,9 @@ from gnss_sem_map.simulation import simulate, write_corrupted_labels
 
 MISTAKES: list[Mistake] = [
     *mistakes_inertial.MISTAKES,
-    *mistakes_sweeps.MISTAKES,
-    *mistakes_sweeps.LABEL_MISTAKES,
+    *mistakes_lidar.MISTAKES,
+    *mistakes_camera.MISTAKES,
+    *mistakes_camera.LABEL_MISTAKES,
 ]
 SPOILED_SEED, SECONDS = 0, 12.0
 WITH_BENDS_S, FRAMES = 30.0, range(120)

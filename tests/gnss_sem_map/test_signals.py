@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -58,3 +60,19 @@ def test_a_signal_is_never_lost_and_never_leaves_a_lock_behind(place: str, print
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert ended.stdout.split() == printed.split()
     assert ended.stderr == ""
+
+
+def test_an_import_is_finished_first(tmp_path: Path) -> None:
+    """Compiled modules crash when an exception leaves their import."""
+    (tmp_path / "halfway.py").write_text(
+        "import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nnumbers = [n for n in range(100_000)]\n"
+    )
+    program = (
+        "import sys, time\nfrom gnss_sem_map.cli.signals import Stopped, stop_on_signals\nstop_on_signals()\n"
+        "try:\n    import halfway\n    time.sleep(20.0)\n"
+        "except Stopped as stopped:\n    print(stopped.number, len(sys.modules['halfway'].numbers))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == [str(int(signal.SIGTERM)), "100000"]

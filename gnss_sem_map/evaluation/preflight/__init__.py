@@ -11,7 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 from gnss_sem_map.config import Settings
-from gnss_sem_map.evaluation.preflight import camera, inertial, positions, sweeps, wheels
+from gnss_sem_map.evaluation.preflight import camera, inertial, lidar_pair, positions, sweeps, wheels
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.segmentation import Segmenter
@@ -27,7 +27,7 @@ def check(
     """
     start = time.perf_counter()
     sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
-    groups = (inertial, positions, wheels, sweeps, *((camera,) if with_camera else ()))
+    groups = (inertial, positions, wheels, sweeps, lidar_pair, *((camera,) if with_camera else ()))
     _ = sample.trajectory  # most checks need it: known before they run side by side
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(lambda group: tuple(group.check(sample)), groups))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gnss_sem_map.dynamics.clusters import find_segments, split_segments
+from gnss_sem_map.dynamics.clusters import VOXEL_M, find_segments, split_segments
 
 
 def side(x, y, length, height=1.5, step=0.1):
@@ -48,8 +48,9 @@ def test_what_is_asked_of_a_segment_is_what_its_points_say():
         assert whole.points[number] == len(points)
         assert whole.labelled[number] == np.count_nonzero(points[:, 0] > 2.0)
         np.testing.assert_allclose(whole.sums[number], points.sum(axis=0))
-        np.testing.assert_array_equal(whole.lowest[number], points[:, :2].min(axis=0).astype(np.float32))
-        np.testing.assert_array_equal(whole.highest[number], points[:, :2].max(axis=0).astype(np.float32))
+        outline = segments.outlines()[number]
+        np.testing.assert_allclose(outline.min(axis=0), points[:, :2].min(axis=0), atol=VOXEL_M)
+        np.testing.assert_allclose(outline.max(axis=0), points[:, :2].max(axis=0), atol=VOXEL_M)
 
 
 def test_of_a_wall_that_the_image_half_calls_a_vehicle_the_named_points_are_a_cut_segment():
@@ -76,6 +77,6 @@ def test_one_object_stays_whole_whatever_is_said_of_its_parts():
     car, far = side(0.0, 5.0, 4.5), side(0.0, 5.0, 4.5, step=0.3)
     for p_map in (car, far):
         segments, voxel = segments_of(p_map, np.ones(len(p_map), bool))
-        east = segments.parts.highest[:, 0] > 2.2
+        east = segments.parts.sums[:, 0] > 2.2 * segments.parts.points
         apart = split_segments(segments, np.full(len(east), 20), np.where(east, 30, 0), 0.7, 0.25)
         np.testing.assert_array_equal(apart.of_points(voxel), 0)

@@ -1,16 +1,16 @@
-"""Tracks, their displacement, and the motion states that follow from hits and misses."""
+"""Tracks, and the motion states that follow from hits and misses."""
 
 import numpy as np
-import pytest
 
 from gnss_sem_map.dynamics.motion_state import MotionSettings, classify_motion
-from gnss_sem_map.dynamics.tracking import Segment, displacement_of, track
+from gnss_sem_map.dynamics.tracking import Segment, track
 from gnss_sem_map.refinement.vehicles import Motion
 
 
 def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, truncated=False):
     centre, half = np.array([x, y]), np.array([length / 2, 0.9])
-    return Segment(scan, scan * 0.1, centre, centre - half, centre + half, points, shown, truncated)
+    corners = centre + half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
+    return Segment(scan, scan * 0.1, centre, points, shown, truncated, corners, np.array([-20.0, 0.0]))
 
 
 def test_two_cars_that_pass_each_other_keep_their_tracks():
@@ -48,29 +48,6 @@ def test_oncoming_traffic_keeps_its_tracks_at_any_speed():
     tracks = track(segments, 1.5, np.ones(30, bool))
     assert [t.segments for t in tracks] == [list(range(k, 30, 3)) for k in range(3)]
     np.testing.assert_allclose(tracks[2].velocity, [-33.0, 0.0], atol=0.5)
-
-
-def test_a_mover_is_displaced_by_the_way_of_both_its_ends():
-    moved = displacement_of([segment(scan, scan * 0.5) for scan in range(20)])
-    assert moved.shift_m == pytest.approx(9.5, abs=1.1)
-    assert moved.speed_m_s == pytest.approx(5.0, rel=0.05)
-
-
-def test_a_parked_car_that_comes_into_view_from_one_end_is_not_displaced():
-    growing = [segment(scan, 2.0 - n / 2, length=n) for scan, n in enumerate(np.linspace(0.5, 4.0, 20))]
-    assert displacement_of(growing).shift_m < 0.1
-
-
-def test_a_car_that_goes_and_then_waits_for_long_is_displaced_all_the_same():
-    places = [*np.linspace(0, 6, 12), *[6.0] * 60]
-    moved = displacement_of([segment(scan, x) for scan, x in enumerate(places)])
-    assert moved.shift_m == pytest.approx(6.0, abs=0.6)
-    assert moved.speed_m_s > 4
-
-
-def test_what_the_edge_of_the_view_cuts_says_nothing_of_motion():
-    assert displacement_of([segment(scan, scan, truncated=True) for scan in range(20)]) is None
-    assert displacement_of([segment(scan, scan) for scan in range(3)]) is None
 
 
 def motion_states(segments, hits, misses):

@@ -6,9 +6,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.report import write_report
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 
 RUN: dict[str, Any] = {
     "name": "drive 5",
@@ -61,6 +65,7 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
+        self.verdict = ""
         self.open: list[str] = []
         self.tags: set[str] = set()
         self.headings: list[str] = []
@@ -88,6 +93,8 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if "h2" in self.open:
             self.headings.append(data)
+        elif "li" in self.open or "strong" in self.open:
+            self.verdict += f"{data}\n"
         elif "tr" in self.open and self.open[-1] != "tr":
             self.rows[-1].append(data)
 
@@ -124,13 +131,52 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
     assert "49.011213°, 8.422885°, 112.8 m" in text
     assert "and 2 more" in text
     assert '<p class="warning">the fixes are better than they say</p>' in text
+    assert "1 remark below must be read" in page.verdict
+    assert "0.12 m root mean square error" in page.verdict
+    assert "90.0 % of the labelled points are right" in page.verdict
+    assert "3 parts of the recording could not be used: 114 files missing" in page.verdict
+
+
+def test_what_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
+    verdict = report(tmp_path, {"name": "x"}, {}).verdict
+    for missing in ("driven length", "mapped area", "accuracy of the positions", "accuracy of the classes"):
+        assert f"{missing} is not known" in verdict
+    assert "no known coordinates" in verdict
+
+
+def test_length_and_uncertainty_are_those_of_the_trajectory_while_it_had_scans(tmp_path: Path) -> None:
+    stamps = np.arange(0.0, 20.0, 0.1)
+    T = np.tile(np.eye(4), (len(stamps), 1, 1))
+    T[:, 0, 3] = 2.0 * stamps
+    covariances = np.tile(np.diag([1e-4] * 3 + [0.04, 0.01, 0.09]), (len(stamps), 1, 1))
+    Trajectory(stamps, T, covariances=covariances).save(tmp_path / "trajectory.parquet")
+    page = report(tmp_path, {"name": "x", "scans_s": [0.0, 10.0]}, {})
+    assert "20 m driven" in page.verdict
+    # the larger axis of the plane, sqrt(chi2 0.95 of 2 degrees of freedom) * 0.2 m; and 1.96 * 0.3 m
+    assert "within 0.49 m in the plane and 0.59 m in height at the median place" in page.verdict
+    assert "not checked against independent survey points" in page.verdict
+    assert page.headings == ["Trajectory", "Files"]
+
+
+def test_the_report_shows_the_map_of_its_folder(street: SemanticMap, tmp_path: Path) -> None:
+    tiles.write(street, tmp_path / "refined", None)
+    page = report(tmp_path, {"name": "x"}, {})
+    assert len(page.images) == 2  # coverage, and classes after refinement
+    assert "m² of ground plan are mapped" in page.verdict
+    assert page.headings == ["Classes and confidence", "Files"]
 
 
 def test_a_section_without_data_does_not_appear(tmp_path: Path) -> None:
     assert report(tmp_path, {"name": "x"}, {}).headings == []
     assert report(tmp_path, {"name": "x", "counts": {"scans": 1}}, {}).headings == ["What went in"]
-    everything = ["What went in", "What was left out", "Map", "Refinement", "Moving vehicles", "Confidence"]
-    everything += ["Trajectory", "Time and memory", "Versions"]
+    everything = [
+        "Classes and confidence",
+        "Moving vehicles",
+        "Trajectory",
+        "What went in",
+        "What was left out",
+    ]
+    everything += ["Refinement", "Time and memory", "Versions"]
     assert report(tmp_path, RUN, METRICS).headings == everything
 
 
@@ -151,7 +197,7 @@ def test_pictures_that_exist_are_embedded_whole_and_files_that_exist_are_linked(
 
 
 @pytest.mark.parametrize(
-    "evil", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "$title & ${body}"]
+    "evil", ["<script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "{{ title }} & {% endblock %}"]
 )
 def test_nothing_that_the_run_says_becomes_markup(evil: str, tmp_path: Path) -> None:
     run = {

@@ -221,7 +221,7 @@ def test_labels_of_points_are_in_the_folder_of_their_lidar(
     """Run, refine again, and evaluate."""
     from typer.testing import CliRunner
 
-    from gnss_sem_map.cli.app import app
+    from gnss_sem_map.cli import app
 
     out, truth = tmp_path / "out", tmp_path / "truth"
     spec = f"labels:{small_drive.labels}"

@@ -153,3 +153,21 @@ def test_lenses_of_other_shapes_are_refused() -> None:
         Camera(np.eye(4), K, (2, 2), name="../up")
     with pytest.raises(DataError, match="of camera left: T_camera_lidar is no rigid transform"):
         Camera(2 * np.eye(4), K, (2, 2), name="left")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        *(Distortion(model="brown", coefficients=k) for k in BROWN.values()),
+        *(Distortion(model="fisheye", coefficients=k) for k in FISHEYE.values()),
+        Distortion(model="mei", coefficients=(0.017, 1.65, 4e-4, 4e-4), xi=2.21),
+    ],
+)
+def test_a_pixel_is_straightened_to_the_ray_that_is_bent_to_it(lens: Distortion) -> None:
+    """Up to a degree before the lens turns back."""
+    widest = np.degrees(np.arccos(lens.least_cosine)) - 1.0
+    points = np.vstack([around(7, widest), [[0.0, 0.0, 2.0]]])
+    rays = points.T / np.linalg.norm(points, axis=1)
+    found = np.array(lens.straightened(*lens.bent(rays)))
+    np.testing.assert_allclose(found, rays, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(np.array(lens.straightened(*found[:2] * 50.0)), axis=0), 1.0)

@@ -15,7 +15,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation import Simulation, simulate
-from gnss_sem_map.simulation.rig import T_LIDAR_IMU, camera_in_lidar
+from gnss_sem_map.simulation.kitti_rig import T_LIDAR_IMU, camera_in_lidar
 
 FRAMES = 12
 

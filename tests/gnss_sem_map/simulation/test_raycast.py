@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from gnss_sem_map.simulation import Simulation, World, build_town
 from gnss_sem_map.simulation.ground import FAR, Ground, height_gradient, hit_ground
+from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR
 from gnss_sem_map.simulation.raycast import GROUND, KERB, cast_ray, hit_thing
-from gnss_sem_map.simulation.rig import T_IMU_LIDAR
 from gnss_sem_map.simulation.shapes import Form, hit_shape
 from gnss_sem_map.simulation.surfaces import Kind, Surface
 

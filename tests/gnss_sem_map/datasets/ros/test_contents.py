@@ -11,7 +11,7 @@ import ros
 from ros import START_NS, sweep
 from typer.testing import CliRunner
 
-from gnss_sem_map.cli.app import app
+from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.contents import Topic, contents_of, suggested_rig

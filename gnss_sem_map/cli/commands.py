@@ -6,12 +6,22 @@ import io
 import os
 import sys
 import warnings
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gnss_sem_map.cli import evaluation, finished, inspection, mapping, segmentation, settings, simulation
-from gnss_sem_map.cli.signals import Stopped, ignore_signals, stop_on_signals
+from gnss_sem_map.cli import (
+    evaluation,
+    finished,
+    inspection,
+    logs,
+    mapping,
+    segmentation,
+    settings,
+    simulation,
+)
+from gnss_sem_map.cli.signals import Stopped, ignore_signals
 from gnss_sem_map.memory import collect_seldom, share_one_heap
 
 COMMANDS = (
@@ -58,8 +68,22 @@ def _all_commands(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("-v", "--verbose", help="A line on stderr when a stage begins and ends; no bars.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("-q", "--quiet", help="Neither progress nor warnings on the terminal.")
+    ] = False,
+    log_file: Annotated[
+        Path | None,
+        typer.Option(help="File to which stages, warnings and the error are appended; not in the folder -o."),
+    ] = None,
 ) -> None:
-    pass
+    if verbose and quiet:
+        raise typer.BadParameter("--verbose and --quiet exclude each other", param_hint="-v, -q")
+    logs.set_up(
+        logs.Terminal.VERBOSE if verbose else logs.Terminal.QUIET if quiet else logs.Terminal.NORMAL, log_file
+    )
 
 
 for _command in COMMANDS:
@@ -69,7 +93,7 @@ for _command in COMMANDS:
 def main() -> None:
     """Entry point: one line on stderr for every error; exit code 2 for wrong usage, 1 for any other error.
 
-    A signal ends it with one line too, and with 128 plus its number.
+    A signal ends it with one line too, and with 128 plus its number; they are caught from `cli.main` on.
     """
     from factor_graphs.errors import FactorGraphError
     from gnss_sem_map.errors import SemMapError
@@ -82,7 +106,6 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
-        stop_on_signals()
         code = app(prog_name="gnss-sem-map", standalone_mode=False)
         sys.stdout.flush()
     except Stopped as stopped:
@@ -100,13 +123,16 @@ def main() -> None:
         _close_stdout()
     except (UnicodeError, RecursionError) as error:
         code = _say(f"{type(error).__name__} {error}", 1)
+    logs.PROGRAM.info("exit code %s", code or 0)
     sys.exit(code)
 
 
 def _say(message: str, code: int) -> int:
     """One line on stderr; returns the exit code."""
     ignore_signals()  # the program is ending already
-    typer.echo(f"gnss-sem-map: {' '.join(message.split())}", err=True)
+    line = " ".join(message.split())
+    logs.PROGRAM.error("%s", line)
+    typer.echo(f"gnss-sem-map: {line}", err=True)
     return code
 
 

@@ -1,4 +1,4 @@
-"""Mounting of the sensors on the vehicle, and their calibration files."""
+"""Mounting of KITTI's sensors on the vehicle, and their calibration files."""
 
 from pathlib import Path
 from typing import Final
@@ -12,21 +12,20 @@ from gnss_sem_map.simulation.compiled import Floats
 _CALIB_TIME: Final = "01-Jan-2026 12:00:00"
 
 
-def _transform(R: Floats, t: tuple[float, float, float]) -> Floats:
+def transform(R: Floats, t: tuple[float, float, float]) -> Floats:
+    """A rotation and a translation as (4, 4)."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
 
 
 # The LiDAR sits ahead of the imu and above it, the cameras below the LiDAR; nothing is mounted quite straight.
-_FORWARD: Final = np.array(
-    [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
-)  # x right, y down, z forward
-T_LIDAR_IMU: Final[Floats] = _transform(
+FORWARD: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x right, y down, z forward
+T_LIDAR_IMU: Final[Floats] = transform(
     Rotation.from_euler("ZYX", [0.05, -0.12, 0.85], degrees=True).as_matrix(), (-0.81, 0.32, -0.80)
 )
-_T_CAMERA0_LIDAR: Final[Floats] = _transform(
-    _FORWARD @ Rotation.from_euler("ZYX", [-0.43, 0.85, 0.04], degrees=True).as_matrix(),
+_T_CAMERA0_LIDAR: Final[Floats] = transform(
+    FORWARD @ Rotation.from_euler("ZYX", [-0.43, 0.85, 0.04], degrees=True).as_matrix(),
     (-0.004, -0.076, -0.272),
 )
 _R_RECT: Final[Floats] = Rotation.from_euler("ZYX", [-0.56, -0.43, 0.25], degrees=True).as_matrix()
@@ -36,16 +35,14 @@ T_IMU_LIDAR: Final[Floats] = np.asarray(np.linalg.inv(T_LIDAR_IMU))
 
 
 def _projection(camera: Camera, number: int) -> Floats:
-    f, u, v = camera.focal_px, camera.centre_u_px, camera.centre_v_px
-    K = np.array([[f, 0.0, u], [0.0, f, v], [0.0, 0.0, 1.0]])
-    return np.column_stack([K, _P_SHIFTS[number]])
+    return np.column_stack([camera.K, _P_SHIFTS[number]])
 
 
 def camera_in_lidar(camera: Camera) -> Floats:
     """T_camera_lidar of the rectified left colour camera: rectification, then the shift in its projection matrix."""
     P = _projection(camera, 2)
-    shift = _transform(np.eye(3), tuple(np.linalg.solve(P[:, :3], P[:, 3])))
-    return np.asarray(shift @ _transform(_R_RECT, (0.0, 0.0, 0.0)) @ _T_CAMERA0_LIDAR)
+    shift = transform(np.eye(3), tuple(np.linalg.solve(P[:, :3], P[:, 3])))
+    return np.asarray(shift @ transform(_R_RECT, (0.0, 0.0, 0.0)) @ _T_CAMERA0_LIDAR)
 
 
 def camera_in_imu(camera: Camera) -> Floats:

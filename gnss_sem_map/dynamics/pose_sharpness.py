@@ -1,0 +1,31 @@
+"""How sharp poses are, as the scans tell: whether what stands is seen through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+OFTEN_HIT = 20
+"""What so many scans hit stands, or half of the scans of a shorter drive."""
+STANDING_SHARE = 0.9
+"""Share of what is often hit that stands for certain: the rest may move, or be leaves."""
+LARGEST_MISS_SHARE = 0.03
+"""With sharp poses, what stands is seen through in a smaller share of the scans."""
+
+
+def are_sharp(counts: Sequence[NDArray[np.int32]]) -> bool:
+    """Whether poses blur what stands so little that what scans see through is free.
+
+    `counts` are hits and misses (2, v) of the voxels of each scan. The share of misses of nine voxels of ten that are
+    often hit is at most 0.014 with poses from LiDAR odometry (three simulated drives, KITTI 0005), 0.06 with the poses
+    of the unit of KITTI 0005, and 0.25 with GNSS and IMU alone. A drive in which nothing is often hit tells nothing:
+    its poses are not taken to be sharp.
+    """
+    hits, misses = np.concatenate(counts, axis=1)
+    stands = hits >= min(OFTEN_HIT, max(len(counts) // 2, 1))
+    if not stands.any():
+        return False
+    share = misses[stands] / (hits + misses)[stands]
+    return bool(np.quantile(share, STANDING_SHARE) < LARGEST_MISS_SHARE)

@@ -1,0 +1,211 @@
+"""Check of several LiDARs against each other: what one sees lies on the surfaces that the first one sees.
+
+At a few moments of the drive, sweeps of the first LiDAR from two seconds before to two seconds after, placed by the
+trajectory, are the surfaces. A sweep of another LiDAR is matched with them, point to plane, at all moments at once: the
+one motion in the imu frame that brings its points onto the surfaces is the error of its pose relative to the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.errors import MeasurementError
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, points_in_map
+from gnss_sem_map.scans.downsampling import one_per_cube
+from gnss_sem_map.scans.registration import exp, inverse
+from gnss_sem_map.sensor_log import Scan, SensorLog
+
+Array = NDArray[np.float64]
+
+AROUND_S = (-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0)
+"""So long before and after a moment the first LiDAR is looked at: it has then seen what the other one sees."""
+AT_MOST_S = 0.3
+"""Farther from where it was wanted, no sweep is taken."""
+NEAREST_M, FARTHEST_M = 2.5, 40.0
+EDGE_M, NEIGHBOURS = 0.3, 8
+"""One point per cube of this edge counts, the mean, with the plane of so many neighbours."""
+LEAST_POINTS = 150
+STEPS_M = (3.0, 2.0, 1.0, 0.5, 0.3, 0.2, 0.2)
+"""How far a point may lie from its surface, step by step."""
+NEAR_M = 1.0
+"""Of points within this distance of a surface, the median distance is told."""
+SOFT_M = 0.05
+"""Residuals beyond this count less (Huber)."""
+LEAST_SHARE = 0.35
+"""A match is believed when so many of the points lie within the last step of a surface."""
+POINTS_PER_SURFACE = 100
+"""Points of one surface err together: so many count as one."""
+SIGMAS = 4.0
+SAME_RAD, SAME_M = np.radians(0.3), 0.06
+"""Differences that are no reason to warn."""
+WRONG_RAD, WRONG_M = np.radians(1.0), 0.15
+"""Larger ones double every wall."""
+TURNS_DEG = ((0, 0, 90), (0, 0, -90), (0, 0, 180), (180, 0, 0), (0, 180, 0))
+"""Mistakes of axes that are tried where nothing fits."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """Surfaces by the first LiDAR, and points of the other one, both in the imu frame of one moment."""
+
+    p_surface: Array
+    """(n, 3) m"""
+    normals: Array
+    """(n, 3); zero where there is no plane."""
+    tree: small_gicp.KdTree
+    p: Array
+    """(m, 3) m"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Where points lie best: T (4, 4) in the imu frame, and how well."""
+
+    T: Array
+    stddevs: Array
+    """(6,) rad and m."""
+    share: float
+    """Of the points that lie within the last step of a surface."""
+
+    @property
+    def turn(self) -> Array:
+        """(3,) rad"""
+        return np.asarray(Rotation.from_matrix(self.T[:3, :3]).as_rotvec())
+
+
+def check(sample: Sample) -> Iterator[Finding]:
+    """Every LiDAR but the first."""
+    first, *others = sample.log.by_lidar
+    for other in others:
+        yield _check(sample, first, other)
+
+
+def _check(sample: Sample, first: SensorLog, other: SensorLog) -> Finding:
+    name, trajectory = f"{other.lidar} against {first.lidar}", sample.trajectory
+    if trajectory is None:
+        return green(name, "not observable: no trajectory of the sample")
+    moments = []
+    for scan in sample.moving_scans[0][::2]:
+        found = _moment(first, other, scan.stamp, trajectory)
+        moments += [found] if found is not None else []
+    if not moments:
+        return green(name, "not observable: no moment at which both have points")
+    best = _match(moments, np.eye(4))
+    apart, fitted = _distance(moments, np.eye(4)), _distance(moments, best.T)
+    if best.share < LEAST_SHARE or fitted > SOFT_M:
+        T = other.calibration.T_imu_lidar
+        tried = (_match(moments, start @ inverse(T)) for start in _starts(T))
+        best = min((best, *tried), key=lambda fit: (fit.share < LEAST_SHARE, _distance(moments, fit.T)))
+        fitted = _distance(moments, best.T)
+    return _finding(name, other.lidar, first.lidar, best, apart, fitted, len(moments))
+
+
+def _starts(T: Array) -> Iterator[Array]:
+    """Poses that a LiDAR may have whose pose is given as T: that of the inverse, and with other axes."""
+    yield inverse(T)
+    for degrees in TURNS_DEG:
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
+        yield T @ turn
+
+
+def _finding(
+    name: str, other: str, first: str, best: _Fit, apart: float, fitted: float, moments: int
+) -> Finding:
+    lies = f"surfaces of {other} lie {apart:.3f} m from those of {first} (median of {moments} moments)"
+    if best.share < LEAST_SHARE:
+        return amber(
+            name,
+            f"{lies}; {best.share:.0%} of the points find a surface, expected more than {LEAST_SHARE:.0%}",
+            f"T_imu_lidar of {other} or of {first} is far off, or the two see different places",
+            f"check T_imu_lidar of {other} and {first}",
+        )
+    turn, shift = best.turn, best.T[:3, 3]
+    size = np.concatenate([np.abs(turn), np.abs(shift)])
+    limits = np.repeat([SAME_RAD, SAME_M], 3)
+    if not ((size > limits) & (size > SIGMAS * best.stddevs)).any():
+        return green(name, lies)
+    degrees = " ".join(f"{angle:.2f}" for angle in np.degrees(turn))
+    metres = " ".join(f"{value:.2f}" for value in shift)
+    is_wrong = ((size > np.repeat([WRONG_RAD, WRONG_M], 3)) & (size > SIGMAS * best.stddevs)).any()
+    level = red if is_wrong and fitted < 0.7 * apart else amber
+    return level(
+        name,
+        f"{lies}, and {fitted:.3f} m when turned by {degrees} deg about x, y, z of the imu and moved by {metres} m",
+        f"the two LiDARs are calibrated onto each other wrongly: T_imu_lidar of {other} or of {first}",
+        f"if {first} is right, put this rotation and shift before T_imu_lidar of {other}; else calibrate again",
+    )
+
+
+def _moment(first: SensorLog, other: SensorLog, stamp: float, trajectory: Trajectory) -> _Moment | None:
+    try:
+        T_imu_map = inverse(trajectory.at([stamp], EXTRAPOLATE_S)[0])
+        p = _points(other, _nearest(other.scans, stamp), trajectory, T_imu_map)
+        clouds = []
+        for after in AROUND_S:
+            if trajectory.start <= stamp + after <= trajectory.end:
+                clouds.append(_points(first, _nearest(first.scans, stamp + after), trajectory, T_imu_map))
+    except (DataError, MeasurementError):
+        return None  # what cannot be read is told by other checks
+    if not clouds or len(p) < LEAST_POINTS:
+        return None
+    surface = one_per_cube(np.concatenate(clouds), EDGE_M)
+    if len(surface) < LEAST_POINTS:
+        return None
+    cloud, tree = small_gicp.PointCloud(surface), small_gicp.KdTree(surface)
+    small_gicp.estimate_normals(cloud, tree, NEIGHBOURS)
+    return _Moment(surface, np.asarray(cloud.normals())[:, :3].copy(), tree, one_per_cube(p, EDGE_M))
+
+
+def _nearest(scans: tuple[Scan, ...], stamp: float) -> Scan | None:
+    scan = min(scans, key=lambda scan: abs(scan.stamp - stamp), default=None)
+    return scan if scan is not None and abs(scan.stamp - stamp) <= AT_MOST_S else None
+
+
+def _points(log: SensorLog, scan: Scan | None, trajectory: Trajectory, T_imu_map: Array) -> Array:
+    """The points of a sweep in the imu frame of the moment (n, 3); none without a sweep."""
+    if scan is None:
+        return np.empty((0, 3))
+    p_map = points_in_map(scan.read(), scan.stamp, trajectory, log.calibration.T_imu_lidar)
+    p = p_map @ T_imu_map[:3, :3].T + T_imu_map[:3, 3]
+    squares = np.einsum("ij,ij->i", p, p)
+    return np.asarray(p[(squares > NEAREST_M**2) & (squares < FARTHEST_M**2)])
+
+
+def _residuals(moment: _Moment, T: Array, within_m: float) -> tuple[Array, Array, Array]:
+    """Points (k, 3) within a distance of a surface, its normals there (k, 3), and their distances across it (k,)."""
+    moved = moment.p @ T[:3, :3].T + T[:3, 3]
+    places, squares = (np.asarray(a) for a in moment.tree.batch_nearest_neighbor_search(moved))
+    use = (squares < within_m**2) & (moment.normals[places] != 0).any(axis=1)
+    at, n = moved[use], moment.normals[places[use]]
+    return at, n, np.einsum("ij,ij->i", n, at - moment.p_surface[places[use]])
+
+
+def _distance(moments: list[_Moment], T: Array) -> float:
+    """Median distance of the points from their surfaces, m."""
+    return float(np.median(np.abs(np.concatenate([_residuals(moment, T, NEAR_M)[2] for moment in moments]))))
+
+
+def _match(moments: list[_Moment], T: Array) -> _Fit:
+    share, H, scatter = 0.0, np.eye(6), np.inf
+    for within_m in STEPS_M:
+        found = [_residuals(moment, T, within_m) for moment in moments]
+        at, n, r = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        share = len(r) / sum(len(moment.p) for moment in moments)
+        J = np.hstack([np.cross(at, n), n])
+        weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(r), 1e-9))[:, None]
+        H, scatter = J.T @ weighted, 1.48 * float(np.median(np.abs(r))) if len(r) else np.inf
+        # a little weight on where it is: what no surface holds stays
+        T = exp(-np.linalg.solve(H + np.eye(6), weighted.T @ r)) @ T
+    covariance = POINTS_PER_SURFACE * scatter**2 * np.linalg.inv(H + np.eye(6))
+    return _Fit(T, np.sqrt(np.diag(covariance)), share)

@@ -1,0 +1,112 @@
+"""The whole map on a coarse grid, for pages: where it was seen, and its classes before and after refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.voxels.tile_files import TILE_BITS
+from gnss_sem_map.voxels.tiles import TiledMap
+
+MOST_CELLS = 800
+"""Cells along the longer side of all tiles."""
+LOOKS = (1, 2, 5, 20, 100)
+"""Lower ends of the groups of voxels by LiDAR points."""
+AREA_CELL_M = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """A map from above, north up: the first row is the northernmost."""
+
+    cell_m: float
+    hits: NDArray[np.int64]
+    """(rows, columns) LiDAR points of the shown voxels."""
+    labels: NDArray[np.int8]
+    """(rows, columns) the class of most shown voxels; -1: only unlabelled ones, -2: none."""
+    area_m2: float
+    """Of the squares with a shown voxel, with edges of about `AREA_CELL_M`."""
+    confidence: dict[str, tuple[int, float]]
+    """Class: labelled voxels and their mean confidence."""
+    colours: dict[str, str]
+    """Class: its colour as CSS has it."""
+    by_looks: dict[int, tuple[int, float]]
+    """Lower end of the LiDAR points of a voxel (`LOOKS`): labelled voxels and their mean confidence."""
+
+
+def overview_of(tiled: TiledMap) -> Overview | None:
+    """Read every tile of a map once; None for a map without tiles."""
+    if not tiled.tiles:
+        return None
+    tiles = np.array(tiled.tiles)
+    low, high = tiles.min(axis=0) << TILE_BITS, (tiles.max(axis=0) + 1) << TILE_BITS
+    shift = max(0, int(np.ceil(np.log2((high - low).max() / MOST_CELLS))))
+    columns, rows = ((high - low) >> shift) + 1
+    area_shift = max(0, round(np.log2(AREA_CELL_M / tiled.voxel_size_m)))
+    names, colours = tiled.label_set.names, tiled.label_set.colours
+    votes = np.zeros((len(names) + 1, rows * columns), np.int32)
+    hits, squares = np.zeros(rows * columns), 0
+    classes, looks = np.zeros((len(names), 2)), np.zeros((len(LOOKS), 2))
+    for piece in tiled:
+        shown = piece.shown
+        places, labels = piece.voxels.indices[shown, :2].astype(np.int64), piece.labels[shown]
+        cells = (places - low) >> shift
+        flat = cells[:, 1] * columns + cells[:, 0]
+        weights = piece.voxels.hits[shown].astype(np.float64)
+        hits += np.bincount(flat, weights, len(hits))
+        for label in range(-1, len(names)):
+            votes[label + 1] += np.bincount(flat[labels == label], minlength=len(hits)).astype(np.int32)
+        x, y = (places >> area_shift).T
+        squares += len(np.unique(x << 32 | y & 0xFFFFFFFF))
+        known, sure = labels >= 0, piece.confidence[shown]
+        classes += _sums(labels[known], sure[known], len(classes))
+        groups = np.searchsorted(LOOKS, weights[known], side="right") - 1
+        looks += _sums(groups, sure[known], len(looks))
+    winners = votes[1:].argmax(axis=0)
+    labels = np.where(votes[1:].any(axis=0), winners, np.where(votes[0] > 0, -1, -2)).astype(np.int8)
+    grid = _filled(hits.reshape(rows, columns))
+    return Overview(
+        cell_m=tiled.voxel_size_m * (1 << shift),
+        hits=hits.astype(np.int64).reshape(rows, columns)[grid][::-1],
+        labels=labels.reshape(rows, columns)[grid][::-1],
+        area_m2=squares * (tiled.voxel_size_m * (1 << area_shift)) ** 2,
+        confidence=dict(zip(names, map(_mean, classes), strict=True)),
+        colours={name: "#" + bytes(rgb).hex() for name, rgb in zip(names, colours, strict=True)},
+        by_looks=dict(zip(LOOKS, map(_mean, looks), strict=True)),
+    )
+
+
+def coverage_pixels(overview: Overview) -> NDArray[np.uint8]:
+    """Pixels (rows, columns, 3) RGB: the darker, the more LiDAR points, on a logarithmic scale; white: none."""
+    depth = np.log1p(overview.hits) / max(float(np.log1p(overview.hits).max()), 1.0)
+    light, dark = np.array([214, 228, 250]), np.array([16, 42, 110])
+    pixels = light + depth[..., None] * (dark - light)
+    return np.where(overview.hits[..., None] > 0, pixels, 255).astype(np.uint8)
+
+
+def label_pixels(overview: Overview) -> NDArray[np.uint8]:
+    """Pixels (rows, columns, 3) RGB in the colours of the classes; grey: no label, white: nothing."""
+    colours = [bytes.fromhex(colour[1:]) for colour in overview.colours.values()]
+    table = np.array(
+        [*map(list, colours), [255, 255, 255], [205, 209, 217]], np.uint8
+    )  # -2 and -1 count from the end
+    return table[overview.labels]
+
+
+def _sums(groups: NDArray[np.integer], values: NDArray[np.float32], count: int) -> NDArray[np.float64]:
+    """(count, 2): values of every group, and their sum."""
+    return np.stack([np.bincount(groups, minlength=count), np.bincount(groups, values, count)], axis=1)
+
+
+def _filled(cells: NDArray[np.float64]) -> tuple[slice, slice]:
+    """The part of a grid outside which all is zero; the whole of a grid of zeros."""
+    rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return slice(None), slice(None)
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def _mean(sums: NDArray[np.float64]) -> tuple[int, float]:
+    return int(sums[0]), float(sums[1] / max(sums[0], 1))

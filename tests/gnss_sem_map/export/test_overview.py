@@ -1,0 +1,45 @@
+"""The overview of a map counts every shown voxel once and has north on top."""
+
+import numpy as np
+
+from gnss_sem_map.export.overview import coverage_pixels, label_pixels, overview_of
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tiles import in_memory
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
+
+URBAN = open_label_set()
+
+
+def map_of(indices: np.ndarray, labels: np.ndarray, hits: np.ndarray) -> SemanticMap:
+    keys = pack(indices)
+    order = np.argsort(keys)
+    evidence = np.zeros((len(keys), len(URBAN.names)), np.int32)
+    evidence[np.arange(len(keys)), labels] = 2 * UNITS_PER_NAT
+    return SemanticMap.of(VoxelMap(0.2, URBAN, keys[order], evidence[order], hits[order].astype(np.uint32)))
+
+
+def test_an_overview_of_a_plane_over_four_tiles() -> None:
+    """A square of 100 x 100 voxels about the corner of four tiles: its north half is building, its south half road."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-50, 50), np.arange(-50, 50)))
+    road, building = URBAN.index("road"), URBAN.index("building")
+    indices = np.stack([x, y, np.zeros_like(x)], axis=1)
+    semantic_map = map_of(indices, np.where(y >= 0, building, road), np.where(x < 0, 1, 30))
+    tiled = in_memory(semantic_map)
+    assert len(tiled.tiles) == 4
+    overview = overview_of(tiled)
+    assert overview is not None
+    assert overview.hits.sum() == 5000 * 31
+    middle = len(overview.labels) // 2
+    assert (overview.labels[: middle - 1] == building).all()
+    assert (overview.labels[middle + 1 :] == road).all()
+    assert overview.hits[0, 0] < overview.hits[0, -1]
+    # squares of 0.8 m, of which those at the rim are counted whole
+    assert 20.0**2 <= overview.area_m2 <= 21.6**2
+    (few, sure), (many, _) = overview.by_looks[1], overview.by_looks[20]
+    assert few == many == 5000
+    assert np.isclose(sure, semantic_map.confidence[0])
+    assert overview.confidence["road"][0] == 5000
+    assert (coverage_pixels(overview)[0, 0] > coverage_pixels(overview)[0, -1]).all()
+    assert (label_pixels(overview)[0, 0] == URBAN.colours[building]).all()

@@ -1,0 +1,118 @@
+"""Options of all commands: how much is printed, the log file, the dry run; and Ctrl-C at any moment."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from street import Street
+
+from gnss_sem_map.runs import expected_cost
+
+pytestmark = pytest.mark.integration
+
+PROGRAM = (sys.executable, "-m", "gnss_sem_map.cli")
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def program(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, text=True)
+
+
+def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "out"
+    words = (
+        "run",
+        small_drive.drive,
+        "--segmenter",
+        f"labels:{small_drive.labels}",
+        "-o",
+        out,
+        "--workers",
+        "1",
+    )
+    done = program(*words, "--dry-run")
+    assert (done.returncode, done.stderr) == (0, "")
+    scans = len(list(small_drive.drive.glob("velodyne*/data/*")))
+    assert f"{scans} scans over" in done.stdout
+    assert f"labels:{small_drive.labels}" in done.stdout
+    assert re.search(r"expected: about [\d.]+ min with 1 process that map", done.stdout)
+    assert "nothing was written" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    for words, message in (
+        (("-o", tmp_path / "out", "--segmenter", "none"), "thesis.tex"),
+        (("-o", tmp_path / "new", "--segmenter", "labels:/nowhere"), "/nowhere"),
+        (("-o", tmp_path / "new", "--segmenter", "none", "--crs", "4326"), "4326"),
+    ):
+        done = program("run", small_drive.drive, *words, "--dry-run")
+        assert done.returncode in (1, 2)
+        assert message in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_constants_of_the_dry_run_are_those_of_the_page_on_scale() -> None:
+    table = dict(re.findall(r"^\| ([^|]+) \| ([\d.,]+) \|$", (DOCS / "scale.md").read_text(), re.MULTILINE))
+    known = {name: float(value.replace(",", "")) for name, value in table.items()}
+    assert known["CPU per scan, ms"] == expected_cost.CPU_MS_PER_SCAN
+    assert known["peak memory, drive of 480 s, MB"] == expected_cost.PEAK_MB
+    assert known["smoothing and binding, MB per hour of a drive"] == expected_cost.TRAJECTORY_MB_PER_HOUR
+
+
+def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    log = tmp_path / "log.txt"
+    words = ("trajectory", small_drive.drive, "-o", tmp_path / "out")
+    loud = program("-v", "--log-file", log, *words)
+    assert loud.returncode == 0
+    assert "scan matching: begins" in loud.stderr
+    text = log.read_text()
+    assert f"gnss-sem-map -v --log-file {log} trajectory" in text
+    assert "scan matching: done after" in text
+    assert text.splitlines()[-1].endswith("exit code 0")
+
+    quiet = program("-q", "--log-file", log, *words)
+    assert (quiet.returncode, quiet.stderr) == (0, "")
+    assert log.read_text().count("exit code 0") == 2  # it is appended to
+
+    missing = program("--log-file", log, "trajectory", tmp_path / "nowhere", "-o", tmp_path / "other")
+    assert len(missing.stderr.splitlines()) == 1
+    assert "nowhere" in log.read_text()
+    assert log.read_text().splitlines()[-1].endswith("exit code 1")
+
+    refused = program("--log-file", tmp_path / "no" / "log", *words)
+    assert refused.returncode == 1
+    assert len(refused.stderr.splitlines()) == 1
+    assert program("-q", "-v", *words).returncode == 2
+
+
+@pytest.mark.parametrize("after_s", [0.08, 0.12, 0.2, 0.5, 2.0])
+def test_ctrl_c_is_one_line_from_the_first_import_on(
+    after_s: float, small_drive: Street, tmp_path: Path
+) -> None:
+    """The interpreter's own start is not ours: the moment counts from the first line of ours."""
+    code = "print('begun', flush=True)\nfrom gnss_sem_map.cli import main\nmain()"
+    words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--workers", "1")
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.readline()
+    time.sleep(after_s)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert len(said.splitlines()) == 1
+    assert said.startswith("gnss-sem-map: stopped by SIGINT")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,253 @@
+"""The documentation: its commands are taken by their parsers, its snippets run, its links lead somewhere.
+
+A block with a title is not run here: the title says what it needs, such as a cluster or a drive of the reader. Its
+commands are parsed and its Python is compiled all the same.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+import yaml
+
+import factor_graphs
+import gnss_sem_map
+from gnss_sem_map import config
+from gnss_sem_map.cli import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+COMMANDS: Any = typer.main.get_command(app)
+FENCED = re.compile(r'^```(\w*)(?: title="([^"\n]*)")?\n(.*?)^```$', re.M | re.S)
+OTHERS = {"dask", "duckdb", "export", "source", "python3", ".venv/bin/pip"}
+"""Programs that are not ours."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: str
+    language: str
+    title: str
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        """Its commands, one that goes on over several lines as one."""
+        return self.text.replace("\\\n", " ").splitlines()
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    for language, title, text in FENCED.findall(page.read_text("utf-8")):
+        yield Block(page.name, language, title, text)
+
+
+BLOCKS = [block for page in PAGES for block in blocks(page)]
+LINES = [
+    pytest.param(line, id=f"{block.page}: {line[:60]}")
+    for block in BLOCKS
+    if block.language == "bash"
+    for line in block.lines
+]
+IN_TEXT = sorted(
+    {
+        " ".join(code.split())
+        for page in TEXTS
+        for code in re.findall(
+            r"`((?:gnss-sem-map|make|python|pytest) [^`]+)`", FENCED.sub("", page.read_text("utf-8"))
+        )
+    }
+)
+
+
+def test_every_block_says_its_language_and_every_fence_is_one() -> None:
+    assert {block.language for block in BLOCKS} == {"bash", "python", "yaml", "text", "math"}
+    fences = sum(page.read_text("utf-8").count("```") for page in PAGES)
+    assert fences == 2 * len(BLOCKS)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_command_is_taken_by_its_parser(line: str) -> None:
+    words = shlex.split(line, comments=True)
+    if words[0] == "gnss-sem-map":
+        command = COMMANDS.commands[words[1]]
+        taken = command.make_context(words[1], words[2:]).params
+        config.load(overrides=taken.get("set_") or ())
+        named = taken.get("config")
+        assert named is None or (ROOT / named).is_file()
+    elif words[0] == "dask":
+        dask_parser(words[1]).make_context(words[1], words[2:])
+    else:
+        assert words[0] in OTHERS
+
+
+def dask_parser(name: str) -> Any:
+    from distributed.cli import dask_scheduler, dask_worker
+
+    return {"scheduler": dask_scheduler, "worker": dask_worker}[name].main
+
+
+@pytest.mark.parametrize("code", IN_TEXT)
+def test_what_text_calls_a_command_is_one(code: str) -> None:
+    program, name, *words = code.split()
+    options = {word.split("=")[0] for word in words if word.startswith("-")}
+    if program == "gnss-sem-map":
+        if name == "COMMAND":
+            return
+        is_of_all = name.startswith("-")
+        parameters = COMMANDS.params if is_of_all else COMMANDS.commands[name].params
+        known = {option for each in parameters for option in (*each.opts, *each.secondary_opts)}
+        assert options | ({name} if is_of_all else set()) <= known | {"--help", "-h"}
+    elif program == "make":
+        targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+        assert {name, *words} <= targets
+    else:
+        path = ROOT / name.split("::")[0]
+        assert path.exists()
+        assert path.is_dir() or all(f'"{option}"' in path.read_text("utf-8") for option in options)
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.language == "python"], ids=lambda b: b.page
+)
+def test_a_snippet_runs(block: Block, tmp_path: Path) -> None:
+    compile(block.text, block.page, "exec")
+    if block.title or block.page == "tutorial.md":  # the tutorial is run as a whole
+        return
+    (tmp_path / "snippet.py").write_text(block.text, "utf-8")
+    done = run([sys.executable, "snippet.py"], tmp_path, answer="\n")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.language == "yaml"], ids=lambda b: b.page
+)
+def test_a_file_of_settings_is_yaml(block: Block) -> None:
+    assert isinstance(yaml.safe_load(block.text), dict)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tutorial.md", "your_own_log.md"])
+def test_a_page_runs_from_its_first_command_to_its_last(name: str, tmp_path: Path) -> None:
+    ran = 0
+    for block in blocks(ROOT / "docs" / name):
+        if block.title:
+            continue
+        if block.language == "python":
+            compile(block.text, name, "exec")
+            done = run([sys.executable, "-c", block.text], tmp_path)
+            assert done.returncode == 0, done.stderr
+            assert done.stdout
+        for line in block.lines if block.language == "bash" else ():
+            done = run([sys.executable, "-m", "gnss_sem_map.cli", *shlex.split(line)[1:]], tmp_path)
+            is_check = line.split()[1] == "check"  # may be red: the drives here last seconds
+            assert done.returncode == 0 or (is_check and done.returncode == 1), (line, done.stderr)
+            ran += 1
+    assert ran >= 4
+
+
+def run(command: list[str], folder: Path, answer: str = "") -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        input=answer,
+        capture_output=True,
+        text=True,
+    )
+
+
+# --- links ------------------------------------------------------------------------------------------------------
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of the headings of a page, as a forge and MkDocs make them."""
+    found = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.M)
+    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in found}
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.name)
+def test_a_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    links = re.findall(r"\]\(([^)\s]+)\)", page.read_text("utf-8"))
+    for link in links:
+        if link.startswith(("https://", "mailto:")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{page.name}: {link}"
+        assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    listed = re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.M)
+    made = {path for path, _ in generated().pages() if path.endswith(".md")}
+    assert sorted(listed) == sorted({page.name for page in PAGES} | made)
+
+
+# --- pages that are made -----------------------------------------------------------------------------------------
+
+
+def generated() -> Any:
+    spec = importlib.util.spec_from_file_location("generated_pages", ROOT / "docs/site/generated_pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def names_of(settings: dict[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        yield name
+        if isinstance(value, dict):
+            yield from names_of(value)
+
+
+def test_every_setting_has_a_row_with_its_meaning() -> None:
+    page = generated().settings_page()
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    heads = [line for line in page.splitlines() if line.startswith("##")]
+    named = list(names_of(config.load().model_dump()))
+    assert len(rows) + len(heads) == len(named) > 100
+    assert all(f"| `{name}` |" in page or re.search(rf"^#+ .*\b{name}$", page, re.M) for name in named)
+    assert not [row for row in rows if row.rstrip("| ").endswith("`")], "a setting without a meaning"
+
+
+def test_every_command_and_option_has_a_row_with_its_meaning() -> None:
+    page = generated().commands_page()
+    for name, command in COMMANDS.commands.items():
+        section = page.split(f"\n## {name}\n")[1].split("\n## ")[0]
+        rows = re.findall(r"^\| `(.*?)` \| (.+) \|$", section, re.M)
+        assert len(rows) == len([parameter for parameter in command.params if not parameter.hidden])
+        for parameter in command.params:
+            if parameter.opts[0].startswith("-"):
+                assert any(parameter.opts[-1] in names for names, _ in rows)
+
+
+def test_every_public_name_has_a_place_in_the_api() -> None:
+    page = generated().api_page()
+    places = re.findall(r"^::: (\S+)$", page, re.M)
+    public = [*gnss_sem_map.__all__, *factor_graphs.__all__]
+    assert sorted(place.rsplit(".", 1)[1] for place in places) == sorted(public)
+
+
+def test_every_benchmark_has_its_figures_its_command_and_its_commit() -> None:
+    page = generated().benchmarks_page()
+    for file in (ROOT / "benchmarks" / "results").glob("*.json"):
+        section = page.split(f"\n## {file.stem}\n")[1].split("\n## ")[0]
+        assert f"python benchmarks/{file.stem}.py" in section
+        assert "Commit: " in section
+        assert "| figure |" in section

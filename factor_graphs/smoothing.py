@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
 from factor_graphs.condensing import CondensedDrive, condense
-from factor_graphs.constraints import quiet_intervals, standing
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
-from factor_graphs.drift import shift_stddevs
 from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import (
     FITTING_CHI2,
@@ -39,8 +37,6 @@ Array = NDArray[np.float64]
 NOTABLE_REJECTION = 0.01
 # The usual specific force of any vehicle is gravity to some per cent; so many times more or less is another unit.
 ANOTHER_UNIT = 2.0
-# Fixes that claim less than this, m, have a carrier phase, and errors that last.
-CENTIMETRES = 0.1
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
@@ -133,7 +129,7 @@ def smooth(
     found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
     if not condensed:
         return found
-    lacking = _lacking(problem, fit, fixes[problem.used], covariances[:, :6, :6])
+    lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])
     return replace(found, condensed=condense(problem, fit, lacking))
 
 
@@ -153,7 +149,7 @@ def _solution(
     if wheels is not None and wheels.held:
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
-    of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(problem, fit, fixes[problem.used], of_poses) @ R
+    of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
     noise = problem.noise.scaled(fit.inflation, fit.of_walk)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
@@ -183,27 +179,17 @@ def _solution(
     )
 
 
-def _lacking(problem: Problem, fit: Fit, fixes: GnssFixes, covariances: Array) -> Array:
+def _lacking(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
     """Variance (3,) m² by which all poses, of covariances (k, 6, 6), may be wrong together beside them.
 
     Fixes that drift together are wrong together: the more of them, the better the shape, not the place. So the track is
-    nowhere better placed than by one fix, which is as good as it claims, but for its shift where it claims centimetres.
-    What the best placed keyframe lacks in variance of a fix, all of them lack: so their differences stay as sure as
-    they are.
+    nowhere better placed than by one fix. What its best placed keyframe lacks in variance of a fix, all of them lack:
+    so their differences stay as sure as they are.
     """
-    one = np.median(fixes.stddevs, axis=0)
-    claims_centimetres = float(one.max()) < CENTIMETRES
-    if not (claims_centimetres or are_drifting(fixes)):
+    if not are_drifting(fixes):
         return np.zeros(3)
-    T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
-    if claims_centimetres:
-        stands = standing(quiet_intervals(problem.intervals), velocities)
-        stops = np.where(stands, np.cumsum(~stands), -1)[problem.at]
-        stops[fit.weights < 0.5] = -1
-        one = np.maximum(np.hypot(one, shift_stddevs(fixes, stops)), problem.settings.min_fix_stddev_m)
-    R = T[:, :3, :3]
-    in_map = np.einsum("kij,kjl,kil->ki", R, covariances[:, 3:, 3:], R)
-    lacking: Array = np.maximum(one**2 - in_map.min(axis=0), 0.0)
+    in_map = np.einsum("kij,kjl,kil->ki", R_map_imu, covariances[:, 3:, 3:], R_map_imu)
+    lacking: Array = np.maximum(np.median(fixes.stddevs, axis=0) ** 2 - in_map.min(axis=0), 0.0)
     return lacking
 
 

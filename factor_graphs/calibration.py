@@ -40,18 +40,11 @@ class Calibration:
 
 
 def correct(
-    problem: Problem,
-    fit: Fit,
-    now: Calibration,
-    given: Array,
-    with_time: bool,
-    with_lever: bool,
-    doubt_s: float = 0.0,
+    problem: Problem, fit: Fit, now: Calibration, given: Array, with_time: bool, with_lever: bool
 ) -> tuple[Calibration, float]:
     """The better calibration, and how many standard deviations it is away from the present one.
 
-    `given` (3,) m is the lever arm as the user gave it: the prior stays there, and at no time offset. `doubt_s` is a
-    standard deviation of stamps that the graph does not know of.
+    `given` (3,) m is the lever arm as the user gave it: the prior stays there, and at no time offset.
     """
     stddevs = np.array([CLOCK_STDDEV if with_time else HELD, *[ANTENNA_STDDEV if with_lever else HELD] * 3])
     moved = np.array([now.time_offset_s, *(now.p_imu_antenna - given)])
@@ -67,7 +60,6 @@ def correct(
     (found,) = deque(eliminate(split(linear, groups), groups), maxlen=1)
     root = np.linalg.inv(found.R)
     step, sigma = root @ found.d, np.sqrt(np.sum(root**2, axis=1))
-    sigma[0] = np.hypot(sigma[0], doubt_s)
     better = Calibration(
         now.time_offset_s + float(step[0]) if with_time else now.time_offset_s,
         now.p_imu_antenna + step[1:] if with_lever else now.p_imu_antenna,

@@ -15,13 +15,11 @@ from factor_graphs.constraints import (
     standing,
     zero_velocity_factors,
 )
-from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
-from factor_graphs.variance import BiasSteps, imu_noise_shown
 from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe, with_mounting
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
 
@@ -31,8 +29,6 @@ Array = NDArray[np.float64]
 FITTING_CHI2 = (0.8, 1.3)
 # Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
 INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
-# White noise and walk of the IMU are looked at so often.
-NOISE_ROUNDS = 10
 # A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
@@ -54,21 +50,20 @@ def fit_noise(
     in `optimise`.
     """
     loss = "huber" if problem.settings.robust else "quadratic"
-    inflation, of_walk, motion, values = (
-        (1.0, 1.0, motion_graph(problem, 1.0, 1.0), first_values(problem))
+    inflation, motion, values = (
+        (1.0, motion_graph(problem, 1.0), first_values(problem))
         if start is None
-        else (start.inflation, start.of_walk, start.motion, start.values)
+        else (start.inflation, start.motion, start.values)
     )
-    fit = optimise(problem, motion, values, (inflation, of_walk), loss, constraints or [], tolerance)
+    fit = optimise(problem, motion, values, inflation, loss, constraints or [], tolerance)
     if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
         return fit
     stiff, loosest = fit, MAX_INFLATION
     for _ in range(INFLATION_ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
-        noise = inflation, stiff.of_walk * inflation / stiff.inflation
-        motion = motion_graph(problem, *noise)
-        fit = optimise(problem, motion, fit.values, noise, loss, constraints or [], tolerance)
+        motion = motion_graph(problem, inflation)
+        fit = optimise(problem, motion, fit.values, inflation, loss, constraints or [], tolerance)
         if FITTING_CHI2[0] <= fit.chi2_per_dof <= (INFLATED_CHI2 if start is None else FITTING_CHI2[1]):
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
@@ -80,30 +75,12 @@ def fit_noise(
     return fit
 
 
-def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
-    """The solution with white noise and bias walk of the IMU as their own residuals show them, by the fixes alone.
-
-    A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
-    """
-    k, loss = len(problem.intervals.keyframes), fit.loss
-    for _ in range(NOISE_ROUNDS):
-        steps = BiasSteps(k)
-        covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
-        noise = imu_noise_shown(problem, fit, covariances, steps)
-        if noise == (fit.inflation, fit.of_walk):
-            break
-        fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, loss)
-    return fit
-
-
 def calibrate(
     fit_to: Callable[[Calibration], tuple[Problem, Fit]], settings: SmootherSettings, given: Array
 ) -> tuple[Problem, Fit, Calibration]:
     """Fit, correct time offset and lever arm, and fit again, until the correction is lost in its own noise.
 
-    `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from. Unasked, a
-    time offset within the step of the IMU is not believed: with fixes of a centimetre, an accelerometer whose scale is
-    off by 0.4 % looks like 6 ms, and 6 ms are 6 cm at 10 m/s.
+    `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from.
     """
     with_time, with_lever = settings.estimate_time_offset, settings.estimate_lever_arm
     calibration = Calibration(0.0, given)
@@ -112,11 +89,9 @@ def calibrate(
         with_time = False
     if with_time is False and not with_lever:
         return problem, fit, calibration
-    unasked = with_time is None and not with_lever
-    least = BEYOND_DOUBT if unasked else NEGLIGIBLE
-    doubt_s = problem.intervals.step_s / 12**0.5 if unasked else 0.0
+    least = BEYOND_DOUBT if with_time is None and not with_lever else NEGLIGIBLE
     for _ in range(CALIBRATION_ROUNDS):
-        better, moved = correct(problem, fit, calibration, given, with_time is not False, with_lever, doubt_s)
+        better, moved = correct(problem, fit, calibration, given, with_time is not False, with_lever)
         if moved < least:
             place = calibration.p_imu_antenna
             return problem, fit, replace(better, time_offset_s=calibration.time_offset_s, p_imu_antenna=place)
@@ -130,60 +105,37 @@ def constrain(
 ) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
     """Add what a road vehicle cannot do, and what its wheels say, linearised at the solution, and again at the next.
 
-    Vehicle and wheels are None where they are not wanted.
+    Slip is looked at again once it is held, for a heading that drifts looks like slip until then; and the IMU's noise,
+    which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
-    settings, motion, still = problem.settings, body_motion(problem, fit), _quiet(problem)
+    settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
+    quiet = _quiet(problem)
     vehicle, wheels, mounting = _observed(problem, fit, motion, speeds)
     axle = vehicle if vehicle and (settings.vehicle_constraint == "on" or not vehicle.doubt) else None
     rolling = wheels if wheels and (settings.wheel_speed == "on" or not wheels.doubt) else None
-    if axle is not None or rolling is not None:
-        fit, factors, axle, rolling = _hold(problem, fit, motion, still, axle, rolling, mounting, speeds)
-        return fit, factors, axle or vehicle, rolling or wheels
-    factors, stood = [], np.zeros(len(motion.velocity), dtype=bool)
-    for _ in range(CONSTRAINT_ROUNDS):
-        stands = standing(still, motion.velocity)
-        if np.array_equal(stands, stood):
-            break
-        factors, stood = _constraints(problem, fit, motion, stands, None, None, mounting), stands
-        fit = fit_noise(problem, fit, factors)
-        motion = body_motion(problem, fit)
-    return fit, factors, vehicle, wheels
-
-
-def _hold(
-    problem: Problem,
-    fit: Fit,
-    motion: BodyMotion,
-    still: NDArray[np.bool_],
-    axle: Vehicle | None,
-    rolling: Wheels | None,
-    mounting: Array,
-    speeds: WheelSpeeds | None,
-) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
-    """Hold an axle, or what wheels say, or both, until they are linear enough and look as they did.
-
-    Slip is looked at again once it is held, for a heading that drifts looks like slip until then; and the IMU's noise,
-    which a vehicle that is known to stand shows better.
-    """
-    key, settled = len(problem.intervals.keyframes), False
+    settled = axle is None and rolling is None
+    tolerance = RELATIVE_TOLERANCE if settled else ROUGH
     factors: list[gtsam.NonlinearFactor] = []
-    stood = np.zeros(key, dtype=bool)
+    stood: NDArray[np.bool_] | None = None
     slip: tuple[Slip, Slip] | None = None
     known: tuple[Slip, Slip] | None = None
     for n in range(CONSTRAINT_ROUNDS):
-        stands = standing(still, motion.velocity)
+        stands = standing(quiet, motion.velocity)
         if rolling is not None:
             stands &= ~rolling.readings.moving
-        if settled and np.array_equal(stands, stood):
+        if settled and stood is not None and np.array_equal(stands, stood):
             break
         start, stood = _with_shared(problem, fit, axle, rolling), stands
         factors = _constraints(problem, start, motion, stands, axle, rolling, mounting)
-        fit = fit_noise(problem, start, factors, ROUGH)
+        if not factors:
+            break
+        fit = fit_noise(problem, start, factors, tolerance)
         if axle is not None and known is not None and slip != known and _is_bent(fit, start):
             fit, slip, axle = start, known, replace(axle, slip=known)
             continue
         before, motion = motion, body_motion(problem, fit)
-        settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
+        if axle is not None or rolling is not None:
+            settled = bool(np.abs(motion.velocity - before.velocity).max() < SETTLED_MPS)
         if axle is not None:
             mounting, guessed = fit.values.atVector(M(key)), axle
             axle = replace(observe(problem, fit, motion), mounting=mounting, held=True)
@@ -197,7 +149,7 @@ def _hold(
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
-    return fit, factors, axle, rolling
+    return fit, factors, axle or vehicle, rolling or wheels
 
 
 def _observed(
@@ -262,8 +214,15 @@ def _is_bent(fit: Fit, start: Fit) -> bool:
     return fit.inflation > start.inflation or fit.chi2_per_dof > FITTING_CHI2[1]
 
 
+def with_inflation(problem: Problem, fit: Fit, inflation: float) -> Fit:
+    """The same solution, of which the next one starts, with so many times the noise of the IMU."""
+    motion = motion_graph(problem, inflation)
+    loss = "huber" if problem.settings.robust else "quadratic"
+    return optimise(problem, motion, fit.values, inflation, loss)
+
+
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:
     """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
     fits = problem.settings.robust and fit.chi2_per_dof <= FITTING_CHI2[1]
     loss = "truncated" if fits else fit.loss
-    return optimise(problem, fit.motion, fit.values, (fit.inflation, fit.of_walk), loss, constraints)
+    return optimise(problem, fit.motion, fit.values, fit.inflation, loss, constraints)

@@ -61,11 +61,6 @@ class ImuIntervals:
         by_first, by_last = (np.interp(stamps, self.nodes, turned) for stamps in (first, last))
         return np.asarray((by_last - by_first) / (last - first))
 
-    @property
-    def step_s(self) -> float:
-        """The usual step, s."""
-        return float(np.median(self.durations))
-
     def part(self, first: int, last: int) -> "ImuIntervals":
         """From one keyframe to another."""
         bounds = self.bounds[first : last + 1]

@@ -71,7 +71,7 @@ def _dbscan_sorted(
     parents = np.arange(len(voxels))
     if min_samples == 1:  # every voxel is its own sample
         _join_cores(keys, masks, first, own, bits, stencil, parents)
-        return _number(parents, positions)
+        return np.asarray(_number(parents, positions))
     core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
     around = keys[own]
     keys, masks, first, own, core_bits = _words(columns[core], z[core])

@@ -20,7 +20,6 @@ from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.kernels import (
     AXIS_BITS,
-    AXIS_MASK,
     AXIS_OFFSET,
     FIRST_SUM,
     HEIGHT_UNITS,

@@ -2,6 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from factor_graphs import intervals
 from factor_graphs.intervals import noise_as_sampled, split
 from factor_graphs.measurements import ImuNoise, ImuSamples
 
@@ -36,6 +37,24 @@ def test_measurements_that_end_together_with_the_imu_leave_no_empty_interval():
         assert (cut.keyframes[0], cut.keyframes[-1]) == (stamps[0], stamps[-1])
         assert np.diff(cut.keyframes).min() > 0.5
         assert np.diff(cut.nodes).min() > 5e-3
+
+
+def test_steps_made_in_blocks_are_those_made_in_one_piece(monkeypatch):
+    """Wherever a block ends: at a fix, in a gap, and at the last sample alone."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        stamps = np.cumsum(rng.uniform(0.005, 0.035, 501) + 2.0 * (rng.random(501) < 0.01))
+        imu = ImuSamples(stamps, rng.standard_normal((501, 3)), rng.standard_normal((501, 3)))
+        fixes = np.sort([*rng.uniform(stamps[0], stamps[-1], 20), *rng.choice(stamps, 5)])
+        whole = split(imu, fixes)
+        for block in (1, 7, 100, 500):
+            monkeypatch.setattr(intervals, "BLOCK", block)
+            cut = split(imu, fixes)
+            for name in ("keyframes", "bounds", "nodes", "blind"):
+                np.testing.assert_array_equal(getattr(cut, name), getattr(whole, name))
+            np.testing.assert_allclose(cut.specific_force, whole.specific_force, atol=1e-9)
+            np.testing.assert_allclose(cut.angular_rate, whole.angular_rate, atol=1e-9)
+        monkeypatch.undo()
 
 
 def test_a_silent_imu_is_an_interval_of_its_own_with_the_noise_of_an_unseen_vehicle():

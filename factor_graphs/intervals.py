@@ -25,7 +25,8 @@ MAX_STEP_S = 0.01
 UNSEEN_FORCE, UNSEEN_RATE = 2.0, 0.3
 # A whole day of steps; each costs 300 bytes.
 MOST_STEPS = 10_000_000
-# The steps are made in blocks of so many, few enough for the cache: in one piece, two hours took twice as long.
+# The steps are made in blocks of so many, few enough for the cache: in one piece, two hours took half as long again,
+# and three times the memory.
 BLOCK = 10_000
 # Yaw rate is the mean over so long, s: a single sample is noise.
 RATE_WINDOW_S = 0.1

@@ -76,7 +76,7 @@ def rings(folder: Path, seeds: list[int]) -> dict[str, dict[str, Any]]:
         drive, labels = simulated(prepare(SECONDS, seed, rig=Rig(lidars, kitti().cameras)), here, seed)
         for log in open_drive(drive).by_lidar:
             out = here / log.lidar
-            run(drive, out, segmenter=f"labels:{labels}", log=log, write_labels=True)
+            run(drive, out, segmenter=f"labels:{labels / 'camera'}", log=log, write_labels=True)
             found[log.lidar][str(seed)] = _moving(score_run(out, drive / "truth"))
     return found
 

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 AXES = ("east", "north", "up")
 COLOURS = ("tab:red", "tab:green", "tab:blue")
 HEADROOM = 1.15
+LINE_SHARE = 0.016
+"""Height of a line of the title, of that of the figure."""
 
 
 def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
@@ -33,9 +35,11 @@ def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 10), dpi=110, layout="constrained")
+    figure, title = Figure(figsize=(15, 10), dpi=110), _title(solution, fixes)
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(4, 2, width_ratios=[1.1, 1.0])
+    # fixed margins: a layout engine would draw everything twice
+    edges = {"left": 0.05, "right": 0.94, "bottom": 0.06, "top": 0.96 - LINE_SHARE * (1 + title.count("\n"))}
+    grid = figure.add_gridspec(4, 2, width_ratios=[1.1, 1.0], wspace=0.14, hspace=0.1, **edges)
     _track(figure.add_subplot(grid[:, 0]), solution, fixes)
     below = figure.add_subplot(grid[3, 1])
     for row, draw in enumerate((_residuals, _stddevs, _heading)):
@@ -43,7 +47,7 @@ def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str
         axes.tick_params(labelbottom=False)
         draw(axes, solution, fixes)
     _biases(below, solution)
-    figure.suptitle(_title(solution, fixes), fontsize=10, ha="left", x=0.01)
+    figure.suptitle(title, fontsize=10, ha="left", x=0.01)
     figure.savefig(path, format="png")
 
 

@@ -7,6 +7,8 @@ merge.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numba import int64, njit, uint64
 from numpy.typing import NDArray
@@ -47,12 +49,14 @@ def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) ->
         )
     if eps_voxels + TIE >= LARGEST_EPS_VOXELS + 1:
         return _dbscan_by_distance(voxels, eps_voxels, min_samples)
-    keys = pack(voxels)
+    keys, positions = pack(voxels), np.arange(len(voxels))
+    if (np.diff(keys) > 0).all():
+        return _dbscan_sorted(voxels, positions, _stencil(eps_voxels), min_samples)
     order = np.argsort(keys, kind="stable")
     if (np.diff(keys[order]) == 0).any():
         raise DataError("dbscan: found a voxel twice, expected each once; pass unique indices")
-    positions, clusters = np.empty(len(voxels), np.int64), np.empty(len(voxels), np.int32)
-    positions[order] = np.arange(len(voxels))
+    clusters = np.empty(len(voxels), np.int32)
+    positions[order] = positions.copy()
     clusters[order] = _dbscan_sorted(voxels[order], positions, _stencil(eps_voxels), min_samples)
     return clusters
 
@@ -63,13 +67,15 @@ def _dbscan_sorted(
     """Clusters of sorted voxels, numbered in the order of `positions`: where the input's voxels now are."""
     x, y, z = (voxels + AXIS_OFFSET).T
     columns = ((x + _MARGIN) << _Y_BITS | (y + _MARGIN)) << _BLOCK_BITS
-    keys, masks, _, own, bits = _words(columns, z)
-    core = np.ones(len(voxels), np.bool_)
-    if min_samples > 1:  # else every voxel is its own sample
-        core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
+    keys, masks, first, own, bits = _words(columns, z)
+    parents = np.arange(len(voxels))
+    if min_samples == 1:  # every voxel is its own sample
+        _join_cores(keys, masks, first, own, bits, stencil, parents)
+        return np.asarray(_number(parents, positions))
+    core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
     around = keys[own]
     keys, masks, first, own, core_bits = _words(columns[core], z[core])
-    parents = np.arange(core.sum())
+    parents = parents[: core.sum()]
     _join_cores(keys, masks, first, own, core_bits, stencil, parents)
     rank = np.cumsum(core) - 1
     clusters = np.full(len(voxels), NOISE, np.int32)
@@ -86,6 +92,7 @@ def _dbscan_by_distance(voxels: NDArray[np.int64], eps_voxels: float, min_sample
     return np.asarray(DBSCAN(eps=eps_voxels + TIE, min_samples=min_samples).fit(voxels).labels_, np.int32)
 
 
+@cache
 def _stencil(eps_voxels: float) -> NDArray[np.int64]:
     """Columns within the radius: (k, 2) packed offset, ascending, and half height in voxels."""
     reach, limit = int(eps_voxels + TIE), (eps_voxels + TIE) ** 2

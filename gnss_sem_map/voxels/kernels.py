@@ -106,6 +106,15 @@ def pack_keys(p_map, voxel_size_m, keys):
 
 
 @njit(cache=True, nogil=True)
+def unpack_keys(keys, indices):
+    """Integer coordinates (v, 3) of the voxels of keys (v,)."""
+    for i in range(len(keys)):
+        indices[i, 0] = (keys[i] >> 2 * AXIS_BITS & AXIS_MASK) - AXIS_OFFSET
+        indices[i, 1] = (keys[i] >> AXIS_BITS & AXIS_MASK) - AXIS_OFFSET
+        indices[i, 2] = (keys[i] & AXIS_MASK) - AXIS_OFFSET
+
+
+@njit(cache=True, nogil=True)
 def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations, classes):
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 

@@ -20,7 +20,6 @@ from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
 from gnss_sem_map.voxels import kernels
 from gnss_sem_map.voxels.kernels import (
     AXIS_BITS,
-    AXIS_MASK,
     AXIS_OFFSET,
     FIRST_SUM,
     HEIGHT_UNITS,
@@ -312,8 +311,9 @@ def heights_in_voxels(z: NDArray[np.float64], voxel_size_m: float) -> NDArray[np
 
 def unpack(keys: NDArray[np.int64]) -> NDArray[np.int32]:
     """Integer voxel coordinates (v, 3) of packed keys."""
-    axes = (keys >> (2 * AXIS_BITS), keys >> AXIS_BITS, keys)
-    return np.stack([(axis & AXIS_MASK) - AXIS_OFFSET for axis in axes], axis=-1).astype(np.int32)
+    indices = np.empty((len(keys), 3), np.int32)
+    kernels.unpack_keys(keys, indices)
+    return indices
 
 
 def limits_of(rows: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

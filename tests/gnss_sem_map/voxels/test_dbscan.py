@@ -25,9 +25,10 @@ def reference(indices, eps_voxels, min_samples):
 def test_every_cluster_number_is_that_of_scikit_learn(seed, count, half_widths, eps_voxels, min_samples):
     rng = np.random.default_rng(seed)
     spread = np.array(half_widths)
-    indices = rng.permutation(np.unique(rng.integers(-spread, spread + 1, (count, 3)), axis=0))
-    expected = reference(indices, eps_voxels, min_samples)
-    np.testing.assert_array_equal(dbscan(indices, eps_voxels, min_samples), expected)
+    ordered = np.unique(rng.integers(-spread, spread + 1, (count, 3)), axis=0)
+    for indices in (ordered, rng.permutation(ordered)):
+        expected = reference(indices, eps_voxels, min_samples)
+        np.testing.assert_array_equal(dbscan(indices, eps_voxels, min_samples), expected)
 
 
 def test_border_voxels_between_two_clusters_go_to_the_one_that_the_input_names_first():

@@ -15,18 +15,23 @@ from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, KNOTS_PER_S
 from gnss_sem_map.scans.projection import NEAREST_DEPTH_M, ClassImage, LabellingSettings, exposure_stamp
 from gnss_sem_map.sensor_log import Calibration, Image, Points
-from gnss_sem_map.voxels.voxel_map import MappingSettings, VoxelMap, log_table, pack
+from gnss_sem_map.voxels.voxel_map import VoxelMap, log_table, pack
 
 Array = NDArray[np.float64]
 
 
 def points_in_map(
-    points: Points, stamp: float, trajectory: Trajectory, T_imu_lidar: Array, settings: MappingSettings
+    points: Points,
+    stamp: float,
+    trajectory: Trajectory,
+    T_imu_lidar: Array,
+    nearest_m: float,
+    farthest_m: float,
 ) -> Array:
     """The usable points of one sweep in the map frame, each moved with the pose of its own stamp."""
     x, y, z = points.xyz.T.astype(np.float64)
     squares = x * x + y * y + z * z
-    valid = (squares >= settings.nearest_m**2) & (squares <= settings.farthest_m**2)
+    valid = (squares >= nearest_m**2) & (squares <= farthest_m**2)
     x, y, z = x[valid, None], y[valid, None], z[valid, None]
     stamps = np.full(len(x), stamp) if points.stamps is None else points.stamps[valid]
     numbers = np.arange(np.floor(stamps.min() * KNOTS_PER_S), np.floor(stamps.max() * KNOTS_PER_S) + 2)

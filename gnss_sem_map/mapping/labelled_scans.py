@@ -25,6 +25,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
 from gnss_sem_map.scans.kept_sweeps import KeptSweeps
+from gnss_sem_map.scans.own_vehicle import reach_of_vehicle
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
     ClassImage,
@@ -37,7 +38,7 @@ from gnss_sem_map.scans.projection import (
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
-from gnss_sem_map.voxels.voxel_map import MappingSettings, keys_of
+from gnss_sem_map.voxels.voxel_map import keys_of
 
 READ_AHEAD = 4
 SAMPLED_SCANS = 8
@@ -72,12 +73,18 @@ class Drive:
     @property
     def image_rows(self) -> Rows:
         """Rows of the range images of its LiDAR, by some scans of the whole drive: for every chunk the same."""
-        return self._pattern[0]
+        return self._pattern.rows
 
     @property
     def is_too_sparse(self) -> bool:
         """Whether points are too far apart to tell what a scan sees through, so that nothing is found to have moved."""
-        return self._pattern[1] < LEAST_SEEN_THROUGH
+        return self._pattern.seen_through < LEAST_SEEN_THROUGH
+
+    @property
+    def nearest_m(self) -> float:
+        """Returns nearer to its LiDAR are left out: they may be of the vehicle."""
+        said = self.settings.mapping.nearest_m
+        return self._pattern.reach_m if said is None else said
 
     @cached_property
     def scans(self) -> tuple[Scan, ...]:
@@ -85,15 +92,26 @@ class Drive:
         return self._kept.taking(self.log).scans
 
     @cached_property
-    def _pattern(self) -> tuple[Rows, float]:
-        """Rows of the range images, and the share of returns that scans see up to."""
+    def _pattern(self) -> _Pattern:
         scans = _sample(self._kept.keeping(self.log).scans)
         rows = Rows.of(scans)
-        return rows, share_seen_through(scans, rows)
+        return _Pattern(rows, share_seen_through(scans, rows), reach_of_vehicle(scans))
 
     @cached_property
     def _kept(self) -> KeptSweeps:
         return KeptSweeps()
+
+
+@dataclass(frozen=True, eq=False)
+class _Pattern:
+    """What some scans of the whole drive tell of a LiDAR."""
+
+    rows: Rows
+    """Of the range images."""
+    seen_through: float
+    """The share of returns that scans see up to."""
+    reach_m: float
+    """How far the vehicle itself reaches."""
 
 
 def _sample(scans: Sequence[Scan]) -> list[NDArray[np.float32]]:
@@ -151,17 +169,18 @@ def _see(
 ) -> LabelledScan | None:
     """Deskew one scan, find its voxels and its labels."""
     log, n, mapping = drive.log, len(points.xyz), drive.settings.mapping
+    nearest_m = drive.nearest_m
     valid, keys, heights = np.zeros(n, np.bool_), np.empty(n, np.int64), np.empty(n, np.uint8)
     at = np.empty(3 * n)
     try:
         stamps, knots = knots_of(
-            points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, mapping.nearest_m, mapping.farthest_m
+            points, scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, nearest_m, mapping.farthest_m
         )  # fmt: skip
     except MeasurementError as error:
         stats.skips.append(Skip("scan", f"frame {log.frame_of(scan)}", str(error)))
         return None
     count = kernels.place(
-        points.rows, stamps, mapping.nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
+        points.rows, stamps, nearest_m, mapping.farthest_m, KNOTS_PER_S, knots.first, knots.poses,
         mapping.voxel_size_m, valid, keys, heights, at,
     )  # fmt: skip
     if count == 0:
@@ -232,12 +251,15 @@ class Looks:
         return points, classes.at(seen)
 
 
-def map_points(
-    points: Points, scan: Scan, trajectory: Trajectory, log: SensorLog, settings: MappingSettings
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def map_points(points: Points, scan: Scan, drive: Drive) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The finite points in range of a sweep, in the map (m, 3) m, and their mask among all points (n,)."""
     return usable_points_in_map(
-        points, scan.stamp, trajectory, log.calibration.T_imu_lidar, settings.nearest_m, settings.farthest_m
+        points,
+        scan.stamp,
+        drive.trajectory,
+        drive.log.calibration.T_imu_lidar,
+        drive.nearest_m,
+        drive.settings.mapping.farthest_m,
     )
 
 

@@ -50,7 +50,7 @@ def range_images(drive: Drive, scans: Sequence[Scan]) -> list[RangeImage]:
     def draw(scan: Scan) -> RangeImage | None:
         try:
             points = scan.read()
-            p_map, _ = map_points(points, scan, drive.trajectory, drive.log, drive.settings.mapping)
+            p_map, _ = map_points(points, scan, drive)
         except (DataError, MeasurementError):
             return None
         return RangeImage.of(p_map, _lidar_pose(drive, scan), drive.image_rows) if len(p_map) else None

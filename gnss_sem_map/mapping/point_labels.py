@@ -15,7 +15,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.mapping.evidence import read_moving_points
-from gnss_sem_map.mapping.labelled_scans import map_points
+from gnss_sem_map.mapping.labelled_scans import Drive, map_points
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.scans.prefetch import prefetch, threads
@@ -58,15 +58,17 @@ def label_points(
     """
     files = list(moving_points)
     moving: dict[int, NDArray[np.int64]] = {}
-    for start in range(0, len(log.scans), SCANS_AT_ONCE):
-        scans = log.scans[start : start + SCANS_AT_ONCE]
+    drive = Drive(log, trajectory, None, settings)
+    _ = drive.nearest_m  # the scans that tell it are kept for their turn
+    for start in range(0, len(drive.scans), SCANS_AT_ONCE):
+        scans = drive.scans[start : start + SCANS_AT_ONCE]
         box = _box_of(scans, log, trajectory, settings.mapping.farthest_m)
         if box is None:
             continue
         parts = [tiled.inside(box) for tiled in maps]
         while files and not {scan.number for scan in scans} <= moving.keys():
             moving |= read_moving_points(files.pop(0))
-        yield from _label_some(scans, log, trajectory, parts, settings, moving, kerbs)
+        yield from _label_some(drive, scans, parts, moving, kerbs)
         for scan in scans:
             moving.pop(scan.number, None)
 
@@ -85,11 +87,9 @@ def _box_of(
 
 
 def _label_some(
+    drive: Drive,
     scans: Sequence[Scan],
-    log: SensorLog,
-    trajectory: Trajectory,
     maps: Sequence[SemanticMap],
-    settings: Settings,
     moving: Mapping[int, NDArray[np.int64]],
     kerbs: Kerbs | None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
@@ -98,12 +98,12 @@ def _label_some(
     def label(scan: Scan) -> list[PointLabels] | None:
         try:
             points = scan.read()
-            p_map, valid = map_points(points, scan, trajectory, log, settings.mapping)
+            p_map, valid = map_points(points, scan, drive)
         except (DataError, MeasurementError):
             return None  # was reported when the map was built
         if not valid.any():
             return None  # likewise
-        keys = keys_of(p_map, settings.mapping.voxel_size_m)
+        keys = keys_of(p_map, drive.settings.mapping.voxel_size_m)
         places = [m.voxels.indices_of(keys) for m in (maps[:1] if one_grid else maps)]
         places *= len(maps) // len(places)
         found = [_look_up(m, there, valid) for m, there in zip(maps, places, strict=True)]

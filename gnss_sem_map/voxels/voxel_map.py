@@ -42,10 +42,11 @@ class MappingSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     voxel_size_m: float = Field(0.2, gt=0.01, le=10, description="Edge of a voxel (the paper: 0.2 m).")
-    nearest_m: float = Field(
-        2.4,
+    nearest_m: float | None = Field(
+        None,
         ge=0,
-        description="Returns nearer to the LiDAR are left out: the vehicle itself (2.4 m on KITTI's).",
+        description="Returns nearer to the LiDAR are left out, m; by default as far as those of the vehicle itself"
+        " reach, which stay in place in all scans, at most 2.4.",
     )
     farthest_m: float = Field(120.0, gt=0, description="Returns farther from the LiDAR are left out.")
 

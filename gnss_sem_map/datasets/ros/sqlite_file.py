@@ -15,6 +15,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, shown
 
 Ints = NDArray[np.int64]
+DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError)
+"""What damaged rows raise: names that are no text, numbers that are none or too large."""
 
 
 class SqliteFile:
@@ -30,10 +32,10 @@ class SqliteFile:
             )
             weakref.finalize(self, self._database.close)
             rows = self._database.execute("SELECT id, name, type FROM topics").fetchall()
-        except sqlite3.Error as error:
+            self.topics = {str(name): str(kind) for _, name, kind in rows}
+            self._numbers = {str(name): int(number) for number, name, _ in rows}
+        except DAMAGED as error:
             raise self._damaged(error) from None
-        self.topics = {str(name): str(kind) for _, name, kind in rows}
-        self._numbers = {str(name): int(number) for number, name, _ in rows}
 
     def index(self, topic: str) -> tuple[Ints, Ints]:
         """Arrival (n,), ns, and place (n, 2) of the messages of a topic, in the order of the file."""
@@ -43,7 +45,7 @@ class SqliteFile:
                 (self._numbers.get(topic, -1),),
             )
             found = np.fromiter((value for row in rows for value in row), np.int64).reshape(-1, 2)
-        except sqlite3.Error as error:
+        except DAMAGED as error:
             raise self._damaged(error) from None
         return found[:, 0], np.column_stack([found[:, 1], np.zeros(len(found), np.int64)])
 
@@ -56,7 +58,7 @@ class SqliteFile:
             raise self._damaged(error) from None
         return expand(data, self._codec, shown(self.path), most or MOST_BYTES) if self._codec else data
 
-    def _damaged(self, error: sqlite3.Error) -> DataError:
+    def _damaged(self, error: Exception) -> DataError:
         return DataError(
             f"{shown(self.path)}: truncated, damaged or no bag ({error}); repair it: sqlite3 {shown(self.path.name)}"
             " .recover | sqlite3 repaired.db3"

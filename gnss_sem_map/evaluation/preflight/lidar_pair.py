@@ -8,11 +8,12 @@ one motion in the imu frame that brings its points onto the surfaces is the erro
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
@@ -35,8 +36,10 @@ NEAREST_M, FARTHEST_M = 2.5, 40.0
 EDGE_M, NEIGHBOURS = 0.3, 8
 """One point per cube of this edge counts, the mean, with the plane of so many neighbours."""
 LEAST_POINTS = 150
-STEPS_M = (3.0, 2.0, 1.0, 0.5, 0.3, 0.2, 0.2)
+STEPS_M = (3.0, 2.0, 1.0, 0.5, 0.3, 0.2)
 """How far a point may lie from its surface, step by step."""
+REPEATS, STILL = 6, 2e-3
+"""Each step is repeated at most so often, until the next motion is smaller than this, rad and m."""
 NEAR_M = 1.0
 """Of points within this distance of a surface, the median distance is told."""
 SOFT_M = 0.05
@@ -50,8 +53,12 @@ SAME_RAD, SAME_M = np.radians(0.3), 0.06
 """Differences that are no reason to warn."""
 WRONG_RAD, WRONG_M = np.radians(1.0), 0.15
 """Larger ones double every wall."""
-TURNS_DEG = ((0, 0, 90), (0, 0, -90), (0, 0, 180), (180, 0, 0), (0, 180, 0))
-"""Mistakes of axes that are tried where nothing fits."""
+TURNS, CELL_M = 4000, 0.5
+"""Where nothing fits, so many rotations all around are tried, 10 degrees apart: by the points of a few moments that
+then lie in a cell of this size with a surface, or beside one."""
+TURNS_MATCHED, HEADINGS, MOMENTS_TRIED, POINTS_TRIED = 12, 24, 3, 400
+"""The best of them are matched, by few points of these moments, and the best of these again with so many headings: the
+ground alone holds it level."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +72,8 @@ class _Moment:
     tree: small_gicp.KdTree
     p: Array
     """(m, 3) m"""
+    up: Array
+    """(3,) unit vector."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,29 +103,77 @@ def _check(sample: Sample, first: SensorLog, other: SensorLog) -> Finding:
     name, trajectory = f"{other.lidar} against {first.lidar}", sample.trajectory
     if trajectory is None:
         return green(name, "not observable: no trajectory of the sample")
-    moments = []
-    for scan in sample.moving_scans[0][::2]:
-        found = _moment(first, other, scan.stamp, trajectory)
-        moments += [found] if found is not None else []
+    moments = _moments(sample, first, other, trajectory)
     if not moments:
         return green(name, "not observable: no moment at which both have points")
     best = _match(moments, np.eye(4))
     apart, fitted = _distance(moments, np.eye(4)), _distance(moments, best.T)
     if best.share < LEAST_SHARE or fitted > SOFT_M:
-        T = other.calibration.T_imu_lidar
-        tried = (_match(moments, start @ inverse(T)) for start in _starts(T))
-        best = min((best, *tried), key=lambda fit: (fit.share < LEAST_SHARE, _distance(moments, fit.T)))
-        fitted = _distance(moments, best.T)
+        far = max(_far_matches(moments, other.calibration.T_imu_lidar), key=lambda fit: fit.share)
+        # sweeps that are deskewed by a pose that is far off are bent: once more by the pose that was found
+        there = _placed(other, far.T @ other.calibration.T_imu_lidar)
+        if straight := _moments(sample, first, there, trajectory):
+            found = _match(straight, np.eye(4))
+            if found.share > best.share:
+                best, fitted = replace(found, T=found.T @ far.T), _distance(straight, found.T)
     return _finding(name, other.lidar, first.lidar, best, apart, fitted, len(moments))
 
 
-def _starts(T: Array) -> Iterator[Array]:
-    """Poses that a LiDAR may have whose pose is given as T: that of the inverse, and with other axes."""
-    yield inverse(T)
-    for degrees in TURNS_DEG:
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(degrees, degrees=True).as_matrix()
-        yield T @ turn
+def _moments(sample: Sample, first: SensorLog, other: SensorLog, trajectory: Trajectory) -> list[_Moment]:
+    found = (_moment(first, other, scan.stamp, trajectory) for scan in sample.moving_scans[0][::2])
+    return [one for one in found if one is not None]
+
+
+def _placed(log: SensorLog, T_imu_lidar: Array) -> SensorLog:
+    """The log with its LiDAR at another pose."""
+    return replace(log, calibration=replace(log.calibration, T_imu_lidar=T_imu_lidar))
+
+
+def _far_matches(moments: list[_Moment], T_imu_lidar: Array) -> Iterator[_Fit]:
+    """Matches from where the LiDAR lies by the inverse of its pose, and from the best of all rotations.
+
+    These are about the LiDAR, whose axes may be wrong, and about the imu, whose axes may be.
+    """
+    few = [_thinned(moment) for moment in moments[:: -(-len(moments) // MOMENTS_TRIED)]]
+    turns = Rotation.random(TURNS, random_state=0)
+    all_around = np.concatenate([_about(place, turns) for place in (T_imu_lidar[:3, 3], np.zeros(3))])
+    hits = np.sum([_on_surfaces(moment, all_around) for moment in few], axis=0)
+    level = _best(few, all_around[np.argsort(-hits, kind="stable")[:TURNS_MATCHED]])
+    angles = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
+    headings = _about((level @ T_imu_lidar)[:3, 3], Rotation.from_rotvec(np.outer(angles, moments[0].up)))
+    yield _match(moments, _best(few, headings @ level))
+    inverted = inverse(T_imu_lidar)
+    yield _match(moments, inverted @ inverted)
+
+
+def _about(place: Array, turns: Rotation) -> Array:
+    """Rotations about a place (3,) m, as (k, 4, 4)."""
+    T = np.tile(np.eye(4), (len(turns), 1, 1))
+    T[:, :3, :3] = turns.as_matrix()
+    T[:, :3, 3] = place - T[:, :3, :3] @ place
+    return T
+
+
+def _best(moments: list[_Moment], starts: Array) -> Array:
+    """The best match (4, 4) from some starts (k, 4, 4)."""
+    return max((_match(moments, T) for T in starts), key=lambda fit: fit.share).T
+
+
+def _thinned(moment: _Moment) -> _Moment:
+    return replace(moment, p=moment.p[:: -(-len(moment.p) // POINTS_TRIED)])
+
+
+def _on_surfaces(moment: _Moment, Ts: Array) -> NDArray[np.int64]:
+    """For each motion (k, 4, 4), how many points it brings into a cell with a surface, or beside one: (k,)."""
+    size = int(2 * FARTHEST_M / CELL_M) + 3  # an empty cell on every side
+    occupied = np.zeros((size,) * 3, np.bool_)
+    occupied[tuple((moment.p_surface / CELL_M).astype(np.int64).T + size // 2)] = True
+    occupied = binary_dilation(occupied, np.ones((3, 3, 3), np.bool_))
+    hits = np.empty(len(Ts), np.int64)
+    for k, T in enumerate(Ts):
+        cells = ((moment.p @ T[:3, :3].T + T[:3, 3]) / CELL_M).astype(np.int64) + size // 2
+        hits[k] = occupied[tuple(np.clip(cells, 0, size - 1).T)].sum()
+    return hits
 
 
 def _finding(
@@ -138,7 +195,7 @@ def _finding(
     degrees = " ".join(f"{angle:.2f}" for angle in np.degrees(turn))
     metres = " ".join(f"{value:.2f}" for value in shift)
     is_wrong = ((size > np.repeat([WRONG_RAD, WRONG_M], 3)) & (size > SIGMAS * best.stddevs)).any()
-    level = red if is_wrong and fitted < 0.7 * apart else amber
+    level = red if is_wrong and fitted < apart else amber
     return level(
         name,
         f"{lies}, and {fitted:.3f} m when turned by {degrees} deg about x, y, z of the imu and moved by {metres} m",
@@ -164,7 +221,8 @@ def _moment(first: SensorLog, other: SensorLog, stamp: float, trajectory: Trajec
         return None
     cloud, tree = small_gicp.PointCloud(surface), small_gicp.KdTree(surface)
     small_gicp.estimate_normals(cloud, tree, NEIGHBOURS)
-    return _Moment(surface, np.asarray(cloud.normals())[:, :3].copy(), tree, one_per_cube(p, EDGE_M))
+    normals = np.asarray(cloud.normals())[:, :3].copy()
+    return _Moment(surface, normals, tree, one_per_cube(p, EDGE_M), np.asarray(T_imu_map[:3, 2]))
 
 
 def _nearest(scans: tuple[Scan, ...], stamp: float) -> Scan | None:
@@ -197,15 +255,23 @@ def _distance(moments: list[_Moment], T: Array) -> float:
 
 
 def _match(moments: list[_Moment], T: Array) -> _Fit:
-    share, H, scatter = 0.0, np.eye(6), np.inf
+    fit = _Fit(T, np.full(6, np.inf), 0.0)
     for within_m in STEPS_M:
-        found = [_residuals(moment, T, within_m) for moment in moments]
-        at, n, r = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        share = len(r) / sum(len(moment.p) for moment in moments)
-        J = np.hstack([np.cross(at, n), n])
-        weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(r), 1e-9))[:, None]
-        H, scatter = J.T @ weighted, 1.48 * float(np.median(np.abs(r))) if len(r) else np.inf
-        # a little weight on where it is: what no surface holds stays
-        T = exp(-np.linalg.solve(H + np.eye(6), weighted.T @ r)) @ T
-    covariance = POINTS_PER_SURFACE * scatter**2 * np.linalg.inv(H + np.eye(6))
-    return _Fit(T, np.sqrt(np.diag(covariance)), share)
+        for _ in range(REPEATS):
+            before, fit = fit.T, _step(moments, fit.T, within_m)
+            if np.abs(fit.T - before).max() < STILL:
+                break
+    return fit
+
+
+def _step(moments: list[_Moment], T: Array, within_m: float) -> _Fit:
+    """One step of Gauss and Newton."""
+    found = [_residuals(moment, T, within_m) for moment in moments]
+    at, n, r = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    share = len(r) / sum(len(moment.p) for moment in moments)
+    J = np.hstack([np.cross(at, n), n])
+    weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(r), 1e-9))[:, None]
+    scatter = 1.48 * float(np.median(np.abs(r))) if len(r) else np.inf
+    H = J.T @ weighted + np.eye(6)  # a little weight on where it is: what no surface holds stays
+    T = exp(-np.linalg.solve(H, weighted.T @ r)) @ T
+    return _Fit(T, np.sqrt(np.diag(POINTS_PER_SURFACE * scatter**2 * np.linalg.inv(H))), share)

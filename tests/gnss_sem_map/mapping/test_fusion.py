@@ -130,8 +130,9 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
     for seen in labelled_scans(drive):
         points = seen.scan.read()
         p_map = numpy_chain.points_in_map(
-            points, seen.scan.stamp, drive.trajectory, log.calibration.T_imu_lidar, settings.mapping
-        )
+            points, seen.scan.stamp, drive.trajectory, log.calibration.T_imu_lidar,
+            drive.nearest_m, settings.mapping.farthest_m,
+        )  # fmt: skip
         np.testing.assert_array_equal(seen.p_map, p_map)
         image = log.image_at(seen.scan.stamp, settings.labelling.image_within_s)
         assert image is not None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -57,6 +59,22 @@ def test_an_mcap_that_was_not_closed_is_refused(plain: Path, tmp_path: Path) -> 
         open_drive(tmp_path / "open.mcap")
 
 
+@pytest.mark.integration
+@pytest.mark.parametrize(("command", "storage"), [("inspect", "mcap"), ("inspect", "bag"), ("check", "db3")])
+def test_a_command_says_in_one_line_that_a_bag_is_truncated(
+    tmp_path: Path, command: str, storage: str
+) -> None:
+    name = "drive.bag" if storage == "bag" else "drive"
+    bag = ros.write(tmp_path / name, ros.drive(storage == "bag"), storage)
+    damaged(bag, lambda content: content[: len(content) // 3])
+    line = [sys.executable, "-m", "gnss_sem_map.cli", command, str(bag)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "truncated" in done.stderr
+    assert not (tmp_path / "rig.yaml").exists()
+
+
 def test_an_unknown_codec_is_named(tmp_path: Path) -> None:
     bag = ros.write(tmp_path / "drive", ros.drive(), compression="storage")
     damaged(bag, lambda content: content.replace(b"\x04\x00\x00\x00zstd", b"\x04\x00\x00\x00abcd"))
@@ -72,11 +90,15 @@ def test_files_that_are_compressed_as_a_whole_are_refused(tmp_path: Path) -> Non
         open_drive(bag)
 
 
-def test_every_flipped_byte_is_an_error_or_a_value(plain: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("storage", ["mcap", "db3", "bag"])
+def test_every_flipped_byte_is_an_error_or_a_value(tmp_path: Path, storage: str) -> None:
     """Nothing but our own errors, whatever the bytes of a message or of the index are."""
-    content = next(plain.glob("*.mcap")).read_bytes()
+    written = ros.write(
+        tmp_path / ("bag.bag" if storage == "bag" else "bag"), ros.drive(storage == "bag"), storage
+    )
+    content = (written if written.is_file() else next(written.glob(f"*.{storage}"))).read_bytes()
     rng = np.random.default_rng(1)
-    file = tmp_path / "drive.mcap"
+    file = tmp_path / f"drive.{storage}"
     for _ in range(60):
         changed = bytearray(content)
         for at in rng.integers(0, len(content), 20):
@@ -135,6 +157,20 @@ def test_wrong_header_stamps_are_refused_and_arrivals_offered(
     log = open_drive(bag)
     assert log.imu is not None
     np.testing.assert_allclose(np.diff(log.imu.stamps), 0.01, atol=1e-9)
+
+
+def test_wrong_header_stamps_of_clouds_are_refused_and_arrivals_offered(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/points"]
+    for k in range(10):
+        rig.cloud(START_NS + k * 10**8, sweep(TIMES), header_ns=0)
+    bag = ros.write(tmp_path / "drive", rig)
+    with pytest.raises(
+        DataError, match=r"/points: 10 of 10 header stamps are zero.*set `stamps: received` for this topic"
+    ):
+        open_drive(bag)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/points", "stamps": "received"}})
+    np.testing.assert_allclose(np.diff([scan.stamp for scan in open_drive(bag).scans]), 0.1, atol=1e-9)
 
 
 def test_a_bag_that_is_played_at_half_speed_keeps_its_header_stamps(tmp_path: Path) -> None:

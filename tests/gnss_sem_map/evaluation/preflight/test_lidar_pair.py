@@ -71,8 +71,15 @@ def test_a_wrong_pose_is_red_with_its_error(
     np.testing.assert_allclose(shift, -np.array(shift_m, float), atol=0.08)
 
 
-def test_a_pose_that_is_far_off_is_not_green(pair: SensorLog) -> None:
-    assert found(misplaced(pair, (0, 0, 90), (0, 0, 0))).level is not Level.GREEN
+@pytest.mark.parametrize("turn_deg", [(0, 0, 20), (25, 0, 0), (0, -30, 0), (30, 20, -40), (0, 0, 180)])
+def test_a_turn_that_is_far_off_is_red_with_its_error(
+    pair: SensorLog, turn_deg: tuple[float, float, float]
+) -> None:
+    finding = found(misplaced(pair, turn_deg, (0, 0, 0)))
+    assert finding.level is Level.RED, finding
+    turn = Rotation.from_rotvec(told(finding)[0], degrees=True)
+    rest = turn * Rotation.from_rotvec(turn_deg, degrees=True)
+    assert np.degrees(rest.magnitude()) < 0.3
 
 
 def test_one_lidar_has_nothing_to_be_compared_with(pair: SensorLog) -> None:

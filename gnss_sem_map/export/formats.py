@@ -36,7 +36,9 @@ SMALL = 1_000_000
 FORMATS = (
     Format(
         "viewer", "viewer.html", "the map to turn and to ask, in any browser, offline",
-        lambda e, path: write_viewer(e.map, e.tracks, path, e.title or "Semantic map", changes=e.changes),
+        lambda e, path: write_viewer(
+            e.map, e.tracks, path, e.title or "Semantic map", changes=e.changes, georeference=e.georeference
+        ),
     ),
     Format(
         "laz", "map.laz",

@@ -161,7 +161,7 @@ def calibration_counts(
         np.bincount(cells, weights, len(LOOKS) * CALIBRATION_BINS)
         for weights in (np.ones_like(sure), right, sure)
     ]
-    return np.stack(columns, axis=1).reshape(*shape, 3)
+    return np.asarray(np.stack(columns, axis=1).reshape(*shape, 3), np.float64)
 
 
 def calibration(counts: NDArray[np.float64]) -> dict[str, Any]:

@@ -2,12 +2,15 @@
 #   docker build -t gnss-sem-map . && docker run --rm -v "$PWD:/data" gnss-sem-map
 # --build-arg EXTRAS='[segmentation]' adds torch: its CPU build where pip is told to take that one.
 FROM python:3.11-slim
+# --build-arg VERSION=1.2.3 names the version, which is otherwise the fallback: .git is not copied.
 ARG EXTRAS=""
+ARG VERSION=""
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY gnss_sem_map gnss_sem_map
 COPY factor_graphs factor_graphs
-RUN pip install --no-cache-dir -c constraints.txt ".${EXTRAS}"
+RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_GNSS_SEM_MAP="${VERSION}" \
+    pip install --no-cache-dir -c constraints.txt ".${EXTRAS}"
 WORKDIR /data
 ENTRYPOINT ["gnss-sem-map"]
 CMD ["demo"]

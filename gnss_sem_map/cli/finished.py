@@ -59,7 +59,8 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="Some of viewer, laz, removed, ply, geotiff, geopackage, topview, perspective, copc; with commas.",
+            help="Some of viewer, laz, removed, ply, geotiff, geopackage, topview, perspective, flight, copc; "
+            "with commas.",
         ),
     ],
     out: Annotated[

@@ -27,6 +27,11 @@ def read_confidence(path: Path) -> NDArray[np.float16]:
     return found
 
 
+def read_looks(path: Path) -> NDArray[np.uint8]:
+    """The LiDAR points of the voxel of each point, 255 for more; raises DataError when it cannot be read."""
+    return _values(path, "u1")
+
+
 def _values(path: Path, dtype: str) -> NDArray[Any]:
     content, size = read_bytes(path, MOST_LABEL_BYTES), np.dtype(dtype).itemsize
     if len(content) % size:

@@ -17,6 +17,8 @@ from gnss_sem_map.labels.label_set import LabelSet, taxonomy
 MOVING_IDS = range(252, 260)
 """SemanticKITTI raw ids of moving objects; the vehicles among them map to the class `vehicle`."""
 CALIBRATION_BINS = 15
+LOOKS = (1, 2, 5, 20, 100)
+"""Lower ends of the groups of voxels by LiDAR points."""
 RAW_IDS = 1 << 16
 
 
@@ -142,22 +144,37 @@ def calibration_counts(
     prediction: NDArray[np.uint32],
     truth: NDArray[np.uint32],
     tables: Tables,
+    looks: NDArray[np.uint8],
 ) -> NDArray[np.float64]:
-    """Counts (bins, 3) of one scan by confidence: points, points that are right, sum of confidences."""
+    """Counts (groups, bins, 3) of one scan by the looks at their voxel and by confidence: points, points that are
+    right, sum of confidences. `looks` (n,) falls into the groups of `LOOKS`.
+    """
     true, predicted = tables.truth[truth & 0xFFFF], tables.prediction[prediction & 0xFFFF]
     use = (true >= 0) & (predicted >= 0) & (predicted < len(tables.label_set.names))
     sure = confidence[use].astype(np.float64)
     bins = np.minimum((sure * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
     right = (true == predicted)[use].astype(np.float64)
-    columns = [np.bincount(bins, weights, CALIBRATION_BINS) for weights in (np.ones_like(sure), right, sure)]
-    return np.stack(columns, axis=1)
+    group = np.maximum(np.searchsorted(LOOKS, looks[use], side="right") - 1, 0)
+    shape = (len(LOOKS), CALIBRATION_BINS)
+    cells = group * CALIBRATION_BINS + bins
+    columns = [
+        np.bincount(cells, weights, len(LOOKS) * CALIBRATION_BINS)
+        for weights in (np.ones_like(sure), right, sure)
+    ]
+    return np.asarray(np.stack(columns, axis=1).reshape(*shape, 3), np.float64)
 
 
 def calibration(counts: NDArray[np.float64]) -> dict[str, Any]:
     """Expected calibration error: mean of |share right - mean confidence| over bins, weighted by points.
 
     `bins`: the reliability curve, of every bin with points their number, mean confidence and share that is right.
+    `by_looks`: the same for the points in voxels of so many LiDAR points and more, up to the next group.
     """
+    groups = {str(low): _reliability(group) for low, group in zip(LOOKS, counts, strict=True) if group.any()}
+    return _reliability(counts.sum(axis=0)) | {"by_looks": groups}
+
+
+def _reliability(counts: NDArray[np.float64]) -> dict[str, Any]:
     points, right, sure = counts.T
     total = float(points.sum())
     bins = [

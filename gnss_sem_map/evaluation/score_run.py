@@ -13,7 +13,13 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.accuracy import SHARES, coverage, errors, pose_nees, relative_error
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
-from gnss_sem_map.datasets.label_files import label_files, read_confidence, read_labels, truth_folder
+from gnss_sem_map.datasets.label_files import (
+    label_files,
+    read_confidence,
+    read_labels,
+    read_looks,
+    truth_folder,
+)
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import metrics
 from gnss_sem_map.files.ownership import amend
@@ -65,6 +71,10 @@ def _check_scorable(out: Path) -> None:
         raise DataError(
             f"{shown(out / 'labels')}: no point labels in this run; make it again with --write-labels"
         )
+    if not is_folder(out / "looks"):
+        raise DataError(
+            f"{shown(out / 'looks')}: not in this run of an earlier version; make it again with --write-labels"
+        )
 
 
 def _known_metrics(out: Path) -> dict[str, Any]:
@@ -77,7 +87,7 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
     count = len(label_set.names)
     refined = np.zeros((count, count + 1), np.int64)
     raw, moved = refined.copy(), np.zeros((3, 2), np.int64)
-    sure = np.zeros((metrics.CALIBRATION_BINS, 3))
+    sure = np.zeros((len(metrics.LOOKS), metrics.CALIBRATION_BINS, 3))
     for name, true in _truths(out / "labels", truth_folder(truth)):
         where = f"{out / 'labels' / name}.label"
         predicted = read_labels(out / "labels" / f"{name}.label")
@@ -95,7 +105,10 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
         confidence = read_confidence(out / "confidence" / f"{name}.bin")
         if len(confidence) != len(predicted):
             raise DataError(f"{where}: found {len(confidence)} probabilities for {len(predicted)} labels")
-        sure += metrics.calibration_counts(confidence, predicted, true, tables)
+        looks = read_looks(out / "looks" / f"{name}.bin")
+        if len(looks) != len(predicted):
+            raise DataError(f"{where}: found {len(looks)} counts of looks for {len(predicted)} labels")
+        sure += metrics.calibration_counts(confidence, predicted, true, tables, looks)
     return {
         "semantics": {
             "raw": metrics.semantics(raw, label_set),

@@ -36,6 +36,7 @@ class Chart:
     width: int = WIDTH
     height: int = HEIGHT
     frame: tuple[int, int, int, int] = field(default=(LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM))
+    has_legend: bool = False
 
 
 Values = Sequence[float] | NDArray[np.float64]
@@ -53,8 +54,12 @@ def chart(
     width: int = WIDTH,
     height: int = HEIGHT,
     is_equal: bool = False,
+    has_legend: bool = False,
 ) -> Chart:
-    """A chart of some curves; without ranges the axes end at their values. `is_equal`: a metre is as long on both."""
+    """A chart of some curves; without ranges the axes end at their values. `is_equal`: a metre is as long on both.
+
+    `has_legend`: the names of the curves stand below; else they are seen where the mouse points.
+    """
     curves = list(curves)
     x_low, x_high = x_range or _range(np.concatenate([np.asarray(x, float) for _, _, x, _ in curves]))
     y_low, y_high = y_range or _range(np.concatenate([np.asarray(y, float) for _, _, _, y in curves]))
@@ -76,7 +81,7 @@ def chart(
     )
     x_ticks = tuple((x_px(value), f"{value:g}") for value in ticks(x_low, x_high))
     y_ticks = tuple((y_px(value), f"{value:g}") for value in ticks(y_low, y_high))
-    return Chart(title, x_title, y_title, lines, x_ticks, y_ticks, width, height, frame)
+    return Chart(title, x_title, y_title, lines, x_ticks, y_ticks, width, height, frame, has_legend)
 
 
 def ticks(low: float, high: float, most: int = 7) -> list[float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -106,16 +106,24 @@ class _Octree:
         places = np.floor((points - self.low) / edges[:, None]).astype(np.int64)
         return np.column_stack([levels, np.clip(places, 0, (1 << levels)[:, None] - 1)])
 
-    def tiles(self, node: Node, exported: Exported, georeference: Georeference) -> set[Tile]:
-        """Tiles of the map that may have points in a node."""
-        level, *place = node
-        edge = self.edge_m / 2.0**level
-        corners = self.low[:2] + edge * np.add(place[:2], [(0, 0), (0, 1), (1, 0), (1, 1)])
-        heights = np.full((4, 1), self.low[2] + self.edge_m / 2)
-        flat = georeference.to_map(np.hstack([corners, heights]))[:, :2] / exported.map.voxel_size_m
-        low, high = (np.floor(flat.min(axis=0) - 1), np.ceil(flat.max(axis=0) + 1))
-        (west, south), (east, north) = (corner.astype(int) >> TILE_BITS for corner in (low, high))
-        return {(x, y) for x, y in exported.map.tiles if west <= x <= east and south <= y <= north}
+    def tiles(
+        self, nodes: Sequence[Node], exported: Exported, georeference: Georeference
+    ) -> Iterator[set[Tile]]:
+        """Tiles of the map that may have points in each of some nodes."""
+        if not nodes:
+            return
+        levels, *places = np.array(nodes).T
+        edges = (self.edge_m / 2.0**levels)[:, None, None]
+        around = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
+        corners = self.low[:2] + edges * (np.stack(places[:2], axis=1)[:, None] + around)
+        heights = np.full((len(nodes), 4, 1), self.low[2] + self.edge_m / 2)
+        p_map = georeference.to_map(np.concatenate([corners, heights], axis=-1).reshape(-1, 3))
+        flat = p_map[:, :2].reshape(-1, 4, 2) / exported.map.voxel_size_m
+        lows, highs = (np.floor(flat.min(axis=1) - 1), np.ceil(flat.max(axis=1) + 1))
+        known = np.array(exported.map.tiles)
+        for low, high in zip(lows.astype(int) >> TILE_BITS, highs.astype(int) >> TILE_BITS, strict=True):
+            near = ((known >= low) & (known <= high)).all(axis=1)
+            yield set(map(tuple, known[near].tolist()))
 
 
 def _nodes(
@@ -127,14 +135,15 @@ def _nodes(
     missing: dict[Node, set[Tile]] = {}
     written: set[Node] = set()
 
-    def add(node: Node, records: NDArray[np.uint8]) -> None:
-        if node not in parts:
-            parts[node], missing[node] = [], octree.tiles(node, exported, georeference) & unread
-        parts[node].append(records)
+    def add(points: Sequence[tuple[Node, NDArray[np.uint8]]]) -> None:
+        fresh = [node for node, _ in points if node not in parts]
+        for node, tiles in zip(fresh, octree.tiles(fresh, exported, georeference), strict=True):
+            parts[node], missing[node] = [], tiles & unread
+        for node, records in points:
+            parts[node].append(records)
 
     for tile in exported.map.tiles:
-        for node, records in _points_of(exported.map.read_tile(tile), georeference, octree, header):
-            add(node, records)
+        add(list(_points_of(exported.map.read_tile(tile), georeference, octree, header)))
         unread.discard(tile)
         for tiles in missing.values():
             tiles.discard(tile)
@@ -145,7 +154,7 @@ def _nodes(
             # readers go down from the root and stop at a level without points: it gets one from below
             for above in _ancestors(node):
                 if len(records) and above not in parts and above not in written:
-                    add(above, records[:1])
+                    add([(above, records[:1])])
                     records = records[1:]
             del missing[node]
             if len(records):
@@ -163,11 +172,14 @@ def _points_of(
     points = las_points(piece, georeference, header)
     levels = np.maximum(octree.depth - _largest_cubes(piece), 0)
     nodes = octree.nodes(np.column_stack([points.x, points.y, points.z]), levels)
-    nodes, of = np.unique(nodes, axis=0, return_inverse=True)
-    order = np.argsort(of.ravel(), kind="stable")
+    packed = np.zeros(len(nodes), np.int64)  # one number sorts ten times as fast as a row
+    for column in nodes.T:
+        packed = packed << octree.depth | column
+    order = np.argsort(packed, kind="stable")
+    starts = np.flatnonzero(np.diff(packed[order], prepend=-1))
     records = np.ascontiguousarray(points.array).view(np.uint8).reshape(len(piece), -1)[order]
-    ends = np.cumsum(np.bincount(of.ravel(), minlength=len(nodes)))
-    yield from zip(map(tuple, nodes.tolist()), np.split(records, ends[:-1]), strict=True)
+    first = map(tuple, nodes[order[starts]].tolist())
+    yield from zip(first, np.split(records, starts[1:]), strict=True)
 
 
 def _ancestors(node: Node) -> Iterator[Node]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.flight import write_flight
 from gnss_sem_map.export.geopackage import write_geopackage
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
@@ -36,7 +37,9 @@ SMALL = 1_000_000
 FORMATS = (
     Format(
         "viewer", "viewer.html", "the map to turn and to ask, in any browser, offline",
-        lambda e, path: write_viewer(e.map, e.tracks, path, e.title or "Semantic map", changes=e.changes),
+        lambda e, path: write_viewer(
+            e.map, e.tracks, path, e.title or "Semantic map", changes=e.changes, georeference=e.georeference
+        ),
     ),
     Format(
         "laz", "map.laz",
@@ -58,6 +61,10 @@ FORMATS = (
     Format(
         "perspective", "perspective.png", "the map as a camera behind the vehicle would see it",
         write_perspective,
+    ),
+    Format(
+        "flight", "flight.webp", "a flight over the map along the longest track, as a moving picture",
+        write_flight, on_demand=True,
     ),
     Format(
         "copc", "map.copc.laz", "map.laz as an octree that is read in parts, for streaming and web viewers",

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.tiles import TiledMap
 
 MOST_CELLS = 800
 """Cells along the longer side of all tiles."""
-LOOKS = (1, 2, 5, 20, 100)
-"""Lower ends of the groups of voxels by LiDAR points."""
 AREA_CELL_M = 1.0
 
 

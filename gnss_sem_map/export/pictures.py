@@ -47,7 +47,8 @@ TRACK_COLOUR = (255, 214, 10)
 SKY = np.array([[13, 17, 28], [38, 48, 66]], np.float32)
 """RGB at the upper and the lower edge."""
 HOLLOWS = np.array([(2, 6.0, 0.1), (8, 2.5, 0.15), (24, 1.5, 0.25), (64, 1.0, 0.35)], np.float32)
-"""Pixels to the neighbour, strength, and the largest step in log depth that counts: edges, then wide shadows."""
+"""Pixels to the neighbour in a picture of that size, strength, and the largest step in log depth that counts: edges,
+then wide shadows."""
 
 UNLABELLED_BY_DAY, UNLABELLED_BY_NIGHT = (214, 217, 222), (72, 80, 97)
 UNLABELLED_ALONE = (150, 158, 172)
@@ -205,12 +206,18 @@ def write_perspective(exported: Exported, path: Path | str, camera: Camera | Non
         raise DataError(NO_VOXELS)
     if camera is None:
         camera = _best_behind(exported) if exported.tracks else _from_the_south(exported)
-    unlabelled = UNLABELLED_BY_NIGHT if extent.labels[:-1].any() else UNLABELLED_ALONE
-    image = _lit(exported, np.vstack([label_set.colours, unlabelled, TRACK_COLOUR]), camera)
-    entries = _legend_entries(extent.labels, label_set, unlabelled)
+    colours = colours_by_night(exported)
+    image = lit_view(exported, colours, camera)
+    entries = _legend_entries(extent.labels, label_set, colours[-2])
     if exported.tracks:
         entries.append(("track", TRACK_COLOUR))
     _write_png(np.vstack([image, _legend(image.shape[1], entries)]), path)
+
+
+def colours_by_night(exported: Exported) -> NDArray[np.uint8]:
+    """(c + 2, 3) RGB before a dark sky: of the classes, of no label, and of the tracks."""
+    unlabelled = UNLABELLED_BY_NIGHT if exported.extent.labels[:-1].any() else UNLABELLED_ALONE
+    return np.vstack([exported.map.label_set.colours, unlabelled, TRACK_COLOUR]).astype(np.uint8)
 
 
 def _behind(T_map_imu: NDArray[np.float64]) -> Camera:
@@ -250,7 +257,7 @@ def _best_behind(exported: Exported) -> Camera:
 
 def _before_the_end(track: Trajectory) -> NDArray[np.float64]:
     """The poses (k, 4, 4) from which a camera still looks at what was driven."""
-    along = _along(track)
+    along = driven_m(track)
     poses: NDArray[np.float64] = track.T_map_imu[along <= max(0.0, along[-1] - AHEAD_M / 2)]
     return poses
 
@@ -270,17 +277,17 @@ def _camera(eye: NDArray[np.float64], target: NDArray[np.float64]) -> Camera:
 
 def _beads(trajectory: Trajectory) -> NDArray[np.float64]:
     """Points (n, 3) m along the track, dense enough to be drawn as a line."""
-    along = _along(trajectory)
+    along = driven_m(trajectory)
     steps = np.arange(0.0, along[-1], BEAD_M / 2)
     return np.column_stack([np.interp(steps, along, axis) for axis in trajectory.positions.T])
 
 
-def _along(trajectory: Trajectory) -> NDArray[np.float64]:
+def driven_m(trajectory: Trajectory) -> NDArray[np.float64]:
     """Distance driven up to every pose, (k,) m."""
     return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)))
 
 
-def _lit(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+def lit_view(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog, nearest tiles first.
 
     The palette holds the colours of the classes, of no label, and of the tracks.
@@ -305,7 +312,9 @@ def _lit(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDAr
         order = _nearest_first(centres, camera.eye, reach_m)
         draw_cubes(picture, fine, centres[order], half_m, numbers[order], camera.eye, reach_m)
     sky = np.linspace(SKY[0], SKY[1], fine.height_px, dtype=np.float32)
-    image = lit(picture, palette.astype(np.float32), sky, distance, HOLLOWS, SUPERSAMPLING)
+    hollow = HOLLOWS.copy()
+    hollow[:, 0] = np.maximum(1, hollow[:, 0] * camera.width_px // PERSPECTIVE_PX[0])
+    image = lit(picture, palette.astype(np.float32), sky, distance, hollow, SUPERSAMPLING)
     return np.rint(image).astype(np.uint8)
 
 

@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.export.charts import Chart, Curve, chart
 from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.export.overview import Overview, coverage_pixels, label_pixels, overview_of
@@ -45,6 +46,7 @@ FILES = {
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",
     "confidence": "the probability of each of these labels, float16",
+    "looks": "the LiDAR points of the voxel of each of these points, at most 255, uint8",
     "removed": "1 for every LiDAR point on a moving vehicle that was taken out of the map",
     "config.yaml": "all settings of this run",
     "run.json": "the content of this page about the run, machine-readable",
@@ -52,6 +54,8 @@ FILES = {
 }
 MANY_SKIPS = 200
 """Number of skips on the page; run.json lists all."""
+ENOUGH_POINTS = 200
+"""Of a bin of the reliability curve of a group: the share of fewer is chance."""
 MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
 MAPS = {"map": "before refinement", "refined": "after refinement"}
@@ -82,7 +86,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "map_figures": {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map},
         "calibration": _shares(metrics.get("calibration", {})),
         "looks": [] if refined is None else list(_looks(refined)),
-        "reliability": _reliability(metrics.get("calibration", {}).get("bins", ())),
+        "reliability": _reliability(metrics.get("calibration", {})),
         "dynamic": _shares(metrics.get("dynamic", {})),
         "path": _path(tracks, refinement.get("tracked", ())),
         "band": _band(tracks),
@@ -151,23 +155,35 @@ def _coarse_pictures(overviews: Mapping[str, Overview]) -> Iterator[tuple[str, s
 
 def _looks(overview: Overview) -> Iterator[tuple[str, int, str | None]]:
     """Rows of the confidence by LiDAR points of a voxel."""
-    ends = [*(str(low - 1) for low in list(overview.by_looks)[1:]), ""]
-    for (low, (voxels, mean)), end in zip(overview.by_looks.items(), ends, strict=True):
+    for low, (voxels, mean) in overview.by_looks.items():
         if voxels:
-            group = f"{low} and more" if not end else end if end == str(low) else f"{low} to {end}"
-            yield group, voxels, percent(mean)
+            yield _group(low), voxels, percent(mean)
 
 
-def _reliability(bins: Sequence[Mapping[str, float]]) -> Chart | None:
-    """Share of right labels over stated confidence; None without truth."""
-    if not bins:
+def _group(low: int) -> str:
+    """The group of `LOOKS` with this lower end, in words."""
+    end = next((each - 1 for each in LOOKS if each > low), None)
+    return f"{low} and more" if end is None else f"{low}" if end == low else f"{low} to {end}"
+
+
+def _reliability(calibration: Mapping[str, Any]) -> Chart | None:
+    """Share of right labels over stated confidence, of all and by the looks at a voxel; None without truth."""
+    if not calibration.get("bins"):
         return None
-    x, y = [each["confidence"] for each in bins], [each["right"] for each in bins]
+    curves: list[Curve] = [("both agree", "c", (0, 1), (0, 1))]
+    for low, group in calibration.get("by_looks", {}).items():
+        enough = [each for each in group["bins"] if each["points"] >= ENOUGH_POINTS]
+        if int(low) in LOOKS and enough:
+            curves.append((_group(int(low)), f"g{LOOKS.index(int(low))}", *_confidence_and_right(enough)))
+    curves.append(("all", "b", *_confidence_and_right(calibration["bins"])))
     return chart(
-        "How often labels of a stated confidence are right, measured against truth; on the dashed line both agree.",
-        "stated confidence", "share that is right", [("ideal", "c", (0, 1), (0, 1)), ("measured", "a", x, y)],
-        (0, 1), (0, 1), width=420, height=340,
+        "How often labels of a stated confidence are right, measured against truth, by the LiDAR points of the voxel.",
+        "stated confidence", "share that is right", curves, (0, 1), (0, 1), width=420, height=340, has_legend=True,
     )  # fmt: skip
+
+
+def _confidence_and_right(bins: Sequence[Mapping[str, float]]) -> tuple[list[float], list[float]]:
+    return [each["confidence"] for each in bins], [each["right"] for each in bins]
 
 
 def _path(tracks: Mapping[str, Track], tracked: Sequence[Mapping[str, Any]]) -> Chart | None:

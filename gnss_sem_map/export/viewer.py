@@ -24,6 +24,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.changes import box_corners
 from gnss_sem_map.export.exported import NO_VOXELS
+from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.placing import fitted_placing
 from gnss_sem_map.export.viewer_levels import Node, lowest_tile, visit_nodes
 from gnss_sem_map.files.atomic import adding_folder, replacing
 from gnss_sem_map.labels.label_set import LabelSet
@@ -37,7 +39,7 @@ PACKING = 4
 """Level of compression: 4 % larger than with zlib's usual 6, in 40 % of its time."""
 MOST_POSES = 50_000
 """Of longer tracks the page holds every second pose, every third, ..."""
-SCRIPTS = ("viewer_shaders.js", "viewer_levels.js", "viewer.js")
+SCRIPTS = ("viewer_shaders.js", "viewer_levels.js", "viewer_clicks.js", "viewer_link.js", "viewer.js")
 FINER_ALLOWED = " 'self' file:"
 """What a page with a folder may load beside what is in it: scripts from its own place."""
 
@@ -49,14 +51,16 @@ def write_viewer(
     title: str = "Semantic map",
     most_voxels: int = 3_000_000,
     changes: Sequence[Mapping[str, Any]] = (),
+    georeference: Georeference | None = None,
 ) -> None:
     """Write the map as an HTML page that works from file://, some 2 MB per million voxels.
 
     Classes, the tracks, removed and unlabelled voxels are layers to switch, and so are the boxes of `changes` (rows of
     `Change.about`); colours show class, height, confidence or where the class comes from; a click tells what a voxel or
-    a box is. Up to `most_voxels` the page holds the map. Above,
-    voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of the page's name (`viewer/`
-    beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map is read tile by tile.
+    a box is, and with `georeference` where on Earth. The address of the page follows the view. Up to `most_voxels` the
+    page holds the map. Above, voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of
+    the page's name (`viewer/` beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map
+    is read tile by tile.
     Raises DataError for an empty map, when that folder exists, and when a file cannot be written.
     """
     path = Path(path)
@@ -67,7 +71,12 @@ def write_viewer(
     with adding_folder(path.with_suffix("")) as folder:
         levels = _Levels(folder, most_voxels, len(tiled_map.label_set.names))
         visit_nodes(tiled_map, levels.add, most_voxels)
-        page = _page(levels, tiled_map, tracks, changes, path.stem, title)
+        if not levels.in_page:
+            raise DataError(NO_VOXELS)
+        meta = _meta(levels, tiled_map, tracks, changes)
+        if georeference is not None:
+            meta["placing"] = fitted_placing(georeference, *_box(levels, tiled_map))
+        page = _page(levels, meta, path.stem, title)
         with replacing(path) as file:
             file.write(page.encode("utf-8"))
 
@@ -135,18 +144,9 @@ def _encoded(node: Node) -> str:
     return base64.b64encode(packed).decode("ascii")
 
 
-def _page(
-    levels: _Levels,
-    tiled_map: TiledMap,
-    tracks: Sequence[Trajectory],
-    changes: Sequence[Mapping[str, Any]],
-    folder: str,
-    title: str,
-) -> str:
+def _page(levels: _Levels, meta: dict[str, Any], folder: str, title: str) -> str:
     nodes = levels.in_page
-    if not nodes:
-        raise DataError(NO_VOXELS)
-    meta = _meta(levels, tiled_map, tracks, changes) | ({"folder": folder} if nodes[0].level else {})
+    meta |= {"folder": folder} if nodes[0].level else {}
     assets = resources.files("gnss_sem_map.export") / "assets"
     return Template((assets / "viewer.html").read_text("utf-8")).substitute(
         title=html.escape(title),
@@ -202,6 +202,15 @@ def _meta(
             )
         ],
     }
+
+
+def _box(levels: _Levels, tiled_map: TiledMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest corner (3,) m of what the map may hold, in the map frame."""
+    tiles = np.array(tiled_map.tiles) << TILE_BITS
+    finest = np.array([about[3:5] for about in levels.listed if about[0] == 0])
+    low = [*tiles.min(axis=0), finest[:, 0].min() - Z_OFFSET]
+    high = [*tiles.max(axis=0) + (1 << TILE_BITS), finest[:, 1].max() + 1 - Z_OFFSET]
+    return np.array(low) * tiled_map.voxel_size_m, np.array(high) * tiled_map.voxel_size_m
 
 
 def _changed_box(change: Mapping[str, Any], voxel_m: float, origin: NDArray[np.int64]) -> dict[str, Any]:

@@ -40,6 +40,8 @@ class PointLabels:
     """(n,) probability of that class, 0 if unknown."""
     removed: NDArray[np.bool_]
     """(n,) mask of the points of moving objects."""
+    looks: NDArray[np.uint8]
+    """(n,) LiDAR points of the voxel, 255 for more; 0 if unknown."""
 
 
 def label_points(
@@ -135,10 +137,12 @@ def _look_up(semantic_map: SemanticMap, places: NDArray[np.int64], valid: NDArra
         labels=np.full(len(valid), UNLABELLED, np.int8),
         confidence=np.zeros(len(valid), np.float32),
         removed=np.zeros(len(valid), np.bool_),
+        looks=np.zeros(len(valid), np.uint8),
     )
     found.labels[known] = semantic_map.labels[places]
     found.confidence[known] = semantic_map.confidence[places]
     found.removed[known] = semantic_map.states[places] == State.REMOVED
+    found.looks[known] = np.minimum(semantic_map.voxels.hits[places], 255)
     return found
 
 

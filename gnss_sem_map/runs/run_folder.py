@@ -50,7 +50,7 @@ from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 
 RAW_LABELS = "labels_raw"
-LABELS = ("labels", RAW_LABELS, "confidence", "removed")
+LABELS = ("labels", RAW_LABELS, "confidence", "looks", "removed")
 """Folders of the point labels of one drive."""
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
 
@@ -58,7 +58,7 @@ PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless",
 RUN_FILES = re.compile(
     "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
     + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
-    r"|(labels|labels_raw|removed)/(\d+\.label)?|confidence/(\d+\.bin)?"
+    r"|(labels|labels_raw|removed)/(\d+\.label)?|(confidence|looks)/(\d+\.bin)?"
 )
 """Pattern of all paths in run folders of older versions, which have no list of their files."""
 
@@ -279,11 +279,12 @@ def write_point_labels(
     known_raw: Path | None = None,
     run: Path | None = None,
 ) -> None:
-    """Write for every original point: class before and after refinement, confidence, and whether it was removed.
+    """Write for every original point: class before and after refinement, confidence, LiDAR points of its voxel, and
+    whether it was removed.
 
-    `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16.
-    Of several LiDARs, each has a folder of its name. `known_raw`: a folder with the labels before refinement, which are
-    copied. `run`: the folder of the maps, if it is another one.
+    `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16,
+    looks/ uint8. Of several LiDARs, each has a folder of its name. `known_raw`: a folder with the labels before
+    refinement, which are copied. `run`: the folder of the maps, if it is another one.
     """
     for name in LABELS:
         for one in log.by_lidar:
@@ -303,6 +304,7 @@ def write_point_labels(
                 ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{place}.label")
             ids[refined.labels].tofile(folder / "labels" / f"{place}.label")
             refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{place}.bin")
+            refined.looks.tofile(folder / "looks" / f"{place}.bin")
             refined.removed.astype("<u4").tofile(folder / "removed" / f"{place}.label")
 
 

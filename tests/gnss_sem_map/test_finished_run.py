@@ -75,7 +75,7 @@ def test_refining_needs_no_drive_where_there_are_no_point_labels_and_works_in_pl
     folder = tmp_path / "run"
     finished.refine(finished.settings, folder)
     alone = Run.open(folder)
-    for name in ("labels", "labels_raw", "confidence", "removed"):
+    for name in ("labels", "labels_raw", "confidence", "looks", "removed"):
         shutil.rmtree(folder / name)
     other = with_refinement(alone.settings, count_grid={"enabled": False})
     again = alone.refine(other)

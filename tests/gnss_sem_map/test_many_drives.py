@@ -435,7 +435,7 @@ def test_a_map_of_many_drives_is_merged_with_all_its_keyframe_scans(made: dict[s
 
 
 def labels_of(drive: Path) -> dict[str, bytes]:
-    names = ("labels", "labels_raw", "confidence", "removed")
+    names = ("labels", "labels_raw", "confidence", "looks", "removed")
     files = [path for name in names for path in (drive / name).iterdir()]
     return {path.relative_to(drive).as_posix(): path.read_bytes() for path in files}
 

@@ -125,7 +125,7 @@ def watched(folder: Path, words: Sequence[str | Path], **dies: int) -> Watched:
 
 def results_of(out: Path) -> dict[str, bytes]:
     """What a run must give again, byte for byte."""
-    folders = ("map", "refined", "labels", "labels_raw", "removed", "confidence")
+    folders = ("map", "refined", "labels", "labels_raw", "removed", "confidence", "looks")
     files = [path for name in folders for path in (out / name).rglob("*") if path.is_file()]
     return {str(path.relative_to(out)): path.read_bytes() for path in [*files, *out.glob("trajectory*")]}
 

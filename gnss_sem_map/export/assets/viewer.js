@@ -10,7 +10,6 @@ const ORIGIN_COLOURS = [[150, 150, 150], [90, 150, 255], [255, 170, 60], [90, 21
 const meta = JSON.parse(document.getElementById("meta").textContent);
 const canvas = document.querySelector("canvas");
 const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer: true });
-const hash = new URLSearchParams(location.hash.slice(1));  // #colour=height&hide=building,vegetation
 const MOST_BEADS = 500000;
 // Pairs of corners of a box, the lower four first.
 const EDGES = [0, 1, 2, 3].flatMap(i => [[i, (i + 1) % 4], [i + 4, (i + 1) % 4 + 4], [i, i + 4]]);
@@ -22,12 +21,12 @@ const lineLayers = [
     lines: meta.tracks.map(points => ({ points, text: "track" })) },
   boxLayer("appeared", [80, 230, 255], meta.changes.filter(({ layer }) => layer === "appeared")),
   boxLayer("vanished", [255, 80, 220], meta.changes.filter(({ layer }) => layer === "vanished")),
+  { name: "measured", colour: [255, 255, 255], count: 0, lines: [] },
 ];
 const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], count: meta.unlabelled },
                 ...lineLayers];
-const hidden = new Set((hash.get("hide") ?? (meta.classes.some(c => c.count) ? "unlabelled" : "")).split(","));
-const visible = layers.map(layer => !hidden.has(layer.name));
-let showRemoved = hash.has("removed"), mode = 0, frameAsked = false;
+const visible = layers.map(() => true), rows = [];
+let showRemoved = false, mode = 0, frameAsked = false;
 const camera = { azimuth: -0.6, elevation: 0.65, distance: meta.view.distance, target: [...meta.view.target] };
 
 // Puts voxels onto the graphics card: for each the cell, as numbers of a kind, then class, confidence and origin.
@@ -174,7 +173,7 @@ function draw() {
   const tangents = [canvas.width, canvas.height].map(pixels => pixels / (2 * focal));
   const view = { eye, axes: [right, up, forward], focal, tangents }, wanted = needed(scene.roots, view);
   scene.drawn = ranges(scene.roots, wanted, view);
-  if (scene.lines) scene.drawn.push([scene.lines, 0, scene.lines.count]);
+  for (const node of [scene.lines, scene.measured]) if (node) scene.drawn.push([node, 0, node.count]);
   const palette = layers.flatMap((layer, i) => [...layer.colour.map(c => c / 255), visible[i] ? 1 : 0]);
   const flat = colours => colours.flat().map(c => c / 255);
   gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
@@ -205,6 +204,7 @@ function draw() {
       gl.uniform3fv(cubes.at("corner"), node.corner.map((v, k) => v - eye[k]));
       gl.uniform1f(cubes.at("scale"), node.scale);
       gl.uniform1ui(cubes.at("before"), node.before);
+      gl.depthFunc(node === scene.measured ? gl.ALWAYS : gl.LESS);  // seen through the ground that it is measured on
     }
     gl.drawArrays(gl.POINTS, first, count);
   }
@@ -224,49 +224,14 @@ function draw() {
 
 function redraw() {
   if (!frameAsked) frameAsked = requestAnimationFrame(draw);
+  linkSoon();
 }
 
-// What the picture shows at a pointer: the node, the number in it, the place, class, confidence and origin; null for the
-// sky.
-function voxelAt(event) {
-  const scale = canvas.width / innerWidth, found = new Uint32Array(4);
-  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
-  gl.readBuffer(gl.COLOR_ATTACHMENT1);
-  gl.readPixels(event.clientX * scale, canvas.height - 1 - event.clientY * scale, 1, 1,
-                gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
-  if (!found[0]) return null;
-  const number = found[0] - 1;
-  const [node] = scene.drawn.find(([{ before, count }]) => number >= before && number < before + count);
-  const stride = node === scene.lines ? 16 : STRIDE, bytes = new Uint8Array(stride);
-  gl.bindBuffer(gl.ARRAY_BUFFER, node.buffer);
-  gl.getBufferSubData(gl.ARRAY_BUFFER, stride * (number - node.before), bytes);
-  const cell = node === scene.lines ? new Float32Array(bytes.buffer, 0, 3) : new Int16Array(bytes.buffer, 0, 3);
-  const place = [...cell].map((v, k) => (v + 0.5) * node.scale + node.corner[k]);
-  return [node, number - node.before, place, ...bytes.subarray(stride - 4)];
-}
-
-function pick(event) {
-  const found = voxelAt(event);
-  document.getElementById("picked").textContent = found ? described(...found) : "";
-}
-
-function described(node, number, place, label, confidence, origin) {
-  const metres = place.map((v, k) => ((v + meta.origin[k]) * meta.voxel_m).toFixed(1));
-  const what = node === scene.lines ? node.texts[number] : `${layers[label]?.name}, ${ORIGINS[origin]}`
-    + (label < classes ? `, probability ${(confidence / 255).toFixed(2)}` : "")
-    + (node.level ? `, the most hit voxel in ${inMetres(node.scale)} m` : "");
-  return `${what}\neast ${metres[0]} m, north ${metres[1]} m, up ${metres[2]} m`;
-}
-
-function goTo(event) {
-  const found = voxelAt(event);
-  if (!found) return;
-  camera.target = found[2];
-  zoom(1 / 3);
-}
+const clampedDistance = distance => Math.min(FAR / 10, Math.max(5, distance));
+const clampedElevation = elevation => Math.min(1.55, Math.max(0.02, elevation));
 
 function zoom(factor) {
-  camera.distance = Math.min(FAR / 10, Math.max(5, camera.distance * factor));
+  camera.distance = clampedDistance(camera.distance * factor);
   redraw();
 }
 
@@ -292,19 +257,20 @@ function listen() {
     zoom(apartBefore / apart());
     moved += Math.abs(dx) + Math.abs(dy);
     if (event.buttons & 2 || event.shiftKey || pointers.size > 1) {
-      const { right, forward } = axesOf(camera), step = camera.distance / (0.9 * innerHeight);
+      const { right, forward } = axesOf(camera);
+      const step = camera.distance / (0.9 * innerHeight * Math.max(1, pointers.size));  // each finger moves its part
       const level = Math.hypot(forward[0], forward[1]);
       camera.target[0] += step * (-dx * right[0] + dy * forward[0] / level);
       camera.target[1] += step * (-dx * right[1] + dy * forward[1] / level);
     } else {
       camera.azimuth += 0.006 * dx;
-      camera.elevation = Math.min(1.55, Math.max(0.02, camera.elevation + 0.006 * dy));
+      camera.elevation = clampedElevation(camera.elevation + 0.006 * dy);
     }
     redraw();
   });
   for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, event => {
     pointers.delete(event.pointerId);
-    if (name === "pointerup" && moved < 4) pick(event);
+    if (name === "pointerup" && moved < (event.pointerType === "touch" ? 12 : 4)) pick(event);
   });
   canvas.addEventListener("dblclick", goTo);
   canvas.addEventListener("wheel", event => {
@@ -312,26 +278,58 @@ function listen() {
     zoom(Math.exp(0.001 * event.deltaY));
   }, { passive: false });
   addEventListener("resize", redraw);
+  document.querySelector("select").addEventListener("change", event => { colourBy(event.target.value); redraw(); });
+  document.getElementById("measure").addEventListener("change", event => measure(event.target.checked));
 }
 
-function addLayer(name, colour, count, checked, change) {
-  const row = document.createElement("label"), box = document.createElement("input");
-  const patch = document.createElement("i"), number = document.createElement("b");
-  Object.assign(box, { type: "checkbox", checked, onchange: () => { change(box.checked); redraw(); } });
+function patchOf(colour) {
+  const patch = document.createElement("i");
   patch.style.background = `rgb(${colour})`;
+  return patch;
+}
+
+// `coloursHere(mode)`: whether a colour mode paints the layer in its own colour.
+function addLayer(name, colour, count, coloursHere, isOn, change) {
+  const row = document.createElement("label"), box = document.createElement("input");
+  const patch = patchOf(colour), number = document.createElement("b");
+  Object.assign(box, { type: "checkbox", onchange: () => { change(box.checked); redraw(); } });
   number.textContent = count.toLocaleString("en");
   row.append(box, patch, name, number);
   document.getElementById("layers").append(row);
+  rows.push(() => {
+    box.checked = isOn();
+    patch.style.visibility = coloursHere(mode) ? "visible" : "hidden";
+  });
+}
+
+function addLayers() {
+  layers.forEach(({ name, colour, count }, i) => {
+    const own = m => m === 0 || i > classes || (i === classes && m === 2);
+    if (count) addLayer(name, colour, count, own, () => visible[i], on => { visible[i] = on; });
+  });
+  if (meta.removed) addLayer("removed", ORIGIN_COLOURS[REMOVED], meta.removed, () => true,
+                             () => showRemoved, on => { showRemoved = on; });
+  ORIGINS.forEach((name, i) => {
+    if (i === REMOVED) return;  // a layer of its own
+    const row = document.createElement("div");
+    row.append(patchOf(ORIGIN_COLOURS[i]), name);
+    document.getElementById("origins").append(row);
+  });
 }
 
 function colourBy(name) {
   const select = document.querySelector("select"), ramp = document.getElementById("ramp");
   select.value = name;
-  mode = Math.max(0, select.selectedIndex);
-  const ends = mode === 1 ? meta.heights.map(h => `${((h + meta.origin[2]) * meta.voxel_m).toFixed(1)} m`) : ["0", "1"];
-  [...ramp.children].forEach((end, i) => { end.textContent = ends[i]; });
-  ramp.style.display = mode === 1 || mode === 2 ? "flex" : "none";
+  if (select.selectedIndex < 0) select.selectedIndex = 0;
+  mode = select.selectedIndex;
+  const [low, high] = mode === 1 ? meta.heights.map(h => (h + meta.origin[2]) * meta.voxel_m) : [0, 1];
+  [...ramp.children].forEach((tick, i) => {
+    tick.textContent = mode === 1 ? `${(low + (high - low) * i / 2).toFixed(1)} m` : low + (high - low) * i / 2;
+  });
+  ramp.hidden = mode !== 1 && mode !== 2;
   ramp.style.background = `linear-gradient(90deg, ${RAMP.map(c => `rgb(${c})`)})`;
+  document.getElementById("origins").hidden = mode !== 3;
+  rows.forEach(update => update());
 }
 
 async function main() {
@@ -340,17 +338,12 @@ async function main() {
   const texts = document.getElementById("voxels").textContent.split("\n");
   await Promise.all(roots.map((root, i) => unpack(root, texts[i])));
   const lines = lineLayers.flatMap((layer, i) => layer.lines.map(line => ({ ...line, layer: classes + 1 + i })));
-  scene = { nodes, roots, drawn: [], views: 0, lines: lines.length ? beadNode(lines) : null,
+  scene = { nodes, roots, drawn: [], views: 0, lines: lines.length ? beadNode(lines) : null, measured: null,
             nothing: gl.createVertexArray(), cubes: program(VERTEX, FRAGMENT), lighting: program(SCREEN, LIGHTING) };
-  layers.forEach((layer, i) => {
-    if (layer.count) addLayer(layer.name, layer.colour, layer.count, visible[i], on => { visible[i] = on; });
-  });
-  if (meta.removed) {
-    addLayer("removed", ORIGIN_COLOURS[REMOVED], meta.removed, showRemoved, on => { showRemoved = on; });
-  }
+  addLayers();
   document.getElementById("about").textContent = meta.about;
-  document.querySelector("select").addEventListener("change", event => { colourBy(event.target.value); redraw(); });
-  colourBy(hash.get("colour") ?? "class");
+  document.getElementById("panel").open = innerWidth > 600;
+  followLink();
   listen();
   draw();
   document.title = `ready: ${meta.count} voxels`;

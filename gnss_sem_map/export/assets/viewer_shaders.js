@@ -13,7 +13,7 @@ uniform vec3 corner;                  // of the node, from the eye
 uniform vec2 size;
 uniform float focal, largest, scale, eyeHeight;
 uniform uint before;                  // voxels of the nodes that were drawn before
-uniform vec4 palette[68];             // rgb and whether it is shown
+uniform vec4 palette[69];             // rgb and whether it is shown
 uniform vec3 ramp[5], origins[6];
 uniform vec2 heights;
 uniform int mode, firstLine;

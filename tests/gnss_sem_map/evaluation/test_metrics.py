@@ -146,7 +146,22 @@ def test_a_calibrated_confidence_has_no_calibration_error_and_a_boast_has_its_si
     confidence = rng.uniform(0.2, 1.0, len(truth))
     wrong = rng.random(len(truth)) > confidence
     prediction = np.where(wrong, np.where(truth == 40, 48, 40), truth).astype(np.uint32)
-    counts = metrics.calibration_counts(confidence, prediction, truth, TABLES)
+    looks = rng.integers(1, 255, len(truth)).astype(np.uint8)
+    counts = metrics.calibration_counts(confidence, prediction, truth, TABLES, looks)
     assert metrics.calibration(counts)["ece"] < 0.005
-    boast = metrics.calibration_counts(np.ones(len(truth)), prediction, truth, TABLES)
+    boast = metrics.calibration_counts(np.ones(len(truth)), prediction, truth, TABLES, looks)
     assert metrics.calibration(boast)["ece"] == pytest.approx(wrong.mean())
+
+
+def test_reliability_is_told_apart_by_the_looks_at_a_voxel() -> None:
+    truth = ids(*[40] * 10)
+    prediction = ids(40, 48, 40, 40, 40, 40, 48, 48, 40, 0)
+    looks = np.array([1, 1, 2, 4, 5, 19, 20, 100, 255, 1], np.uint8)  # the last point has no label
+    found = metrics.calibration(
+        metrics.calibration_counts(np.full(10, 0.8), prediction, truth, TABLES, looks)
+    )
+    assert {low: group["bins"] for low, group in found["by_looks"].items()} == {
+        low: [{"points": 2, "confidence": pytest.approx(0.8), "right": right}]
+        for low, right in (("1", 0.5), ("2", 1.0), ("5", 1.0), ("100", 0.5))
+    } | {"20": [{"points": 1, "confidence": pytest.approx(0.8), "right": 0.0}]}
+    assert found["bins"] == [{"points": 9, "confidence": pytest.approx(0.8), "right": pytest.approx(6 / 9)}]

@@ -14,6 +14,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.flight import write_flight
 from gnss_sem_map.export.geopackage import write_geopackage
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
@@ -33,6 +34,7 @@ WRITERS: dict[str, Writer] = {
     "map.gpkg": lambda m, t, f, path: write_geopackage(Exported(in_memory(m, f), [t]), path),
     "topview.png": lambda m, t, f, path: write_topview(Exported(in_memory(m, f), [t]), path),
     "perspective.png": lambda m, t, f, path: write_perspective(Exported(in_memory(m, f), [t]), path),
+    "flight.webp": lambda m, t, f, path: write_flight(Exported(in_memory(m, f), [t]), path),
     "topview_class.tif": lambda m, t, f, path: write_topview_geotiff(Exported(in_memory(m, f), [t]), path),
     "viewer.html": lambda m, t, f, path: write_viewer(in_memory(m), [t], path),
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),

@@ -224,3 +224,19 @@ def test_the_page_loads_nothing_from_anywhere(tmp_path: Path) -> None:
     text = (tmp_path / "report.html").read_text("utf-8")
     assert "default-src 'none'" in text
     assert not re.findall(r"<script|<link|https?://|@import|url\(", text)
+
+
+def test_the_reliability_curve_is_told_apart_by_looks_where_there_are_enough_points(tmp_path: Path) -> None:
+    def bins(points: int) -> list[dict[str, float]]:
+        return [{"points": points, "confidence": c, "right": c - 0.1} for c in (0.3, 0.6, 0.9)]
+
+    groups = {
+        "1": {"ece": 0.1, "bins": bins(1000)},
+        "2": {"ece": 0.1, "bins": bins(3)},
+        "100": {"bins": bins(500)},
+    }
+    calibration = {"ece": 0.1, "bins": bins(1503), "by_looks": groups}
+    report(tmp_path, RUN, METRICS | {"calibration": calibration})
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert re.findall(r'<i class="key \w+"></i>([^<]*)<', text) == ["both agree", "1", "100 and more", "all"]
+    assert text.count("<polyline") == 4

@@ -13,7 +13,9 @@ import pytest
 from browsers import Browser, opened_browser
 from viewer_pages import hostile, written
 
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 
@@ -82,7 +84,7 @@ def test_what_changed_is_a_layer_of_boxes_that_say_what_they_are(
         said.append(browser.run("return document.getElementById('picked').textContent"))
     assert said[0].startswith("road")
     assert said[1].startswith(
-        "vehicle appeared (parked), 4.0 x 2.0 x 1.5 m, between monday and tuesday\neast 31.0 m"
+        "vehicle appeared (parked), 4.0 x 2.0 x 1.5 m, between monday and tuesday\nmap: east 31.0 m"
     )
     browser.run(
         "[...document.querySelectorAll('#layers label')].find(l => l.textContent === 'appeared1').click()"
@@ -284,3 +286,128 @@ def test_a_click_on_a_joined_voxel_says_so(browser: Browser, town: SemanticMap, 
     assert "the most hit voxel in 0.8 m" in said
     place = [float(number) for number in re.findall(r"(-?\d+\.\d) m", said.split("\n")[1])]
     assert place[:2] == pytest.approx([110, 6], abs=2.0)
+
+
+def said_at_the_middle(browser: Browser) -> str:
+    browser.run("draw(); pick({ clientX: innerWidth / 2, clientY: innerHeight / 2 });")
+    return str(browser.run("return document.getElementById('picked').textContent"))
+
+
+def test_a_click_tells_the_place_on_earth_as_pyproj_does(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    georeference = Georeference(LocalFrame(49.0, 8.4, 100.0))
+    written(tmp_path, street, None, georeference=georeference)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    look_at(browser, (30, 1, 0), 20)
+    browser.run("camera.elevation = 1.5")
+    said = said_at_the_middle(browser)
+    assert "WGS 84 / UTM zone 32N (EPSG:32632): " in said
+    place = [float(number) for number in re.findall(r"(-?\d+\.\d) (?:E|N|m above)", said)]
+    p_map = np.array([[float(number) for number in re.findall(r"(?:east|north|up) (-?\d+\.\d) m", said)]])
+    assert place == pytest.approx(georeference.from_map(p_map)[0], abs=0.11)
+    degrees = [float(number) for number in re.findall(r"(\d+\.\d+)°", said)]
+    lat_deg, lon_deg, _ = georeference.frame.to_geodetic(p_map)
+    assert degrees == pytest.approx([lat_deg[0], lon_deg[0]], abs=2e-6)
+
+
+def test_the_distance_of_clicks_is_that_of_their_places(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    browser.run("camera.elevation = 1.5; document.getElementById('measure').click()")
+    before = count(browser.screenshot(), np.ones(3))
+    places = [(30, 1, 0), (20, 1, 0), (20, -3, 0)]
+    for place in places:
+        look_at(browser, place, 20)
+        said = said_at_the_middle(browser)
+    found = [float(number) for number in re.findall(r"(\d+\.\d) m", said)]
+    assert said.startswith("distance ")
+    assert found[:2] == pytest.approx([4, 4], abs=0.41)  # a voxel at each end
+    assert "\n2 parts: " in said
+    assert found[3] == pytest.approx(14, abs=0.81)
+    assert count(browser.screenshot(), np.ones(3)) > before + 50
+    assert (
+        said_at_the_middle(browser).splitlines()[:2] == said.splitlines()[:2]
+    )  # the same place is no corner
+    browser.run("document.getElementById('measure').click()")
+    assert not said_at_the_middle(browser).startswith("distance")
+
+
+def test_the_address_of_a_view_shows_the_same_picture(
+    browser: Browser, street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    written(tmp_path, street, track)
+    page = (tmp_path / "viewer.html").as_uri()
+    browser.open(page)
+    first = browser.screenshot()
+    browser.run(
+        "camera.azimuth = 1; camera.elevation = 0.7; zoom(0.5);"
+        "document.querySelectorAll('#layers input')[3].click();"
+        "document.querySelectorAll('#layers input')[7].click();"
+        "document.querySelector('select').value = 'confidence';"
+        "document.querySelector('select').dispatchEvent(new Event('change'));"
+    )
+    seen = browser.screenshot()
+    for _ in range(100):
+        if "colour=confidence" in (link := browser.run("return location.href")):
+            break
+        time.sleep(0.05)
+    assert (first != seen).any()
+    browser.open(link)
+    assert browser.run("return [...document.querySelectorAll('#layers input')].map(b => b.checked)") == [
+        True, True, True, False, True, False, True, True,
+    ]  # fmt: skip
+    assert (browser.screenshot() != seen).any(axis=2).mean() < 0.02
+    # pasted into the address of an open page
+    browser.run("location.hash = '#at=30,1,0,20,0,86&colour=height&hide='")
+    time.sleep(0.2)
+    assert browser.run("return [mode, camera.distance * meta.voxel_m, visible.every(Boolean)]") == [
+        1,
+        20,
+        True,
+    ]
+    browser.run("location.hash = '#at=1,2,x,4,5,6&colour=nothing&hide=nobody'")
+    time.sleep(0.2)
+    assert browser.run("return [mode, camera.distance * meta.voxel_m]") == [0, 20]
+
+
+def test_every_colour_mode_has_a_legend_of_what_it_shows(
+    browser: Browser, street: SemanticMap, track: Trajectory, tmp_path: Path
+) -> None:
+    written(tmp_path, street, track)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    shown = {
+        mode: browser.run(
+            f"colourBy('{mode}'); return ['ramp', 'origins'].map(id => !document.getElementById(id).hidden).concat("
+            "[...document.querySelectorAll('#layers i')].map(i => i.style.visibility === 'visible'))"
+        )
+        for mode in ("class", "height", "confidence", "origin")
+    }
+    classes, unlabelled, track_and_removed = [True] * 5, [True], [True] * 2
+    assert shown == {
+        "class": [False, False, *classes, *unlabelled, *track_and_removed],
+        "height": [True, False, *[False] * 6, *track_and_removed],
+        "confidence": [True, False, *[False] * 5, *unlabelled, *track_and_removed],
+        "origin": [False, True, *[False] * 6, *track_and_removed],
+    }
+    assert browser.run("return document.getElementById('origins').childElementCount") == len(State) - 1
+
+
+def test_two_fingers_move_the_map_by_as_much_as_they_move(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri())
+    look_at(browser, (30, 1, 0), 20)
+    browser.run("camera.azimuth = 0; camera.elevation = 1.55; draw()")
+    steps = range(0, 61, 10)
+    fingers = [pointer(str(x), "touch", *((x + step, 300) for step in steps)) for x in (250, 550)]
+    browser.ask("/actions", actions=fingers)
+    metres = browser.run("return 60 * 20 / (0.9 * innerHeight)")
+    east, distance = browser.run(
+        "return [(camera.target[0] + meta.origin[0]) * meta.voxel_m, camera.distance * meta.voxel_m]"
+    )
+    assert 30 - east == pytest.approx(metres, rel=0.05)
+    assert distance == pytest.approx(20, rel=0.05)

@@ -1,0 +1,102 @@
+"""What each file of a large map costs: the tiles of a finished run, repeated side by side, are exported.
+
+python benchmarks/exports.py RUN [--million-voxels 10] [--formats laz,copc]
+
+The figures are the time on one core and the size of the files. Tiles come from memory: to read one from its file takes
+another 0.1 to 0.2 us per voxel. The memory is the highest of the process so far, with 30 MB of tiles or so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.formats import FORMATS
+from gnss_sem_map.runs.finished_run import Run
+from gnss_sem_map.runs.tracks import tracks_of
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
+from gnss_sem_map.voxels.tiles import TiledMap
+
+RESULTS = Path(__file__).parent / "results" / "exports.json"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--million-voxels", type=float, default=10.0)
+    parser.add_argument("--formats", default=",".join(one.name for one in FORMATS if one.name != "flight"))
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    run = Run.open(arguments.run)
+    small = tiles.open_map(run.folder / "refined", run.label_set)
+    copies = math.ceil(1e6 * arguments.million_voxels / sum(map(len, small)))
+    exported = Exported(repeated(small, copies), tracks_of(run.folder), "repeated")
+    voxels = copies * sum(map(len, small))
+    results = [{"million_voxels": round(voxels / 1e6, 1), "tiles": len(exported.map.tiles)}]
+    for figures in costs(exported, voxels, arguments.formats.split(",")):
+        results.append(figures)
+        print(json.dumps(figures), flush=True)
+    arguments.out.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+
+
+def repeated(small: TiledMap, copies: int) -> TiledMap:
+    """A map beside its copies, in a square."""
+    held = {tile: small.read_tile(tile) for tile in small.tiles}
+    width, depth = np.ptp(np.array(small.tiles), axis=0) + 1
+    edge = math.ceil(math.sqrt(copies))
+    source = {
+        (x + int(width) * (copy // edge - edge // 2), y + int(depth) * (copy % edge - edge // 2)): (x, y)
+        for copy in range(copies)
+        for x, y in small.tiles
+    }
+
+    def read_tile(tile: Tile) -> SemanticMap:
+        piece, (x, y) = held[source[tile]], source[tile]
+        shift = ((tile[0] - x) << TILE_BITS + 2 * AXIS_BITS) + ((tile[1] - y) << TILE_BITS + AXIS_BITS)
+        return replace(piece, voxels=replace(piece.voxels, keys=piece.voxels.keys + shift))
+
+    return replace(
+        small,
+        tiles=tuple(sorted(source)),
+        read_tile=read_tile,
+        read_voxels=lambda tile: read_tile(tile).voxels,
+    )
+
+
+def costs(exported: Exported, voxels: int, names: list[str]) -> Iterator[dict[str, Any]]:
+    """Of every format; the extent of the map, which is found once, is not in it."""
+    _ = exported.extent
+    for each in FORMATS:
+        if each.name not in names:
+            continue
+        with TemporaryDirectory() as folder:
+            begun = time.process_time()
+            each.write(exported, Path(folder) / each.file)
+            seconds = time.process_time() - begun
+            size = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
+        yield {
+            "format": each.name,
+            "cpu_us_per_voxel": round(1e6 * seconds / voxels, 2),
+            "mb": round(size / 1e6, 1),
+            "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        }
+
+
+if __name__ == "__main__":
+    main()

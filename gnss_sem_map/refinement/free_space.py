@@ -15,13 +15,14 @@ from pydantic import Field
 
 from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
+from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 OVER_M = (0.4, 3.0)
 """Only voxels with another one so far below them (least, most) are removed: the ground stays."""
-POINTS_PER_MISS = 2.0
+POINTS_PER_MISS = 6.0
 """A voxel with more points than this per miss too many stays, whatever the keyframe scans say: other scans saw it."""
 
 
@@ -31,7 +32,7 @@ class FreeSpaceSettings(StepSettings):
     least_misses: int = Field(
         default=3, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
-    misses_per_hit: float = Field(default=1.0, gt=0, description="and least ratio of misses to hits.")
+    misses_per_hit: float = Field(default=1.5, gt=0, description="and least ratio of misses to hits.")
     farthest_m: float = Field(
         default=80.0,
         gt=0,
@@ -40,17 +41,20 @@ class FreeSpaceSettings(StepSettings):
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
-    """The columns beside; keyframe scans are used wherever they are."""
+    """The voxels around; keyframe scans are used wherever they are."""
     return voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
-    """Remove the voxels that rays traverse repeatedly; see `traversed`."""
+    """Remove the voxels that rays traverse repeatedly, see `traversed`, unless more stands around them than goes."""
     if state.beside.keyframes is None:
         raise NotApplicable("no keyframe scans: the poses are not sharp enough to tell what is free")
     assert state.decided is not None
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= state.decided.states != State.SPLIT  # a kerb is ground
+    removed = more_goes_than_stands(
+        state, removed, removed, over_ground(state)
+    )  # rays graze the edges of roofs
     states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
     return replace(state, decided=replace(state.decided, states=states))
 
@@ -62,7 +66,7 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     because grazing rays traverse them. Scans are read part by part. A voxel is asked about no longer once even misses
     in all the scans left would not make it free.
     """
-    stands = stands_over(voxels)
+    stands = _stands_over(voxels)
     left = len(keyframes)
     undecided = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * left))
     places = voxels.centres[undecided]
@@ -84,7 +88,7 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     return free
 
 
-def stands_over(voxels: VoxelMap) -> NDArray[np.bool_]:
+def _stands_over(voxels: VoxelMap) -> NDArray[np.bool_]:
     """Which voxels (v,) have one under them, in 3 x 3 columns, lower by OVER_M."""
     least, most = (round(m / voxels.voxel_size_m) for m in OVER_M)
     found = np.zeros(len(voxels), np.bool_)

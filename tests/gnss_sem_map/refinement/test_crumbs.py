@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,9 +11,10 @@ from surfaces import with_heights
 
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.by_tile import refine, run_steps
-from gnss_sem_map.refinement.crumbs import crumbs, points_around
-from gnss_sem_map.refinement.state import Evidence
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.refinement.crumbs import CrumbSettings, apply
+from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.surroundings import points_around
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -44,15 +47,16 @@ def shifted(indices: NDArray[np.int64], x: int) -> NDArray[np.int64]:
 
 
 def street(*crumbs: NDArray[np.int64], shift: int = 0) -> tuple[VoxelMap, VoxelMap]:
-    """A road, a wall, and crumbs of one point each; and the mover."""
+    """A road, a wall, and crumbs of two points each; and the mover."""
     solid, loose = np.concatenate([ROAD, WALL]), np.concatenate([np.empty((0, 3), np.int64), *crumbs])
-    hits = np.repeat([MANY, 1], [len(solid), len(loose)])
+    hits = np.repeat([MANY, 2], [len(solid), len(loose)])
     static = voxel_map(shifted(np.concatenate([solid, loose]), shift), hits)
     return static, voxel_map(shifted(MOVER, shift), np.full(len(MOVER), 3))
 
 
 def removed(static: VoxelMap, moved: VoxelMap, most_points: int = 16) -> NDArray[np.bool_]:
-    return crumbs(static, np.zeros(len(static), np.bool_), moved, most_points)
+    state = replace(MapState.of(static, Evidence(moved=moved)), decided=SemanticMap.of(static))
+    return apply(state, CrumbSettings(most_points=most_points)).is_removed
 
 
 def test_crumbs_go_and_wall_and_road_stay() -> None:
@@ -81,7 +85,7 @@ def test_ground_that_touches_two_voxels_stays_and_a_crumb_on_it_goes(inside_m: f
 
 def test_what_has_many_points_stays_and_so_does_what_is_far_from_the_mover() -> None:
     static, moved = street(CRUMBS)
-    assert not removed(static, moved, most_points=0).any()
+    assert not removed(static, moved, most_points=1).any()
     static, moved = street(np.array([[30, 8, 4]]))
     assert not removed(static, moved).any()
 
@@ -112,7 +116,7 @@ def test_the_refined_map_holds_crumbs_as_removed_and_counts_them_as_such() -> No
     assert {step.name: step.changed for step in report.steps}["crumbs"] == len(CRUMBS)
     gone = refined.voxels.keys[refined.states == State.REMOVED]
     np.testing.assert_array_equal(gone, np.union1d(pack(CRUMBS), moved.keys))
-    assert refined.removed_hits.sum() == moved.hits.sum() + len(CRUMBS)
+    assert refined.removed_hits.sum() == moved.hits.sum() + 2 * len(CRUMBS)
     assert refined.voxels.hits.sum() == moved.hits.sum() + static.hits.sum()
 
 

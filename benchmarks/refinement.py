@@ -6,8 +6,9 @@
 prints the figures and writes them into benchmarks/results/refinement.json; parts that were not asked for stay as they
 are there. Removal: share of moving vehicle points removed (DA), of static vehicle points kept (SA_vehicle) and of all
 static points kept (SA), AA = sqrt(SA DA); on real data and with `semantics` the paper's rule beside ours. Simulated:
-what every mover does, and how much of it was removed. Semantics: strict IoU on the points that their own image labels,
-before and after. Times are CPU time of this process; what counts is their ratio.
+what every mover does, how much of it was removed, and how many voxels are left over roads where nothing stands.
+Semantics: strict IoU on the points that their own image labels, before and after. Times are CPU time of this process;
+what counts is their ratio.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import keys_of, pack
+from gnss_sem_map.voxels.voxel_map import keys_of, pack, unpack
 
 URBAN = open_label_set()
 TABLES = Tables.of(URBAN)
@@ -63,6 +64,9 @@ AS_IT_RUNS = "as the pipeline runs"
 PARTS = ["kernels", "raw", "semantics", "simulated"]
 Figures = dict[str, Any]
 REPEATS = 7
+GROUND_IDS = (40, 48)
+HIGHEST = 20
+"""So many voxels over a road, 4 m, something is over it."""
 Points = Mapping[int, NDArray[np.int64]]
 PAPER = RefinementSettings.model_validate(
     {
@@ -226,20 +230,26 @@ def by_the_paper(drive: Drive) -> Points:
     return points
 
 
-def removed_in_all(drive: Drive, chunks: list[MappedChunk]) -> Points:
-    """The points of what moved and, as in a run, those in voxels that witnesses look through."""
-    static = reduce(add, (chunk.static for chunk in chunks))
+def refined_map(chunks: list[MappedChunk]) -> SemanticMap:
+    """The map that a run makes of all chunks."""
+    static, moved = (
+        reduce(add, (getattr(chunk, name) for chunk in chunks)) for name in ("static", "removed")
+    )
     known = [chunk.keyframes for chunk in chunks if chunk.keyframes is not None]
     keyframes = KeyframeScans(
         np.concatenate([one.images for one in known]), np.concatenate([one.T_lidar_map for one in known]),
         known[0].rows,
     ) if known else None  # fmt: skip
-    refined, _ = refine(static, beside=Evidence(keyframes=keyframes))
+    return refine(static, beside=Evidence(moved=moved, keyframes=keyframes))[0]
+
+
+def removed_in_all(drive: Drive, chunks: list[MappedChunk], refined: SemanticMap) -> Points:
+    """The points of what moved and, as in a run, those in voxels that refinement removes."""
     empty = np.append(refined.states == State.REMOVED, False)  # the place -1 finds the last
     moving = {number: points for chunk in chunks for number, points in chunk.moving.items()}
     points = {}
     for seen in labelled_scans(replace(drive, segmenter=None)):
-        places = static.indices_of(keys_of(seen.p_map, static.voxel_size_m))
+        places = refined.voxels.indices_of(keys_of(seen.p_map, refined.voxels.voxel_size_m))
         moved = moving.get(seen.scan.number, np.empty(0, np.int64))
         points[seen.scan.number] = np.union1d(moved, np.flatnonzero(empty[places]))
     return points
@@ -283,7 +293,9 @@ def on_raw_drive(data: Path) -> Figures:
     ):
         drive = Drive(log, trajectory, segmenter, Settings(), from_lidar_odometry=name == AS_IT_RUNS)
         found, cost = timed_mapping(drive)
-        figures[name] = tracklets.removal(drive, removed_in_all(drive, found), data / RAW_0005) | cost
+        figures[name] = (
+            tracklets.removal(drive, removed_in_all(drive, found, refined_map(found)), data / RAW_0005) | cost
+        )
         figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
     return figures
 
@@ -312,16 +324,20 @@ def on_simulated_drive(folder: Path) -> Figures:
     """Removal all around, mover by mover."""
     drive = perfectly_seen(folder)
     found, cost = timed_mapping(drive)
-    points = removed_in_all(drive, found)
+    refined = refined_map(found)
+    points = removed_in_all(drive, found, refined)
     cases = what_they_do(folder)
     counts = np.zeros((3, 2), np.int64)
     movers: dict[str, NDArray[np.int64]] = {}
+    size, keys = refined.voxels.voxel_size_m, ([], [])
     for seen in labelled_scans(Drive(drive.log, drive.trajectory, None, drive.settings)):
         truth = np.fromfile(folder / "truth" / "labels" / f"{seen.scan.name}.label", "<u4")[seen.valid]
         removed = np.zeros(len(truth), np.uint32)
         removed[points.get(seen.scan.number, [])] = 1
         counts += dynamic_counts(removed, truth, TABLES, seen.scan.name)
         moving = np.isin(truth & 0xFFFF, list(MOVING_IDS))
+        for kind, which in zip(keys, (~moving, np.isin(truth & 0xFFFF, GROUND_IDS)), strict=True):
+            kind.append(np.unique(keys_of(seen.p_map[which], size)))
         for instance in np.unique(truth[moving] >> 16):
             of_it = moving & (truth >> 16 == instance)
             found = np.array([of_it.sum(), removed[of_it].sum()])
@@ -329,11 +345,25 @@ def on_simulated_drive(folder: Path) -> Figures:
     return dynamic(counts) | {
         **cost,
         "scans": len(drive.log.scans),
+        "left_over_road": left_over_road(refined, *map(np.concatenate, keys)),
         "movers": {
             case: {"points": int(n), "removed": round(float(k / n), 4)}
             for case, (n, k) in sorted(movers.items())
         },
     }
+
+
+def left_over_road(refined: SemanticMap, static: NDArray[np.int64], ground: NDArray[np.int64]) -> int:
+    """Voxels of the shown map over a road or sidewalk in which, by the truth, nothing stands.
+
+    `static` and `ground` are the keys of all voxels with a point of what stands, and of road or sidewalk.
+    """
+    left = unpack(np.setdiff1d(refined.voxels.keys[refined.states != State.REMOVED], static))
+    known = unpack(np.unique(ground))
+    under, place = np.unique(known[:, :2], axis=0, return_index=True)
+    top = dict(zip(map(tuple, under.tolist()), np.maximum.reduceat(known[:, 2], place).tolist(), strict=True))
+    over = [z - top[x, y] for x, y, z in left.tolist() if (x, y) in top]
+    return sum(0 < height <= HIGHEST for height in over)
 
 
 def what_they_do(folder: Path) -> dict[int, str]:

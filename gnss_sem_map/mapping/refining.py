@@ -30,12 +30,12 @@ from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles, on_tiles
 from gnss_sem_map.memory import release_memory
-from gnss_sem_map.refinement import kerb_points
+from gnss_sem_map.refinement import crumbs, free_space, kerb_points
 from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_halo_m, sums_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.state import Evidence
-from gnss_sem_map.refinement.steps import RefinementReport
+from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import files_of, name_of
@@ -170,7 +170,8 @@ class _Refinement:
         poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
         at = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[:, :2]
         edge = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
-        reach = self.settings.refinement.free_space.farthest_m
+        steps = self.settings.refinement
+        reach = steps.free_space.farthest_m + _moved_reach_m(steps, self.raw.fused.voxel_size_m)
         found = {}
         for tile in self._tiles:
             low = np.array(tile) * edge
@@ -205,8 +206,9 @@ class _Inputs:
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
     def beside(self, tile: Tile) -> Evidence:
-        moved, keyframes = self.raw.evidence.moved.around(tile, 0), None
-        indices = np.concatenate([self.raw.around(tile, 0).indices, moved.indices])
+        margin = _moved_reach_m(self.steps, self.raw.fused.voxel_size_m)
+        moved, keyframes = self.raw.evidence.moved.around(tile, margin), None
+        indices = np.concatenate([self.raw.around(tile, margin).indices, moved.indices])
         if len(indices) and self.steps.free_space.enabled:
             box = (np.stack(limits_of(indices)) + 0.5) * moved.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
@@ -258,6 +260,11 @@ def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any]
     # heights are in the raw map: here they would take a sixth of the bytes
     voxels_only = replace(state.decided.voxels, heights=None)
     save(tile, replace(state.decided, voxels=voxels_only), about, _packed(state.kerbs), made_in)
+
+
+def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:
+    """How far around a tile the points that moved are read, m."""
+    return free_space.reach_m(steps.free_space, voxel_size_m) + crumbs.reach_m(steps.crumbs, voxel_size_m)
 
 
 MEASURE_TILES, REFINE_TILES = (f"{f.__module__}:{f.__name__}" for f in (measure_tiles, refine_tiles))

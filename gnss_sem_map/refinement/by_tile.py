@@ -91,7 +91,7 @@ def refine_tile(
     size, reports = around.voxel_size_m, []
     halo = _reach_from(0, settings, size)
     if beside.moved is not None:
-        beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, 0)])
+        beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, halo)])
     around = around[places_around(around, tile, halo_m(settings, size))]
     heights, near = height_above_ground.height_over_ground(around.centres), places_around(around, tile, halo)
     around, heights = around[near], heights[near]
@@ -101,7 +101,7 @@ def refine_tile(
     for i, step in enumerate(STEPS):
         needed = _reach_from(i, settings, size)
         if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
-            state, halo = state[places_around(state.voxels, tile, needed)], needed
+            state, halo = _cut(state, tile, needed), needed
             own = _inside(state.voxels, tile)
         state, report = do(step, state, settings, own if halo else slice(None))
         reports.append(report)
@@ -167,6 +167,15 @@ def _inside(voxels: VoxelMap, tile: Tile) -> NDArray[np.bool_]:
     inside = np.zeros(len(voxels), np.bool_)
     inside[places_around(voxels, tile, 0)] = True
     return inside
+
+
+def _cut(state: MapState, tile: Tile, margin_m: float) -> MapState:
+    """The state of a tile and a margin around it, and what moved there."""
+    if (moved := state.beside.moved) is not None:
+        moved = moved[places_around(moved, tile, margin_m)]
+    return replace(
+        state[places_around(state.voxels, tile, margin_m)], beside=replace(state.beside, moved=moved)
+    )
 
 
 def _holds(tile: Tile, thing: VehicleObject, voxel_size_m: float) -> bool:

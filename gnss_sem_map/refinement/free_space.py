@@ -6,7 +6,6 @@ be tracked, in no image, or too close to a wall. Static voxels are hit again fro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,14 +15,15 @@ from pydantic import Field
 
 from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
+from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 OVER_M = (0.4, 3.0)
 """Only voxels with another one so far below them (least, most) are removed: the ground stays."""
-POINTS_PER_MISS = 4.0
-"""A voxel with more points per miss than this stays, whatever the keyframe scans say: other scans saw it often."""
+POINTS_PER_MISS = 6.0
+"""A voxel with more points than this per miss too many stays, whatever the keyframe scans say: other scans saw it."""
 
 
 class FreeSpaceSettings(StepSettings):
@@ -32,7 +32,7 @@ class FreeSpaceSettings(StepSettings):
     least_misses: int = Field(
         default=3, ge=1, description="Least number of keyframe scans whose rays traverse the voxel,"
     )
-    misses_per_hit: float = Field(default=3.0, gt=0, description="and least ratio of misses to hits.")
+    misses_per_hit: float = Field(default=1.5, gt=0, description="and least ratio of misses to hits.")
     farthest_m: float = Field(
         default=80.0,
         gt=0,
@@ -41,17 +41,20 @@ class FreeSpaceSettings(StepSettings):
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
-    """The columns beside; keyframe scans are used wherever they are."""
+    """The voxels around; keyframe scans are used wherever they are."""
     return voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
-    """Remove the voxels that rays traverse repeatedly; see `traversed`."""
+    """Remove the voxels that rays traverse repeatedly, see `traversed`, unless more stands around them than goes."""
     if state.beside.keyframes is None:
         raise NotApplicable("no keyframe scans: the poses are not sharp enough to tell what is free")
     assert state.decided is not None
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= state.decided.states != State.SPLIT  # a kerb is ground
+    removed = more_goes_than_stands(
+        state, removed, removed, over_ground(state)
+    )  # rays graze the edges of roofs
     states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
     return replace(state, decided=replace(state.decided, states=states))
 
@@ -63,7 +66,7 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     because grazing rays traverse them. Scans are read part by part. A voxel is asked about no longer once even misses
     in all the scans left would not make it free.
     """
-    stands = _stands_over(voxels.keys, [round(m / voxels.voxel_size_m) for m in OVER_M])
+    stands = _stands_over(voxels)
     left = len(keyframes)
     undecided = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * left))
     places = voxels.centres[undecided]
@@ -75,8 +78,8 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
         left -= len(part)
         hits, most_misses = counts[0], counts[1] + left
         may_be_free = most_misses >= settings.least_misses
-        may_be_free &= most_misses > settings.misses_per_hit * hits
-        may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * most_misses
+        too_many = most_misses - settings.misses_per_hit * hits
+        may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * too_many
         undecided, places, counts = undecided[may_be_free], places[may_be_free], counts[:, may_be_free]
         if not len(undecided):
             break
@@ -85,12 +88,12 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     return free
 
 
-def _stands_over(keys: NDArray[np.int64], under: Sequence[int]) -> NDArray[np.bool_]:
-    """Which of the sorted voxels (v,) have one under them, in 3 x 3 columns, so many voxels lower (least, most)."""
-    least, most = under
-    found = np.zeros(len(keys), np.bool_)
+def _stands_over(voxels: VoxelMap) -> NDArray[np.bool_]:
+    """Which voxels (v,) have one under them, in 3 x 3 columns, lower by OVER_M."""
+    least, most = (round(m / voxels.voxel_size_m) for m in OVER_M)
+    found = np.zeros(len(voxels), np.bool_)
     beside = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    _find_under(keys, np.array(beside), least, most, found)
+    _find_under(voxels.keys, np.array(beside), least, most, found)
     return found
 
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
 from gnss_sem_map.refinement import (
     count_grid,
+    crumbs,
     decision,
     discount,
     free_space,
@@ -30,6 +31,7 @@ from gnss_sem_map.refinement import (
     vehicles,
 )
 from gnss_sem_map.refinement.count_grid import CountGridSettings
+from gnss_sem_map.refinement.crumbs import CrumbSettings
 from gnss_sem_map.refinement.decision import DecisionSettings
 from gnss_sem_map.refinement.discount import DiscountSettings
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings
@@ -89,6 +91,10 @@ class RefinementSettings(BaseModel):
         default=FreeSpaceSettings(),
         description="Voxels that rays traverse again and again are removed, where poses are sharp enough.",
     )
+    crumbs: CrumbSettings = Field(
+        default=CrumbSettings(),
+        description="Few points amid those of a moving object are removed with it.",
+    )
     removed_layer: RemovedLayerSettings = Field(
         default=RemovedLayerSettings(),
         description="Moving objects come back as a layer that is not shown.",
@@ -124,6 +130,7 @@ STEPS = tuple(
         levels,
         kerbs,
         free_space,
+        crumbs,
         removed_layer,
     )
 )

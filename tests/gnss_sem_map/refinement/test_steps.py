@@ -39,7 +39,7 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
     voxels = street()
     beside = Evidence(moved=voxels[:0], keyframes=keyframes())
     before = MapState.of(voxels, beside)
-    if step.name in ("levels", "kerbs", "free_space", "removed_layer"):
+    if step.name in ("levels", "kerbs", "free_space", "crumbs", "removed_layer"):
         before = replace(before, decided=refine(voxels, RefinementSettings.model_validate(OFF))[0])
     x = voxels.centres[:, 0]
     low, high = 330.0, 345.0

@@ -1,0 +1,41 @@
+"""Crumbs: single voxels over the ground that something that moved left behind.
+
+The outline of a mover is cut to some centimetres, and a walker close to a wall is found in some scans only. What is
+left of them has few points, in the midst of what was removed. Free space does not tell: it is too near to the ground or
+to a wall, or was looked at too seldom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
+from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
+from gnss_sem_map.voxels.semantic_map import State
+
+
+class CrumbSettings(StepSettings):
+    """What is little enough to be a crumb."""
+
+    most_points: int = Field(default=16, ge=1, description="A voxel with more points than this is no crumb.")
+
+
+def reach_m(settings: CrumbSettings, voxel_size_m: float) -> float:
+    """The voxels around."""
+    return voxel_size_m
+
+
+def apply(state: MapState, settings: CrumbSettings) -> MapState:
+    """Remove voxels over the ground with few points, around which more moved than stands."""
+    if state.beside.moved is None:
+        raise NotApplicable("moving objects were not sought")
+    assert state.decided is not None
+    gone, over = state.is_removed, over_ground(state)
+    asked = over & ~gone & (state.voxels.hits <= settings.most_points)
+    asked &= state.decided.states != State.SPLIT  # a kerb is ground
+    removed = more_goes_than_stands(state, asked, gone, over)
+    states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
+    return replace(state, decided=replace(state.decided, states=states))

@@ -1,0 +1,70 @@
+"""What is around a voxel over the ground: whether more of it goes, with something that moved, or stands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from gnss_sem_map.refinement.state import MapState
+from gnss_sem_map.voxels.kernels import AXIS_BITS
+
+OVER_M = 0.3
+"""Centres of voxels on the ground are lower than this over it."""
+INSIDE_M = 0.03
+"""What is on the ground, in the next voxel over it, has its mean height so far over the bottom of its voxel: ground
+that touches two voxels does not."""
+
+
+def over_ground(state: MapState) -> NDArray[np.bool_]:
+    """Which voxels (v,) are over the ground, and no part of it."""
+    voxels = state.voxels
+    inside = voxels.surface_heights - voxels.indices[:, 2] * voxels.voxel_size_m
+    on_ground = np.append(False, np.diff(voxels.keys) == 1)[: len(voxels)] & (inside > INSIDE_M)
+    return np.asarray((state.heights > OVER_M) | on_ground)
+
+
+def more_goes_than_stands(
+    state: MapState, asked: NDArray[np.bool_], going: NDArray[np.bool_], over: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which of the voxels `asked` (v,) have more points of what goes around them than of what stands over the ground.
+
+    What goes are the points that were kept out of the map, and those of the voxels `going` (v,); all others that are
+    `over` the ground (v,) stand. A voxel counts with the 26 around it.
+    """
+    keys, hits, moved = state.voxels.keys, state.voxels.hits, state.beside.moved
+    places, stands = np.flatnonzero(asked), over & ~going
+    goes = points_around(keys[places], keys[going], hits[going])
+    if moved is not None:
+        goes += points_around(keys[places], moved.keys, moved.hits)
+    places, goes = places[goes > 0], goes[goes > 0]
+    found = np.zeros(len(keys), np.bool_)
+    found[places[goes > points_around(keys[places], keys[stands], hits[stands])]] = True
+    return found
+
+
+def points_around(
+    asked: NDArray[np.int64], keys: NDArray[np.int64], hits: NDArray[np.uint32]
+) -> NDArray[np.int64]:
+    """Points (a,) in and around sorted packed voxels: of themselves and their 26 neighbours.
+
+    `hits` (v,) are the points in the sorted packed voxels `keys` (v,).
+    """
+    total = np.zeros(len(asked), np.int64)
+    beside = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    _add_around(asked, keys, hits, np.array(beside), total)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _add_around(asked, keys, hits, beside, total):
+    for column in beside:
+        low = 0  # the first voxel that is not lower
+        for i in range(len(asked)):
+            centre = asked[i] + column
+            while low < len(keys) and keys[low] < centre - 1:
+                low += 1
+            k = low
+            while k < len(keys) and keys[k] <= centre + 1:
+                total[i] += hits[k]
+                k += 1

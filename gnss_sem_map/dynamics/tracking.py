@@ -33,6 +33,17 @@ class Segment:
     """(v, 2) m: the points of its voxels on average, which tell its extent in any direction."""
     seen_from: NDArray[np.float64]
     """(2,) m: where the LiDAR was."""
+    levels: tuple[float, float] = (0.0, 0.0)
+    """Lowest and highest of its voxels, by the means of their points, m."""
+    labelled: int = 0
+    """Points that the image labels as movable."""
+    delay: float = 0.0
+    """When the sweep met it, s after the stamp."""
+
+    @property
+    def seen_at(self) -> float:
+        """When it was seen, s."""
+        return self.stamp + self.delay
 
 
 @dataclass(eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -29,23 +30,23 @@ TRACK = {
     "east_m": pa.float64(),
     "north_m": pa.float64(),
     "up_m": pa.float64(),
-    "stddev_east_m": pa.float32(),
-    "stddev_north_m": pa.float32(),
-    "speed_mps": pa.float32(),
-    "speed_stddev_mps": pa.float32(),
-    "heading_deg": pa.float32(),
+    "stddev_east_m": pa.float64(),
+    "stddev_north_m": pa.float64(),
+    "speed_mps": pa.float64(),
+    "speed_stddev_mps": pa.float64(),
+    "heading_deg": pa.float64(),
 }
 """Fields of a place of a track, in the frame of the map."""
 ENDS, AXES = ("start", "end"), ("easting_m", "northing_m", "lat_deg", "lon_deg", "alt_m")
 COLUMNS = {
     "id": pa.int32(), "drive": pa.string(), "lidar": pa.string(), "class": pa.string(), "class_from": pa.string(),
-    "labelled": pa.float32(), "motion": pa.string(), "probability": pa.float32(), "evidence": pa.string(),
+    "labelled": pa.float64(), "motion": pa.string(), "probability": pa.float64(), "evidence": pa.string(),
     "points": pa.int64(), "scans": pa.int32(),
     "first_time": pa.timestamp("us", "UTC"), "last_time": pa.timestamp("us", "UTC"),
     "first_stamp_s": pa.float64(), "last_stamp_s": pa.float64(),
-    "length_m": pa.float32(), "width_m": pa.float32(), "height_m": pa.float32(),
-    "way_m": pa.float32(), "speed_mps": pa.float32(), "speed_stddev_mps": pa.float32(),
-    "highest_speed_mps": pa.float32(), "heading_deg": pa.float32(),
+    "length_m": pa.float64(), "width_m": pa.float64(), "height_m": pa.float64(),
+    "way_m": pa.float64(), "speed_mps": pa.float64(), "speed_stddev_mps": pa.float64(),
+    "highest_speed_mps": pa.float64(), "heading_deg": pa.float64(),
     "utm_epsg": pa.int32(),
     **{f"{end}_{axis}": pa.float64() for end in ENDS for axis in AXES},
     "track": pa.list_(pa.struct(TRACK)),
@@ -102,16 +103,17 @@ def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
     times = [drive.epoch_ns // 1000 + round(1e6 * stamp) for stamp in mover.stamps[[0, -1]].tolist()]
     start, end = mover.positions[[0, -1]]
     length, width, height = mover.size_m
+    heading = np.degrees(np.arctan2(*(end - start)[:2])) % 360
     return {
         "id": number, "drive": drive.name, "lidar": " ".join(mover.lidars), "class": mover.name,
-        "class_from": "labels" if mover.is_labelled else "shape", "labelled": mover.labelled,
-        "motion": str(mover.motion), "probability": mover.probability, "evidence": mover.evidence,
+        "class_from": "labels" if mover.is_labelled else "shape", "labelled": round(mover.labelled, DIGITS),
+        "motion": str(mover.motion), "probability": round(mover.probability, DIGITS), "evidence": mover.evidence,
         "points": mover.points, "scans": len(mover.stamps),
         "first_time": times[0], "last_time": times[1],
         "first_stamp_s": mover.stamps[0], "last_stamp_s": mover.stamps[-1],
-        "length_m": length, "width_m": width, "height_m": height,
-        "way_m": way_m, "speed_mps": speed, "speed_stddev_mps": stddev,
-        "highest_speed_mps": mover.speeds.max(), "heading_deg": np.degrees(np.arctan2(*(end - start)[:2])) % 360,
+        "length_m": round(length, DIGITS), "width_m": round(width, DIGITS), "height_m": round(height, DIGITS),
+        "way_m": round(way_m, DIGITS), "speed_mps": round(speed, DIGITS), "speed_stddev_mps": round(stddev, DIGITS),
+        "highest_speed_mps": round(float(mover.speeds.max()), DIGITS), "heading_deg": round(float(heading), 1),
         "track": _track(mover), **_places(mover, drive.frame),
     }  # fmt: skip
 
@@ -177,7 +179,5 @@ def _feature(row: Mapping[str, Any], line: shapely.LineString) -> dict[str, Any]
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of single precision without the digits that they do not have."""
-    if isinstance(value, float):
-        return float(f"{value:.15g}")
-    return value.isoformat() if hasattr(value, "isoformat") else value
+    """A moment as text; all else as it is."""
+    return value.isoformat() if isinstance(value, datetime) else value

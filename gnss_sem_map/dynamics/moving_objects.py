@@ -252,7 +252,6 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
         outlines = of_scan.outlines()
         levels = of_scan.levels()
         seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
-        delays = seen.delays.towards(centroids - seen_from)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
             listed.append(
                 Segment(
@@ -266,7 +265,7 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     seen_from=seen_from,
                     levels=levels[number],
                     labelled=int(whole.labelled[number]),
-                    delay=float(delays[number]),
+                    delays=seen.delays,
                 )
             )
     return listed

@@ -9,13 +9,14 @@ to what is missing of the size.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays, delays_towards
 from gnss_sem_map.dynamics.tracking import Segment
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ HIDDEN_STDDEV_M = 0.3
 SMALL_M, CAR_M = 2.3, 4.5
 """Smaller objects, people and cyclists, have no sides that are seen well: the mean of what is seen is their place. A
 larger one that is hidden in part may be as long as a car."""
+VELOCITY_SCANS = 5
+"""Scans before and after that tell how an object moves while a sweep meets it."""
 CUT_SCANS = 3
 """Scans before and after one in which it is hidden or cut off, which may show less than they seem to."""
 SAME_VIEW_SCANS = 10
@@ -76,8 +79,11 @@ def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | 
     """
     if len(segments) < FEWEST:
         return None
-    stamps = np.array([one.seen_at for one in segments])
     centroids = np.array([one.centroid for one in segments], np.float64)
+    scans = np.array([one.stamp for one in segments])
+    outline = _Outline.of(segments)
+    stamps = scans + outline.delay
+    outline = outline.at_one_moment(_velocities(scans, centroids))
     along = courses(centroids)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     lidar = np.array([one.seen_from for one in segments]) - centroids
@@ -86,7 +92,7 @@ def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | 
     may_be_cut = binary_dilation(is_cut, iterations=CUT_SCANS)  # what hides it comes and goes by and by
     edge = EDGE_STDDEV_M + EDGE_STDDEV_RATIO * ranges
     middle, variances = centroids.copy(), np.zeros_like(centroids)
-    ends = [_extents(segments, centroids, axis) for axis in (along, across)]
+    ends = [outline.extents(centroids, axis) for axis in (along, across)]
     size = [_size(high - low, is_cut) for low, high in ends]
     for axis, (low, high), extent in zip((along, across), ends, size, strict=True):
         shift, stddev = _middle(low, high, (lidar * axis).sum(axis=1), may_be_cut, edge, extent)
@@ -127,16 +133,54 @@ def _longest_way(places: Array) -> Array:
     return way if way.any() else np.array([1.0, 0.0])
 
 
-def _extents(segments: Sequence[Segment], origins: Array, axis: Array) -> tuple[Array, Array]:
-    """Where each object begins and ends along its axis (k, 2), seen from its origin."""
-    counts = np.array([len(one.outline) for one in segments])
-    points = np.concatenate([one.outline for one in segments])
-    at = ((points - np.repeat(origins, counts, axis=0)) * np.repeat(axis, counts, axis=0)).sum(axis=1)
-    starts = np.cumsum(counts) - counts
-    return (
-        np.asarray(np.minimum.reduceat(at, starts) - GRANULE_M, np.float64),
-        np.asarray(np.maximum.reduceat(at, starts) + GRANULE_M, np.float64),
-    )
+def _velocities(stamps: Array, places: Array) -> Array:
+    """Velocities (k, 2) m/s of places (k, 2) m over some scans before and after."""
+    k = np.arange(len(stamps))
+    after, before = np.minimum(k + VELOCITY_SCANS, k[-1]), np.maximum(k - VELOCITY_SCANS, 0)
+    return np.asarray((places[after] - places[before]) / (stamps[after] - stamps[before])[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Outline:
+    """What all scans show of an object: points (p, 2) m, scan after scan."""
+
+    points: Array
+    counts: NDArray[np.int64]
+    """(k,) points of each scan."""
+    delays: Array
+    """(p,) s: when the sweep met each, after the stamp."""
+
+    @classmethod
+    def of(cls, segments: Sequence[Segment]) -> _Outline:
+        points = np.concatenate([one.outline for one in segments]).astype(np.float64)
+        counts = np.array([len(one.outline) for one in segments])
+        ways = points - np.repeat([one.seen_from for one in segments], counts, axis=0)
+        none = SweepDelays.none()
+        profiles = [one.delays or none for one in segments]
+        return cls(points, counts, delays_towards(ways, profiles, counts))
+
+    @property
+    def delay(self) -> Array:
+        """(k,) s: that of an object, the mean of its points."""
+        return np.asarray(np.add.reduceat(self.delays, self._starts) / self.counts)
+
+    def at_one_moment(self, velocities: Array) -> _Outline:
+        """The points of an object that moves so (k, 2) m/s, where they were at its mean time."""
+        late = self.delays - np.repeat(self.delay, self.counts)
+        return replace(self, points=self.points - late[:, None] * np.repeat(velocities, self.counts, axis=0))
+
+    def extents(self, origins: Array, axis: Array) -> tuple[Array, Array]:
+        """Where an object begins and ends (k,) m along its axis (k, 2), from its origin (k, 2)."""
+        off = self.points - np.repeat(origins, self.counts, axis=0)
+        at = (off * np.repeat(axis, self.counts, axis=0)).sum(axis=1)
+        return (
+            np.asarray(np.minimum.reduceat(at, self._starts) - GRANULE_M),
+            np.asarray(np.maximum.reduceat(at, self._starts) + GRANULE_M),
+        )
+
+    @property
+    def _starts(self) -> NDArray[np.int64]:
+        return np.asarray(np.cumsum(self.counts) - self.counts)
 
 
 def _size(seen: Array, is_cut: NDArray[np.bool_]) -> float:

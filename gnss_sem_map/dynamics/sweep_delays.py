@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,9 +40,13 @@ class SweepDelays:
         sums = np.bincount(where, stamps[rows[::EVERY]] - stamp, DIRECTIONS)
         return cls((sums / np.maximum(count, 1)).astype(np.float32))
 
-    def towards(self, ways: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Delays (s,) s in directions (s, 2)."""
-        return self.seconds[_direction(ways)]
+
+def delays_towards(
+    ways: NDArray[np.float64], of_scans: Sequence[SweepDelays], counts: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Delays (p,) s in directions (p, 2), of which so many (k,) are of each scan, one after the other."""
+    seconds = np.array([one.seconds for one in of_scans])
+    return seconds[np.repeat(np.arange(len(counts)), counts), _direction(ways)].astype(np.float64)
 
 
 def _direction(ways: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays
+
 LONGEST_GAP = 5
 """A track ends after more scans than this without a segment."""
 NEW_SHARE = 0.3
@@ -37,13 +39,8 @@ class Segment:
     """Lowest and highest of its voxels, by the means of their points, m."""
     labelled: int = 0
     """Points that the image labels as movable."""
-    delay: float = 0.0
-    """When the sweep met it, s after the stamp."""
-
-    @property
-    def seen_at(self) -> float:
-        """When it was seen, s."""
-        return self.stamp + self.delay
+    delays: SweepDelays | None = None
+    """When the sweep met what; None: all at the stamp."""
 
 
 @dataclass(eq=False)

@@ -8,7 +8,7 @@ import pytest
 from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
 from gnss_sem_map.dynamics.movers import class_by_shape, movers_of
 from gnss_sem_map.dynamics.object_track import ObjectTrack, courses, track_of
-from gnss_sem_map.dynamics.sweep_delays import SweepDelays
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays, delays_towards
 from gnss_sem_map.dynamics.tracking import Segment
 
 LENGTH, WIDTH, HEIGHT = 4.2, 1.8, 1.5
@@ -42,7 +42,7 @@ def segments(place, heading, lidar, scans=40, delay=lambda t: 0.0):
         found.append(
             Segment(
                 k, 0.1 * k, outline.mean(axis=0), len(outline), True, False, outline, np.array(lidar(t)),
-                (0.2, HEIGHT), len(outline) // 2, delay(0.1 * k),
+                (0.2, HEIGHT), len(outline) // 2, SweepDelays(np.full(72, delay(0.1 * k))),
             )
         )  # fmt: skip
     return found
@@ -94,7 +94,7 @@ def test_a_curve_is_followed() -> None:
 def test_time_within_the_sweep_counts() -> None:
     """A car that passes is met 50 ms before the stamp in front of the LiDAR, and 50 ms after it behind."""
     sliding = segments(passing, straight, still, delay=lambda t: 0.05 * np.tanh((t - 2.0) / 0.4))
-    ignored = [replace(one, delay=0.0) for one in sliding]
+    ignored = [replace(one, delays=None) for one in sliding]
     assert np.abs(only(track_of(sliding)).speeds - SPEED).max() < 0.3
     assert np.abs(only(track_of(ignored)).speeds - SPEED).max() > 0.5
 
@@ -178,8 +178,9 @@ def test_delays_are_those_of_the_points_of_a_direction() -> None:
     )
     ways = np.array([(1.0, 0.1), (0.0, 2.0), (-1.0, -1.0)])
     expected = -0.1 * np.arctan2(ways[:, 1], ways[:, 0]) / (2 * np.pi)
-    np.testing.assert_allclose(delays.towards(ways), expected, atol=1e-3)
-    assert not SweepDelays.none().towards(ways).any()
+    np.testing.assert_allclose(delays_towards(ways, [delays], np.array([3])), expected, atol=1e-3)
+    twice = delays_towards(ways, [SweepDelays.none(), delays], np.array([1, 2]))
+    np.testing.assert_allclose(twice, [0.0, *expected[1:]], atol=1e-3)
 
 
 def test_a_track_comes_back_from_json() -> None:

@@ -22,8 +22,8 @@ SAME_M = 1.0
 """Tracks whose median distance is smaller than this are of one object."""
 LEAST_COMMON_S = 0.25
 """Tracks that have less time in common are not compared."""
-FEWEST_SCANS, LEAST_WAY_M, SIGNIFICANT = 5, 0.5, 3.0
-"""What moved was seen in so many scans, and went so far, and so many standard deviations of that."""
+LEAST_WAY_M, SIGNIFICANT = 0.5, 3.0
+"""What moved went so far, and so many standard deviations of that."""
 LEAST_LABELLED = 0.2
 """With this share of its points labelled, an object is what its labels say; with less, what its shape says."""
 SHAPES = (
@@ -67,8 +67,6 @@ class Mover:
     @property
     def went_somewhere(self) -> bool:
         """Whether it was seen to move, not only to be there at one time and not at another."""
-        if len(self.stamps) < FEWEST_SCANS:
-            return False
         off = self.track.positions - self.track.positions[0]
         stddevs = np.sqrt((self.track.position_variances + self.track.position_variances[0]).max(axis=1))
         return bool((np.linalg.norm(off, axis=1) > np.maximum(LEAST_WAY_M, SIGNIFICANT * stddevs)).any())

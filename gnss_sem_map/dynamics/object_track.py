@@ -39,7 +39,7 @@ GRANULE_M = 0.05
 COURSE_M, COURSE_SCANS = 1.5, (2, 5, 10, 20, 50)
 """A course is that of the fewest scans before and after within which an object goes so far."""
 SIZE_QUANTILE = 0.9
-FEWEST = 3
+FEWEST = 5
 """Scans of a track."""
 
 

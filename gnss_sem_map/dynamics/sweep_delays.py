@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 DIRECTIONS = 72
-EVERY = 16
-"""Of the points, so many-th tell the time of their direction."""
+EVERY = 61
+"""Every 61st point tells the time of its direction: of a file by columns of 16 to 128 rings, those of all rings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +28,17 @@ class SweepDelays:
     @classmethod
     def of(
         cls,
-        p_map: NDArray[np.float64],
+        p_lidar: NDArray[np.float32],
         stamps: NDArray[np.float64],
-        rows: NDArray[np.intp],
-        lidar: NDArray[np.float64],
+        usable: NDArray[np.bool_],
+        R_map_lidar: NDArray[np.float64],
         stamp: float,
     ) -> SweepDelays:
-        """From the points (n, 3) m of a scan, whose stamps (m,) s are in these rows (n,); the LiDAR is at (2,) m."""
-        where = _direction(p_map[::EVERY, :2] - lidar)
+        """From the usable points (n, 3) m of a scan and their stamps (n,) s; `R_map_lidar` (3, 3)."""
+        some = np.flatnonzero(usable[::EVERY]) * EVERY
+        where = _direction(p_lidar[some].astype(np.float64) @ R_map_lidar[:2].T)
         count = np.bincount(where, minlength=DIRECTIONS)
-        sums = np.bincount(where, stamps[rows[::EVERY]] - stamp, DIRECTIONS)
+        sums = np.bincount(where, stamps[some] - stamp, DIRECTIONS)
         return cls((sums / np.maximum(count, 1)).astype(np.float32))
 
 

@@ -110,7 +110,7 @@ def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
         "motion": str(mover.motion), "probability": round(mover.probability, DIGITS), "evidence": mover.evidence,
         "points": mover.points, "scans": len(mover.stamps),
         "first_time": times[0], "last_time": times[1],
-        "first_stamp_s": mover.stamps[0], "last_stamp_s": mover.stamps[-1],
+        "first_stamp_s": round(float(mover.stamps[0]), 6), "last_stamp_s": round(float(mover.stamps[-1]), 6),
         "length_m": round(length, DIGITS), "width_m": round(width, DIGITS), "height_m": round(height, DIGITS),
         "way_m": round(way_m, DIGITS), "speed_mps": round(speed, DIGITS), "speed_stddev_mps": round(stddev, DIGITS),
         "highest_speed_mps": round(float(mover.speeds.max()), DIGITS), "heading_deg": round(float(heading), 1),
@@ -120,7 +120,7 @@ def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
 
 def _track(mover: Mover) -> list[dict[str, float]]:
     values = np.column_stack([
-        mover.stamps, mover.positions.round(DIGITS), np.sqrt(mover.track.position_variances).round(DIGITS),
+        mover.stamps.round(6), mover.positions.round(DIGITS), np.sqrt(mover.track.position_variances).round(DIGITS),
         mover.speeds.round(DIGITS), mover.speed_stddevs.round(DIGITS), mover.headings_deg.round(1),
     ])  # fmt: skip
     return [dict(zip(TRACK, row, strict=True)) for row in values.tolist()]
@@ -165,7 +165,7 @@ def _write(table: pa.Table, is_georeferenced: bool, folder: Path) -> None:
         rows = table.drop_columns(["geometry"]).to_pylist()
         features = [_feature(*pair) for pair in zip(rows, shapes, strict=True)]
         with replacing(folder / GEOJSON) as file:
-            file.write(json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
+            file.write(json.dumps({"type": "FeatureCollection", "features": features}).encode())
 
 
 def _feature(row: Mapping[str, Any], line: shapely.LineString) -> dict[str, Any]:

@@ -42,9 +42,7 @@ def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
     T_map_lidar = _lidar_pose(drive, scan)
     delays = None
     if stamps is not None:
-        delays = SweepDelays.of(
-            seen.p_map, stamps, np.flatnonzero(seen.valid), T_map_lidar[:2, 3], scan.stamp
-        )
+        delays = SweepDelays.of(seen.points.xyz, stamps, seen.valid, T_map_lidar[:3, :3], scan.stamp)
     return observe(
         scan.number, scan.stamp, seen.p_map, T_map_lidar,
         *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics, drive.image_rows, delays,

@@ -172,10 +172,13 @@ def test_courses_are_unit_vectors_along_the_way() -> None:
 
 def test_delays_are_those_of_the_points_of_a_direction() -> None:
     angles = np.linspace(-np.pi, np.pi, 7200, endpoint=False)
-    points = np.column_stack([3 + 10 * np.cos(angles), 4 + 10 * np.sin(angles), 0 * angles])
-    delays = SweepDelays.of(
-        points, 7.0 - 0.1 * angles / (2 * np.pi), np.arange(7200), np.array([3.0, 4.0]), 7.0
-    )
+    points = np.column_stack([-10 * np.sin(angles), 10 * np.cos(angles), 0 * angles]).astype(np.float32)
+    points[::7] = np.nan
+    usable = np.isfinite(points[:, 0])
+    turn = np.array(
+        [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    )  # the LiDAR's y axis is the map's x axis
+    delays = SweepDelays.of(points, 7.0 - 0.1 * angles / (2 * np.pi), usable, turn, 7.0)
     ways = np.array([(1.0, 0.1), (0.0, 2.0), (-1.0, -1.0)])
     expected = -0.1 * np.arctan2(ways[:, 1], ways[:, 0]) / (2 * np.pi)
     np.testing.assert_allclose(delays_towards(ways, [delays], np.array([3])), expected, atol=1e-3)

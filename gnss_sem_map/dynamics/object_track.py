@@ -30,13 +30,13 @@ SMALL_M, CAR_M = 2.3, 4.5
 larger one that is hidden in part may be as long as a car."""
 VELOCITY_SCANS = 5
 """Scans before and after that tell how an object moves while a sweep meets it."""
-CUT_SCANS = 3
+CUT_SCANS = 5
 """Scans before and after one in which it is hidden or cut off, which may show less than they seem to."""
 SAME_VIEW_SCANS = 10
 """What is not seen of an object is the same in so many scans, so they are no better than one."""
 GRANULE_M = 0.05
 """So much farther than the outermost mean of the points of a voxel of 0.2 m an object goes on, on average."""
-COURSE_M, COURSE_SCANS = 1.5, (2, 5, 10, 20, 50)
+COURSE_M, COURSE_SCANS = 3.0, (2, 5, 10, 20, 50)
 """A course is that of the fewest scans before and after within which an object goes so far."""
 SIZE_QUANTILE = 0.9
 FEWEST = 5

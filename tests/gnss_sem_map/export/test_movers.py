@@ -13,6 +13,7 @@ from gnss_sem_map.dynamics.constant_velocity import smooth
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.movers import DriveOfMovers, join_movers, read_movers, write_movers
+from gnss_sem_map.export.report import write_report
 
 EPOCH_NS = 1_317_000_000_000_000_000
 
@@ -121,6 +122,16 @@ def test_drives_are_joined_row_by_row(mover, karlsruhe, tmp_path) -> None:
     join_movers(parts[:1], alone)
     for name in ("objects.parquet", "objects.geojson"):
         assert (alone / name).read_bytes() == (parts[0] / name).read_bytes()
+
+
+def test_the_report_lists_it(mover, karlsruhe, tmp_path) -> None:
+    write_movers([mover], DriveOfMovers("monday", EPOCH_NS, karlsruhe), tmp_path)
+    write_report(tmp_path, {"name": "monday"}, {})
+    page = (tmp_path / "report.html").read_text()
+    (row,) = read_movers(tmp_path)
+    for text in ("What moved", "monday, 1", "vehicle, by its labels", "went 15.0 m", "objects.geojson"):
+        assert text in page
+    assert f"{row['speed_mps']:.1f}\u00a0±\u00a0{row['speed_stddev_mps']:.1f}" in page
 
 
 def test_a_damaged_table_is_named(tmp_path) -> None:

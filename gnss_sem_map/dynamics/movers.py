@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
@@ -186,6 +187,4 @@ def class_by_shape(size_m: tuple[float, ...]) -> str:
 
 
 def _running_median(values: Array) -> Array:
-    from scipy.ndimage import median_filter
-
     return np.asarray(median_filter(values, 9, mode="nearest"))

@@ -25,9 +25,11 @@ EDGE_STDDEV_M, EDGE_STDDEV_RATIO = 0.08, 0.005
 """A side of an object is known to this, plus this share of the range: spacing of the beams, and poses."""
 HIDDEN_STDDEV_M = 0.3
 """What is hidden in part or cut off may end this much farther, beside what is missing of its size."""
-SMALL_M, CAR_M = 2.3, 4.5
+SMALL_M, CAR_M, LORRY_M = 2.3, 4.5, 12.0
 """Smaller objects, people and cyclists, have no sides that are seen well: the mean of what is seen is their place. A
-larger one that is hidden in part may be as long as a car."""
+larger one that is hidden in part may be as long as a car, and one that was never seen whole as long as a lorry."""
+WHOLE_SCANS = 3
+"""Scans in which an object is seen whole, that tell its size."""
 VELOCITY_SCANS = 5
 """Scans before and after that tell how an object moves while a sweep meets it."""
 CUT_SCANS = 5
@@ -199,7 +201,8 @@ def _middle(
     hidden = np.maximum(extent - seen, 0.0) / 2
     side = np.where(lidar < low, 1, np.where(lidar > high, -1, 0))
     middle = (low + high) / 2 + side * hidden
-    possible = max(extent, CAR_M) if extent > SMALL_M / 2 else extent
+    vehicle = CAR_M if (~is_cut).sum() >= WHOLE_SCANS else LORRY_M
+    possible = max(extent, vehicle) if extent > SMALL_M / 2 else extent
     of_cut = np.maximum(possible - seen, 0.0) / 2 + HIDDEN_STDDEV_M
     unknown = np.where(is_cut, of_cut, np.where(side == 0, hidden, 0.0))
     alike = min(max(int((unknown > edge).sum()), 1), SAME_VIEW_SCANS)

@@ -97,6 +97,9 @@ def test_the_map_lies_where_the_drive_was(raw_run: Path, small_drive: Street) ->
     assert (np.asarray(laspy.read(raw_run / "removed.laz")["state"]) == State.REMOVED).all()
     assert len(pyogrio.raw.read(raw_run / "map.gpkg", layer="road")[2]) > 0
     assert len(geopandas.read_parquet(raw_run / "trajectory_wgs84.parquet")) > 10
+    moved = geopandas.read_parquet(raw_run / "objects.parquet")
+    assert moved.crs.to_epsg() == 4979
+    assert len(json.loads((raw_run / "objects.geojson").read_text())["features"]) == len(moved)
     ply = PlyData.read(raw_run / "map.ply")["vertex"]
     wall = ply["label"] == URBAN.index("building")
     north = np.asarray(ply["y"], float)[wall]

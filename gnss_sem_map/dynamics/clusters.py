@@ -129,6 +129,15 @@ class Segments:
         means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
         return np.split(means, np.cumsum(np.bincount(self.number, minlength=len(self.truncated)))[:-1])
 
+    def levels(self) -> list[tuple[float, float]]:
+        """For every segment the lowest and the highest of its voxels, by the means of their points, m."""
+        heights = self.parts.sums[:, 2] / self.parts.points
+        lowest = np.full(len(self.truncated), np.inf)
+        highest = -lowest
+        np.minimum.at(lowest, self.number, heights)
+        np.maximum.at(highest, self.number, heights)
+        return list(zip(lowest.tolist(), highest.tolist(), strict=True))
+
     def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
         """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
         weights, count = counts * self.parts.points, len(self.truncated)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 from scipy.special import betaincc
 
+from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.dynamics.own_motion import motion_of
 from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
@@ -96,6 +97,12 @@ class TrackedObject:
     last_stamp: float
     path: NDArray[np.float64]
     """(s, 2) m: the centroids of its segments, in time order."""
+    track: ObjectTrack | None = None
+    """Where its middle was, if it moved and was seen in some scans."""
+    lidar: str = ""
+    """Name of the LiDAR; empty where the drive has but one."""
+    chunk: int = 0
+    """Number of the chunk of scans in which it was found."""
 
 
 def classify_motion(

@@ -25,8 +25,10 @@ from gnss_sem_map.dynamics.ground_grid import (
 )
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
+from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
 from gnss_sem_map.dynamics.standing import is_occupied, standing
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.tracking import Segment
 from gnss_sem_map.dynamics.visibility import (
     SCANS_PER_PART,
@@ -59,6 +61,7 @@ class Observation:
     stamp: float
     seen: RangeImage
     segments: Segments
+    delays: SweepDelays
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +125,17 @@ def decide(
     moved_of, stood_of = _of_voxels(gone, segments), _of_voxels(stood, segments)
     stays = standing(places, counts, moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
-    first_seen_here = tuple(one for one in objects if listed[one.segments[0]].scan < count)
+    first_seen_here = tuple(
+        _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
+    )
     return Decision(moved, first_seen_here, is_sharp)
+
+
+def _with_track(one: TrackedObject, listed: Sequence[Segment]) -> TrackedObject:
+    """An object that moved, with its track."""
+    if one.motion not in GONE:
+        return one
+    return replace(one, track=track_of([listed[n] for n in one.segments], BODY_HEIGHT_M))
 
 
 def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> list[NDArray[np.bool_]]:
@@ -195,11 +207,13 @@ def observe(
     is_known: NDArray[np.bool_],
     settings: MotionSettings,
     rows: Rows,
+    delays: SweepDelays | None = None,
 ) -> tuple[Observation, NearPoints]:
     """Segments and range image of one scan, and its points in or near a segment.
 
     `p_map` (n, 3) m are its deskewed points, `T_map_lidar` (4, 4) its pose at `stamp`; `is_object` (n,) marks the
-    points that the image labels as movable, `is_known` (n,) those with any label. `rows` are those of its LiDAR.
+    points that the image labels as movable, `is_known` (n,) those with any label. `rows` are those of its LiDAR,
+    `delays` tell when the sweep met what.
     """
     seen = RangeImage.of(p_map, T_map_lidar, rows)
     cell_m = float(np.clip(CELL_M_PER_DEG * rows.gap_on_ground_deg, GROUND_CELL_M, LARGEST_CELL_M))
@@ -226,7 +240,7 @@ def observe(
         voxel=voxel.take(keep),
     )
     segments = replace(segments, truncated=segments.truncated | hidden)
-    return Observation(number, stamp, seen, segments), near
+    return Observation(number, stamp, seen, segments, delays or SweepDelays.none()), near
 
 
 def _all_segments(observations: Sequence[Observation], segments: list[Segments]) -> list[Segment]:
@@ -236,6 +250,7 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
         whole = of_scan.whole
         centroids = whole.sums[:, :2] / whole.points[:, None]
         outlines = of_scan.outlines()
+        levels = of_scan.levels()
         seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
             listed.append(
@@ -248,6 +263,9 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     truncated=truncated,
                     outline=outlines[number],
                     seen_from=seen_from,
+                    levels=levels[number],
+                    labelled=int(whole.labelled[number]),
+                    delays=seen.delays,
                 )
             )
     return listed

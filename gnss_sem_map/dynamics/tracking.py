@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays
+
 LONGEST_GAP = 5
 """A track ends after more scans than this without a segment."""
 NEW_SHARE = 0.3
@@ -33,6 +35,12 @@ class Segment:
     """(v, 2) m: the points of its voxels on average, which tell its extent in any direction."""
     seen_from: NDArray[np.float64]
     """(2,) m: where the LiDAR was."""
+    levels: tuple[float, float] = (0.0, 0.0)
+    """Lowest and highest of its voxels, by the means of their points, m."""
+    labelled: int = 0
+    """Points that the image labels as movable."""
+    delays: SweepDelays | None = None
+    """When the sweep met what; None: all at the stamp."""
 
 
 @dataclass(eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.export.charts import Chart, Curve, chart
 from gnss_sem_map.export.formats import FORMATS
+from gnss_sem_map.export.movers import read_movers
 from gnss_sem_map.export.overview import Overview, coverage_pixels, label_pixels, overview_of
 from gnss_sem_map.export.page import page, percent, png
 from gnss_sem_map.export.track import Track, read_track
@@ -37,6 +38,8 @@ FILES = {
     "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
     "trajectory_wgs84.parquet": "the track in WGS 84 with time, speed and standard deviations, as GeoParquet",
+    "objects.parquet": "what moved: a row per object with its track, size, speed and evidence, as GeoParquet",
+    "objects.geojson": "the same in WGS 84, for web maps and QGIS",
     "map": "the map before refinement, with all evidence, as Parquet tiles",
     "refined": "the refined map as Parquet tiles",
     "drives": "map, evidence, trajectory and report of each of several drives",
@@ -74,6 +77,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
     refined = overviews.get("refined")
     about_map = run.get("map", {})
     refinement = about_map.get("refinement", {})
+    moved = read_movers(folder)
     content = {
         "title": title,
         "facts": _facts(run),
@@ -88,7 +92,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "looks": [] if refined is None else list(_looks(refined)),
         "reliability": _reliability(metrics.get("calibration", {})),
         "dynamic": _shares(metrics.get("dynamic", {})),
-        "path": _path(tracks, refinement.get("tracked", ())),
+        "path": _path(tracks, moved),
         "band": _band(tracks),
         "trajectory": run.get("trajectory") or {},
         "trajectory_scores": metrics.get("trajectory", {}),
@@ -98,7 +102,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "settings": read_text(folder / "config.yaml") if is_file(folder / "config.yaml") else "",
         "versions": run.get("versions", {}),
     }  # fmt: skip
-    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined), _movers(refinement),
+    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined), _movers(refinement, moved),
                  _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
                  _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
         content |= part
@@ -186,15 +190,15 @@ def _confidence_and_right(bins: Sequence[Mapping[str, float]]) -> tuple[list[flo
     return [each["confidence"] for each in bins], [each["right"] for each in bins]
 
 
-def _path(tracks: Mapping[str, Track], tracked: Sequence[Mapping[str, Any]]) -> Chart | None:
+def _path(tracks: Mapping[str, Track], moved: Sequence[Mapping[str, Any]]) -> Chart | None:
     """Where the drives went, and where what moved went."""
     if not tracks:
         return None
-    movers = [np.array(thing["path"]) for thing in tracked if thing["motion"] == "moving" and thing["path"]]
+    movers = [np.array([(place["east_m"], place["north_m"]) for place in one["track"]]) for one in moved]
     curves: list[Curve] = [("moving object", "b", way[:, 0], way[:, 1]) for way in movers]
     curves += [(name, "a", track.positions[:, 0], track.positions[:, 1]) for name, track in tracks.items()]
-    moved = "; orange: what moved" if movers else ""
-    return chart(f"The way of the vehicle (blue), north up{moved}.", "east, m", "north, m", curves,
+    beside = "; orange: what moved" if movers else ""
+    return chart(f"The way of the vehicle (blue), north up{beside}.", "east, m", "north, m", curves,
                  height=420, is_equal=True)  # fmt: skip
 
 
@@ -261,17 +265,20 @@ def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage:
     return [*counts.get(stage, {}), *semantics.get(stage, {}).get("classes", {})]
 
 
-def _movers(refinement: Mapping[str, Any]) -> dict[str, Any]:
-    """What was tracked, counted; and those that moved, with the evidence."""
+def _movers(refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What was tracked, counted; and what moved, with its speed and the evidence."""
     tracked = refinement.get("tracked", ())
     motions = [str(thing["motion"]) for thing in tracked]
-    moving = sorted((t for t in tracked if t["motion"] == "moving"), key=lambda t: -t["points"])[:MANY_MOVERS]
+    rows = sorted(moved, key=lambda one: -one["points"])[:MANY_MOVERS]
     return {
         "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},
         "mover_rows": [
-            (t["motion"], percent(t["probability"]), t["reason"], t["points"],
-             *(f"{round(t[end], 1) + 0.0:.1f}" for end in ("first_stamp", "last_stamp")))
-            for t in moving
+            (f"{one['drive']}, {one['id']}", f"{one['class']}, by its {one['class_from']}",
+             f"{one['speed_mps']:.1f}\u00a0±\u00a0{one['speed_stddev_mps']:.1f}", f"{one['way_m']:.0f}",
+             "\u00a0x\u00a0".join(f"{one[side]:.1f}" for side in ("length_m", "width_m", "height_m")),
+             *(f"{round(one[end], 1) + 0.0:.1f}" for end in ("first_stamp_s", "last_stamp_s")),
+             f"{one['motion']}: {one['evidence']}", one["points"])
+            for one in rows
         ],
     }  # fmt: skip
 

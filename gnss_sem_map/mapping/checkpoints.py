@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS, Motion, TrackedObject
+from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
@@ -195,7 +196,8 @@ def _content(path: Path, checksum: str) -> bytes:
 
 def _about(one: TrackedObject) -> dict[str, Any]:
     """An object without its segments, whose numbers say nothing outside their chunk."""
-    return asdict(one) | {"path": one.path.tolist(), "segments": ()}
+    about = asdict(one) | {"path": one.path.tolist(), "segments": ()}
+    return about if one.track is None else about | {"track": one.track.as_dict()}
 
 
 def _object(content: Mapping[str, Any]) -> TrackedObject:
@@ -203,6 +205,7 @@ def _object(content: Mapping[str, Any]) -> TrackedObject:
         "motion": Motion(content["motion"]),
         "segments": (),
         "path": np.array(content["path"], np.float64).reshape(-1, 2),
+        "track": None if content["track"] is None else ObjectTrack.from_dict(content["track"]),
     }
     return TrackedObject(**{**content, **given})
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -227,10 +227,9 @@ class _Chunk:
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None
         static = self._all.to_map() - gone
-        number = self._first + self._number
-        return MappedChunk(
-            number, self._drive.log.lidar, static, gone, moving, decision.objects, keyframes, self.stats
-        )
+        number, lidar = self._first + self._number, self._drive.log.lidar
+        objects = tuple(replace(one, lidar=lidar, chunk=number) for one in decision.objects)
+        return MappedChunk(number, lidar, static, gone, moving, objects, keyframes, self.stats)
 
     def _last_window(self) -> frozenset[int]:
         window = self._drive.settings.dynamics.window_scans

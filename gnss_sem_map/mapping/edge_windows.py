@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.dynamics.clusters import PointSets, Segments
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.moving_objects import Observation
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import RangeImage
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.ownership import write_whole
@@ -58,6 +59,7 @@ def _arrays(one: Observation) -> dict[str, Any]:
         "frame": np.array(one.number), "stamp": np.array(one.stamp),
         "image": seen.image, "T_lidar_map": seen.T_lidar_map,
         "keys": segments.keys, "number": segments.number, "truncated": segments.truncated,
+        "delays": one.delays.seconds,
     }  # fmt: skip
 
 
@@ -65,4 +67,5 @@ def _observation(arrays: Mapping[str, NDArray[Any]], at: str, rows: Rows) -> Obs
     parts = PointSets(**{field.name: arrays[at + field.name] for field in fields(PointSets)})
     segments = Segments(arrays[at + "keys"], parts, arrays[at + "number"], arrays[at + "truncated"])
     seen = RangeImage(arrays[at + "image"], arrays[at + "T_lidar_map"], rows)
-    return Observation(int(arrays[at + "frame"]), float(arrays[at + "stamp"]), seen, segments)
+    delays = SweepDelays(arrays[at + "delays"])
+    return Observation(int(arrays[at + "frame"]), float(arrays[at + "stamp"]), seen, segments, delays)

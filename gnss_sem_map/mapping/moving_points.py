@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, observe
+from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import THREADS, RangeImage
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import OTHER
@@ -37,10 +38,14 @@ def observe_scan(seen: LabelledScan) -> tuple[Observation, NearPoints]:
 
     Objects outside of all images are tracked too, but count as moving only if they were displaced.
     """
-    drive, scan = seen.drive, seen.scan
+    drive, scan, stamps = seen.drive, seen.scan, seen.points.stamps
+    T_map_lidar = _lidar_pose(drive, scan)
+    delays = None
+    if stamps is not None:
+        delays = SweepDelays.of(seen.points.xyz, stamps, seen.valid, T_map_lidar[:3, :3], scan.stamp)
     return observe(
-        scan.number, scan.stamp, seen.p_map, _lidar_pose(drive, scan),
-        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics, drive.image_rows,
+        scan.number, scan.stamp, seen.p_map, T_map_lidar,
+        *movable_and_known(seen.labels, drive.label_set.names), drive.settings.dynamics, drive.image_rows, delays,
     )  # fmt: skip
 
 

@@ -174,6 +174,8 @@ class Run:
                 before = run_folder.georeference_of(self.settings, self.frame)
                 if before is not None and georeference is not None:
                     copy_changes(self.folder, folder, before, georeference, self.label_set)
+                for file in self.folder.glob("objects.*"):
+                    link_or_copy(file, folder / file.name)
                 about = self.about | {"map": run_folder.about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
                 for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
@@ -215,6 +217,7 @@ class Run:
             )
             refined = pipeline.refine(folder, settings, stats, progress)
             refined = replace(refined, report=run_folder.with_objects(refined.report, mapped))
+            run_folder.write_objects(folder, str(self.about["drive"]), mapped, settings)
             run_folder.write_again(
                 folder,
                 self.folder,

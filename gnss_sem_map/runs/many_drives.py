@@ -32,6 +32,7 @@ from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.changes import write_changes
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.movers import join_movers
 from gnss_sem_map.files import ownership, work_folder
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import Claim, new_folder
@@ -278,6 +279,7 @@ def _write(
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
             write_changes(changes, Georeference.of(frame, settings.delivery), label_set, folder)
+        join_movers(parts, folder)
         about = {
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],
@@ -313,7 +315,11 @@ def _link_all(drive: Path, part: Path) -> None:
     for name in (MAP, evidence.FOLDER):
         ignore = shutil.ignore_patterns(ownership.MARKER)
         shutil.copytree(drive / name, part / name, copy_function=link_or_copy, ignore=ignore)
-    for file in (*drive.glob("trajectory*"), *(drive / name for name in OF_ONE_DRIVE)):
+    for file in (
+        *drive.glob("trajectory*"),
+        *drive.glob("objects.*"),
+        *(drive / name for name in OF_ONE_DRIVE),
+    ):
         link_or_copy(file, part / file.name)
 
 

@@ -20,10 +20,12 @@ from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
+from gnss_sem_map.dynamics.movers import movers_of
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.georeference import Georeference, check_delivery
+from gnss_sem_map.export.movers import DriveOfMovers, write_movers
 from gnss_sem_map.export.report import FILES, write_report
 from gnss_sem_map.export.trajectories import (
     write_covariance_tum,
@@ -37,6 +39,7 @@ from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.moving_points import MOVABLE
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED, Refined
@@ -95,6 +98,7 @@ def write_run(
     refined = replace(refined, report=with_objects(refined.report, mapped))
     with mapped.stats.stage("export"):
         write_plot(folder, mapped.log, mapped.solution)
+        write_objects(folder, source.name, mapped, settings)
         track = _while_mapping(mapped.trajectory, mapped.log)
         write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
         if write_labels:
@@ -109,8 +113,16 @@ def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings
     `correction`: digest of that with which it is bound to others, empty without.
     """
     write_plot(folder, mapped.log, mapped.solution)
+    write_objects(folder, source.name, mapped, settings)
     about = about_mapped(source, mapped) | {"correction": correction}
     write_about(folder, settings, about, metrics_of(mapped))
+
+
+def write_objects(folder: Path, name: str, mapped: Mapped, settings: Settings) -> None:
+    """Write what moved in a drive of this name."""
+    movable = [each for each in open_label_set(settings.classes).names if each in MOVABLE]
+    log = mapped.log
+    write_movers(movers_of(mapped.objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
 
 
 def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
@@ -150,8 +162,9 @@ def write_again(
     """
     about, metrics = read_run(source), read_json(source / "metrics.json")
     first, last = about["scans_s"]
-    for file in source.glob("trajectory*"):
-        shutil.copyfile(file, folder / file.name)
+    for file in (*source.glob("trajectory*"), *source.glob("objects.*")):
+        if not (folder / file.name).exists():  # what moved may be known anew
+            shutil.copyfile(file, folder / file.name)
     with stats.stage("export"):
         write_map_files(folder, [between(trajectory, first, last)], str(about["name"]), settings.delivery)
         if log is not None:

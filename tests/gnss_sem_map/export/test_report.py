@@ -171,7 +171,7 @@ def test_a_section_without_data_does_not_appear(tmp_path: Path) -> None:
     assert report(tmp_path, {"name": "x", "counts": {"scans": 1}}, {}).headings == ["What went in"]
     everything = [
         "Classes and confidence",
-        "Moving vehicles",
+        "What moved",
         "Trajectory",
         "What went in",
         "What was left out",

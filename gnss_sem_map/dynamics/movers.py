@@ -1,0 +1,190 @@
+"""Movers of a drive: what moved, each with its track, size, speed, class and the evidence that it moved.
+
+A drive is searched chunk by chunk and LiDAR by LiDAR, so one object may have several tracks. Tracks of different chunks
+or LiDARs that lie on each other are of one object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
+from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
+from gnss_sem_map.dynamics.object_track import ObjectTrack
+
+Array = NDArray[np.float64]
+
+SAME_M = 1.0
+"""Tracks whose median distance is smaller than this are of one object."""
+LEAST_COMMON_S = 0.25
+"""Tracks that have less time in common are not compared."""
+LEAST_WAY_M, SIGNIFICANT = 0.5, 3.0
+"""What moved went so far, and so many standard deviations of that."""
+LEAST_LABELLED = 0.2
+"""With this share of its points labelled, an object is what its labels say; with less, what its shape says."""
+SHAPES = (
+    ("person", 0.0, 1.2, 1.2, 0.8, 2.3),
+    ("cyclist", 1.2, 2.3, 1.2, 0.8, 2.3),
+    ("vehicle", 2.3, 14.0, 3.2, 0.6, 4.5),
+)
+"""Classes by shape: least and greatest length, greatest width, least and greatest height, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """One object that moved."""
+
+    lidars: tuple[str, ...]
+    """LiDARs that saw it, by name."""
+    name: str
+    """Its class."""
+    is_labelled: bool
+    """Labels tell its class; else its shape does."""
+    labelled: float
+    """Share of its points that an image labels as movable."""
+    motion: str
+    probability: float
+    """That it moved."""
+    evidence: str
+    points: int
+    size_m: tuple[float, float, float]
+    """Length, width and height."""
+    stamps: Array
+    """(k,) s."""
+    heights: Array
+    """(k,) m: the ground under it."""
+    track: SmoothedTrack
+
+    @property
+    def positions(self) -> Array:
+        """(k, 3) m: the middle of its footprint."""
+        return np.column_stack([self.track.positions, self.heights])
+
+    @property
+    def went_somewhere(self) -> bool:
+        """Whether it was seen to move, not only to be there at one time and not at another."""
+        off = self.track.positions - self.track.positions[0]
+        stddevs = np.sqrt((self.track.position_variances + self.track.position_variances[0]).max(axis=1))
+        return bool((np.linalg.norm(off, axis=1) > np.maximum(LEAST_WAY_M, SIGNIFICANT * stddevs)).any())
+
+    @property
+    def speeds(self) -> Array:
+        """(k,) m/s."""
+        return np.asarray(np.linalg.norm(self.track.velocities, axis=1))
+
+    @property
+    def speed_stddevs(self) -> Array:
+        """(k,) m/s."""
+        speeds = self.speeds[:, None]
+        ahead = np.divide(
+            self.track.velocities, speeds, np.full_like(self.track.velocities, 0.5**0.5), where=speeds > 0
+        )
+        return np.asarray(np.sqrt((ahead**2 * self.track.velocity_variances).sum(axis=1)))
+
+    @property
+    def headings_deg(self) -> Array:
+        """(k,) from north over east."""
+        return np.asarray(np.degrees(np.arctan2(*self.track.velocities.T)) % 360)
+
+
+def movers_of(objects: Sequence[TrackedObject], movable: Sequence[str]) -> tuple[Mover, ...]:
+    """The movers among tracked objects, by the time when they were first seen.
+
+    `movable` are the classes of the class set that may move.
+    """
+    moved = [one for one in objects if one.motion in GONE and one.track is not None]
+    movers = [_mover([moved[n] for n in group], movable) for group in _same(moved)]
+    seen_to_move = [one for one in movers if one.went_somewhere]
+    return tuple(sorted(seen_to_move, key=lambda one: (one.stamps[0], *one.positions[0])))
+
+
+def _same(objects: Sequence[TrackedObject]) -> Iterator[list[int]]:
+    """Groups of objects that are one."""
+    order = sorted(range(len(objects)), key=lambda n: float(_track(objects[n]).stamps[0]))
+    group = list(range(len(objects)))
+    alive: list[int] = []
+    for n in order:
+        start = _track(objects[n]).stamps[0]
+        alive = [m for m in alive if _track(objects[m]).stamps[-1] >= start]
+        for m in alive:
+            if _are_one(objects[m], objects[n]):
+                old, new = group[n], group[m]
+                group = [new if g == old else g for g in group]
+        alive.append(n)
+    for root in dict.fromkeys(group):
+        yield [n for n in order if group[n] == root]
+
+
+def _track(one: TrackedObject) -> ObjectTrack:
+    assert one.track is not None
+    return one.track
+
+
+def _are_one(first: TrackedObject, second: TrackedObject) -> bool:
+    """Whether two tracks, of different chunks or LiDARs, lie on each other."""
+    if (first.chunk, first.lidar) == (second.chunk, second.lidar):
+        return False
+    a, b = _track(first), _track(second)
+    start, end = max(a.stamps[0], b.stamps[0]), min(a.stamps[-1], b.stamps[-1])
+    if end - start < LEAST_COMMON_S:
+        return False
+    times = np.linspace(start, end, 20)
+    off = [
+        np.interp(times, a.stamps, a.positions[:, k]) - np.interp(times, b.stamps, b.positions[:, k])
+        for k in (0, 1)
+    ]
+    return bool(np.median(np.hypot(*off)) < SAME_M)
+
+
+def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
+    """One mover of its tracks; what chunks have in common counts once."""
+    tracks = [_track(one) for one in objects]
+    stamps = np.concatenate([t.stamps for t in tracks])
+    lidars = np.repeat([one.lidar for one in objects], [len(t.stamps) for t in tracks])
+    positions, variances = (
+        np.concatenate([getattr(t, name) for t in tracks]) for name in ("positions", "variances")
+    )
+    _, first = np.unique(np.rec.fromarrays([stamps, lidars]), return_index=True)
+    stamps, positions, variances = stamps[first], positions[first], variances[first]
+    points = np.array([one.points for one in objects], np.float64)
+    labelled = float(np.average([t.labelled for t in tracks], weights=points))
+    main = objects[int(points.argmax())]
+    length, width, height = (max(sizes) for sizes in zip(*(t.size_m for t in tracks), strict=True))
+    size = length, width, height
+    is_labelled = labelled >= LEAST_LABELLED and len(movable) == 1
+    return Mover(
+        lidars=tuple(sorted({one.lidar for one in objects})),
+        name=movable[0] if is_labelled else class_by_shape(size),
+        is_labelled=is_labelled,
+        labelled=labelled,
+        motion=main.motion,
+        probability=max(one.probability for one in objects),
+        evidence=main.reason,
+        points=int(points.sum()),
+        size_m=size,
+        stamps=stamps,
+        heights=_running_median(positions[:, 2]),
+        track=smooth(stamps, positions[:, :2], variances),
+    )
+
+
+def class_by_shape(size_m: tuple[float, ...]) -> str:
+    """What an object of this length, width and height is, m."""
+    length, width, height = size_m
+    for name, shortest, longest, widest, lowest, highest in SHAPES:
+        if (
+            shortest <= max(length, width) < longest
+            and min(length, width) < widest
+            and lowest <= height < highest
+        ):
+            return name
+    return "unknown"
+
+
+def _running_median(values: Array) -> Array:
+    return np.asarray(median_filter(values, 9, mode="nearest"))

@@ -133,7 +133,7 @@ def las_header(label_set: LabelSet, georeference: Georeference | None) -> laspy.
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=7, version="1.4")
-    header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"
+    header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"[:32]  # no longer by the standard
     header.scales = np.full(3, LAZ_SCALE_M)
     header.offsets = np.floor(_placed(np.zeros((1, 3)), georeference)[0])
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in EXTRA_BYTES])

@@ -145,7 +145,7 @@ def test_dask_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, tmp
 @pytest.mark.parametrize(
     ("preload", "message"),
     [
-        (OTHER_VERSION, r"Dask worker tcp://\S+: has gnss-sem-map 0\.0\.1; expected \d+\.\d+\.\d+, as here"),
+        (OTHER_VERSION, r"Dask worker tcp://\S+: has gnss-sem-map 0\.0\.1; expected \d+\.\d+\S*, as here"),
         (NO_PACKAGE, r"Dask worker tcp://\S+: has no gnss-sem-map; install version \d"),
         (OWN_FOLDER, r"Dask worker tcp://\S+: does not share the folder /"),
     ],

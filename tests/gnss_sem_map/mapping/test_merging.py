@@ -18,7 +18,9 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import align, into_frame, merge, merge_runs
 from gnss_sem_map.mapping.raw_map import MAP, open_raw
 from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.crumbs import CrumbSettings
 from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, heights_in_voxels, keys_of
@@ -70,11 +72,12 @@ def test_one_frame_is_added_exactly() -> None:
 
 
 def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
-    """Folders as a run writes them: `map` is everything, `evidence` says what of it moved."""
+    """Folders as a run writes them: `map` is everything, `evidence` says what of it moved; crumbs are another matter."""
+    settings = RefinementSettings(crumbs=CrumbSettings(enabled=False))
     for name, frame, seed in (("a", HERE, 0), ("b", THERE, 1)):
         voxels = street(frame, seed)
         moved = voxels.labels == URBAN.index("building")
-        refined, _ = refine(voxels[~moved], beside=Evidence(moved=voxels[moved]))
+        refined, _ = refine(voxels[~moved], settings, Evidence(moved=voxels[moved]))
         assert np.count_nonzero(refined.states == State.REMOVED) == moved.sum() > 0
         write_run(tmp_path / name, voxels[~moved], voxels[moved], frame)
     runs = merge_runs(tmp_path / "a", tmp_path / "b", match=False)
@@ -83,7 +86,7 @@ def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
     assert static.hits.sum() + removed.hits.sum() == 120_000
     assert set(removed.labels) == {URBAN.index("building")}
     assert URBAN.index("building") not in static.labels
-    again, _ = refine(static, beside=Evidence(moved=removed))
+    again, _ = refine(static, settings, Evidence(moved=removed))
     assert np.count_nonzero(again.states == State.REMOVED) == np.count_nonzero(
         static.indices_of(removed.keys) < 0
     )

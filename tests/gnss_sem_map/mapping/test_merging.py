@@ -72,7 +72,7 @@ def test_one_frame_is_added_exactly() -> None:
 
 
 def test_two_run_folders_merge_with_what_was_removed(tmp_path: Path) -> None:
-    """Folders as a run writes them: `map` is everything, `evidence` says what of it moved; crumbs are another matter."""
+    """Folders as a run writes them: `map` is everything, `evidence` says what of it moved; crumbs are left alone."""
     settings = RefinementSettings(crumbs=CrumbSettings(enabled=False))
     for name, frame, seed in (("a", HERE, 0), ("b", THERE, 1)):
         voxels = street(frame, seed)

@@ -23,7 +23,6 @@ from refinement import mapped, perfectly_seen, what_they_do
 from scipy.interpolate import CubicSpline
 
 from gnss_sem_map.dynamics.movers import Mover, movers_of
-from gnss_sem_map.export.movers import mean_speed
 
 RESULTS = Path(__file__).parent / "results" / "movers.json"
 NEAR_M = 3.0
@@ -91,7 +90,7 @@ def scored(movers: tuple[Mover, ...], truth: list[TrueObject]) -> dict[str, Any]
         off.append(errors)
         within.append(np.abs(errors) < 2 * mover.speed_stddevs)
         way = np.linalg.norm(np.diff(one.places(mover.stamps), axis=0), axis=1).sum()
-        _, speed, stddev = mean_speed(mover)
+        speed, stddev = mover.mean_speed
         means.append((speed - way / (mover.stamps[-1] - mover.stamps[0]), stddev))
         right.append(CLASSES.get(one.model, "vehicle") == mover.name)
         by_case.setdefault(one.case, []).append(errors)

@@ -6,13 +6,14 @@ or LiDARs that lie on each other are of one object.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from factor_graphs.sessions import components
 from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
 from gnss_sem_map.dynamics.object_track import ObjectTrack
@@ -25,6 +26,8 @@ LEAST_COMMON_S = 0.25
 """Tracks that have less time in common are not compared."""
 LEAST_WAY_M, SIGNIFICANT = 0.5, 3.0
 """What moved went so far, and so many standard deviations of that."""
+GROUND_PLACES = 9
+"""The ground under a place is the median of so many."""
 LEAST_LABELLED = 0.2
 """With this share of its points labelled, an object is what its labels say; with less, what its shape says."""
 SHAPES = (
@@ -73,6 +76,17 @@ class Mover:
         return bool((np.linalg.norm(off, axis=1) > np.maximum(LEAST_WAY_M, SIGNIFICANT * stddevs)).any())
 
     @property
+    def way_m(self) -> float:
+        """How far it went."""
+        return float(np.linalg.norm(np.diff(self.track.positions, axis=0), axis=1).sum())
+
+    @property
+    def mean_speed(self) -> tuple[float, float]:
+        """Over the time that it was seen, m/s, and the standard deviation of that."""
+        seconds, ends = float(self.stamps[-1] - self.stamps[0]), self.track.position_variances[[0, -1]]
+        return self.way_m / seconds, float(np.sqrt(ends.max(axis=1).sum())) / seconds
+
+    @property
     def speeds(self) -> Array:
         """(k,) m/s."""
         return np.asarray(np.linalg.norm(self.track.velocities, axis=1))
@@ -103,21 +117,18 @@ def movers_of(objects: Sequence[TrackedObject], movable: Sequence[str]) -> tuple
     return tuple(sorted(seen_to_move, key=lambda one: (one.stamps[0], *one.positions[0])))
 
 
-def _same(objects: Sequence[TrackedObject]) -> Iterator[list[int]]:
-    """Groups of objects that are one."""
+def _same(objects: Sequence[TrackedObject]) -> list[list[int]]:
+    """Groups of objects that are one, each in the order of time."""
     order = sorted(range(len(objects)), key=lambda n: float(_track(objects[n]).stamps[0]))
-    group = list(range(len(objects)))
+    ones: list[tuple[int, int]] = []
     alive: list[int] = []
-    for n in order:
+    for place, n in enumerate(order):
         start = _track(objects[n]).stamps[0]
-        alive = [m for m in alive if _track(objects[m]).stamps[-1] >= start]
-        for m in alive:
-            if _are_one(objects[m], objects[n]):
-                old, new = group[n], group[m]
-                group = [new if g == old else g for g in group]
-        alive.append(n)
-    for root in dict.fromkeys(group):
-        yield [n for n in order if group[n] == root]
+        alive = [m for m in alive if _track(objects[order[m]]).stamps[-1] >= start]
+        ones += [(m, place) for m in alive if _are_one(objects[order[m]], objects[n])]
+        alive.append(place)
+    groups = components(len(objects), np.array(ones, np.intp).reshape(-1, 2))
+    return [[order[place] for place in group] for group in groups]
 
 
 def _track(one: TrackedObject) -> ObjectTrack:
@@ -168,7 +179,7 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
         points=int(points.sum()),
         size_m=size,
         stamps=stamps,
-        heights=_running_median(positions[:, 2]),
+        heights=np.asarray(median_filter(positions[:, 2], GROUND_PLACES, mode="nearest")),
         track=smooth(stamps, positions[:, :2], variances),
     )
 
@@ -184,7 +195,3 @@ def class_by_shape(size_m: tuple[float, ...]) -> str:
         ):
             return name
     return "unknown"
-
-
-def _running_median(values: Array) -> Array:
-    return np.asarray(median_filter(values, 9, mode="nearest"))

@@ -99,7 +99,7 @@ def _read(path: Path) -> pa.Table:
 
 def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
     """One mover as the table has it."""
-    way_m, speed, stddev = mean_speed(mover)
+    speed, stddev = mover.mean_speed
     times = [drive.epoch_ns // 1000 + round(1e6 * stamp) for stamp in mover.stamps[[0, -1]].tolist()]
     start, end = mover.positions[[0, -1]]
     length, width, height = mover.size_m
@@ -112,7 +112,8 @@ def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
         "first_time": times[0], "last_time": times[1],
         "first_stamp_s": round(float(mover.stamps[0]), 6), "last_stamp_s": round(float(mover.stamps[-1]), 6),
         "length_m": round(length, DIGITS), "width_m": round(width, DIGITS), "height_m": round(height, DIGITS),
-        "way_m": round(way_m, DIGITS), "speed_mps": round(speed, DIGITS), "speed_stddev_mps": round(stddev, DIGITS),
+        "way_m": round(mover.way_m, DIGITS),
+        "speed_mps": round(speed, DIGITS), "speed_stddev_mps": round(stddev, DIGITS),
         "highest_speed_mps": round(float(mover.speeds.max()), DIGITS), "heading_deg": round(float(heading), 1),
         "track": _track(mover), **_places(mover, drive.frame),
     }  # fmt: skip
@@ -141,14 +142,6 @@ def _places(mover: Mover, frame: LocalFrame | None) -> dict[str, Any]:
             f"{end}_lat_deg": lat_deg[row], f"{end}_lon_deg": lon_deg[row], f"{end}_alt_m": alt_m[row],
         }  # fmt: skip
     return places
-
-
-def mean_speed(mover: Mover) -> tuple[float, float, float]:
-    """Way, m, mean speed over the time that it was seen, m/s, and the standard deviation of that."""
-    steps = np.linalg.norm(np.diff(mover.track.positions, axis=0), axis=1)
-    way, seconds = float(steps.sum()), float(mover.stamps[-1] - mover.stamps[0])
-    ends = mover.track.position_variances[[0, -1]].max(axis=1)
-    return way, way / seconds, float(np.sqrt(ends.sum())) / seconds
 
 
 def _write(table: pa.Table, is_georeferenced: bool, folder: Path) -> None:

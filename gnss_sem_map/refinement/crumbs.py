@@ -7,9 +7,6 @@ to a wall, or was looked at too seldom.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
 from pydantic import Field
 
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
@@ -36,6 +33,4 @@ def apply(state: MapState, settings: CrumbSettings) -> MapState:
     gone, over = state.is_removed, over_ground(state)
     asked = over & ~gone & (state.voxels.hits <= settings.most_points)
     asked &= state.decided.states != State.SPLIT  # a kerb is ground
-    removed = more_goes_than_stands(state, asked, gone, over)
-    states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
-    return replace(state, decided=replace(state.decided, states=states))
+    return state.without(more_goes_than_stands(state, asked, gone, over))

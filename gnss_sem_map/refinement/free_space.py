@@ -6,8 +6,6 @@ be tracked, in no image, or too close to a wall. Static voxels are hit again fro
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -15,8 +13,7 @@ from pydantic import Field
 
 from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
-from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
 from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
@@ -52,11 +49,8 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     assert state.decided is not None
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= state.decided.states != State.SPLIT  # a kerb is ground
-    removed = more_goes_than_stands(
-        state, removed, removed, over_ground(state)
-    )  # rays graze the edges of roofs
-    states = np.where(removed, np.uint8(State.REMOVED), state.decided.states)
-    return replace(state, decided=replace(state.decided, states=states))
+    # rays graze the edges of roofs
+    return state.without(more_goes_than_stands(state, removed, removed, over_ground(state)))
 
 
 def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSettings) -> NDArray[np.bool_]:
@@ -92,8 +86,7 @@ def _stands_over(voxels: VoxelMap) -> NDArray[np.bool_]:
     """Which voxels (v,) have one under them, in 3 x 3 columns, lower by OVER_M."""
     least, most = (round(m / voxels.voxel_size_m) for m in OVER_M)
     found = np.zeros(len(voxels), np.bool_)
-    beside = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    _find_under(voxels.keys, np.array(beside), least, most, found)
+    _find_under(voxels.keys, COLUMNS_AROUND, least, most, found)
     return found
 
 

@@ -140,6 +140,12 @@ class MapState:
         """Which voxels (v,) are part of something that moved."""
         return self.removed if self.decided is None else self.decided.states == State.REMOVED
 
+    def without(self, gone: NDArray[np.bool_]) -> MapState:
+        """The decided map with these voxels (v,) removed."""
+        assert self.decided is not None
+        states = np.where(gone, np.uint8(State.REMOVED), self.decided.states)
+        return replace(self, decided=replace(self.decided, states=states))
+
     @cached_property
     def observations(self) -> NDArray[np.float32]:
         """How often every voxel was observed (v,), about, and at least once.

@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 from gnss_sem_map.refinement.state import MapState
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 
+COLUMNS_AROUND = np.array(
+    [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.int64
+)
+"""From the key of a voxel to those of the same height in its column and the eight beside."""
 OVER_M = 0.3
 """Centres of voxels on the ground are lower than this over it."""
 INSIDE_M = 0.03
@@ -51,8 +55,7 @@ def points_around(
     `hits` (v,) are the points in the sorted packed voxels `keys` (v,).
     """
     total = np.zeros(len(asked), np.int64)
-    beside = [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    _add_around(asked, keys, hits, np.array(beside), total)
+    _add_around(asked, keys, hits, COLUMNS_AROUND, total)
     return total
 
 

@@ -35,10 +35,12 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.about import about_map, with_objects
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, write_point_labels
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
@@ -163,7 +165,7 @@ class Run:
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
-            old_labels = shutil.ignore_patterns(*run_folder.LABELS)
+            old_labels = shutil.ignore_patterns(*LABELS)
             for name in (MAP, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / name):
                     shutil.copytree(
@@ -176,16 +178,16 @@ class Run:
                     copy_changes(self.folder, folder, before, georeference, self.label_set)
                 for file in self.folder.glob("objects.*"):
                     link_or_copy(file, folder / file.name)
-                about = self.about | {"map": run_folder.about_map(folder, refined.report)}
+                about = self.about | {"map": about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
-                for known in sorted(self.folder.glob(f"{DRIVES}/*/{run_folder.RAW_LABELS}")):
+                for known in sorted(self.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
                     one = Run(known.parent)
                     part = folder / DRIVES / known.parent.name
-                    run_folder.write_point_labels(
+                    write_point_labels(
                         part, one.drive(), one.trajectory, refined.kerbs, settings, known, folder
                     )
             else:
-                known = self.folder / run_folder.RAW_LABELS
+                known = self.folder / RAW_LABELS
                 run_folder.write_again(
                     folder, self.folder, self.trajectory, refined, stats, settings, log, {}, known
                 )
@@ -216,7 +218,7 @@ class Run:
                 drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter
             )
             refined = pipeline.refine(folder, settings, stats, progress)
-            refined = replace(refined, report=run_folder.with_objects(refined.report, mapped))
+            refined = replace(refined, report=with_objects(refined.report, mapped))
             run_folder.write_objects(folder, str(self.about["drive"]), mapped, settings)
             run_folder.write_again(
                 folder,

@@ -45,10 +45,12 @@ from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
+from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
+from gnss_sem_map.runs.point_label_files import write_point_labels
 from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
@@ -274,7 +276,7 @@ def _write(
         for source in labelled:
             part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
             trajectory = Trajectory.load(part / "trajectory.parquet")
-            run_folder.write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
+            write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
@@ -291,7 +293,7 @@ def _write(
             + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),
             "changes": [change.about(label_set) for change in changes or ()],
-            "map": run_folder.about_map(folder, refined.report),
+            "map": about_map(folder, refined.report),
         }
         write_merged(folder, settings, about, progress)
     return about

@@ -16,7 +16,8 @@ from gnss_sem_map.mapping.merging import Alignment, merge_runs
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.mapping.refining import refine_map
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.runs.run_folder import about_map, claimed_run, write_about, write_map_files
+from gnss_sem_map.runs.about import about_map
+from gnss_sem_map.runs.run_folder import claimed_run, write_about, write_map_files
 from gnss_sem_map.runs.tracks import keep_tracks, tracks_of
 
 

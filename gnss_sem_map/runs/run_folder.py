@@ -5,15 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, astuple, replace
-from importlib.metadata import PackageNotFoundError, version
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
@@ -38,25 +34,24 @@ from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.moving_points import MOVABLE
-from gnss_sem_map.mapping.point_labels import label_points
-from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
 from gnss_sem_map.pipeline import Located, Mapped
-from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.runs.about import (
+    about_map,
+    about_mapped,
+    about_run,
+    about_solution,
+    metrics_of,
+    seconds_of,
+    with_objects,
+)
+from gnss_sem_map.runs.point_label_files import write_point_labels
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
-
-RAW_LABELS = "labels_raw"
-LABELS = ("labels", RAW_LABELS, "confidence", "looks", "removed")
-"""Folders of the point labels of one drive."""
-PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
-
 
 RUN_FILES = re.compile(
     "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
@@ -125,24 +120,6 @@ def write_objects(folder: Path, name: str, mapped: Mapped, settings: Settings) -
     write_movers(movers_of(mapped.objects, movable), DriveOfMovers(name, log.epoch_ns, log.frame), folder)
 
 
-def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
-    """What is known of a drive beside its map, for run.json."""
-    scans = mapped.log.scans
-    return about_run(source.name, mapped.log, mapped.stats) | {
-        "inputs": source.inputs,
-        "scans_s": [scans[0].stamp, scans[-1].stamp],
-        "preflight": mapped.preflight.as_dict(),
-        "trajectory": _about_solution(mapped.solution),
-        "from_lidar_odometry": mapped.from_lidar_odometry,
-        "passes": [asdict(row) for row in mapped.passes],
-    }
-
-
-def metrics_of(mapped: Mapped) -> dict[str, Any]:
-    """Figures of a drive that need no truth, for metrics.json."""
-    return {"sharpness": {name: figures.as_dict() for name, figures in mapped.sharpness.items()}}
-
-
 def write_again(
     folder: Path,
     source: Path,
@@ -171,7 +148,7 @@ def write_again(
             write_point_labels(folder, log, trajectory, refined.kerbs, settings, known_raw)
     tracked = about["map"]["refinement"]
     about |= changed | {
-        "seconds": about["seconds"] | _seconds(stats),
+        "seconds": about["seconds"] | seconds_of(stats),
         "counts": about["counts"] | dict(sorted(stats.counts.items())),
         "warnings": list(dict.fromkeys([*about["warnings"], *stats.warnings])),
         "map": about_map(folder, refined.report),
@@ -238,7 +215,7 @@ def write_trajectory_run(
         (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
         about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
-            "trajectory": _about_solution(found.solution),
+            "trajectory": about_solution(found.solution),
         }
         _write_json(folder / "run.json", about)
     return about
@@ -263,156 +240,6 @@ def write_plot(folder: Path, log: SensorLog, solution: Solution | None) -> None:
     """Write a plot of the trajectory where it was smoothed."""
     if solution is not None and log.gnss is not None:
         write_trajectory_plot(solution, log.gnss, folder / "trajectory.png")
-
-
-def _about_solution(solution: Solution | None) -> dict[str, Any] | None:
-    if solution is None:
-        return None
-    return {
-        "chi2_per_dof": solution.chi2_per_dof,
-        "imu_noise_inflation": solution.inflation,
-        "iterations": solution.iterations,
-        "fixes": len(solution.rejected),
-        "fixes_rejected": int(solution.rejected.sum()),
-        "relative_poses": len(solution.relative_rejected),
-        "relative_poses_rejected": int(solution.relative_rejected.sum()),
-        "time_offset_s": solution.calibration.time_offset_s,
-        "vehicle_constraint": None if solution.vehicle is None else solution.vehicle.verdict,
-        "wheel_speed": None if solution.wheels is None else solution.wheels.verdict,
-        "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
-    }
-
-
-def write_point_labels(
-    folder: Path,
-    log: SensorLog,
-    trajectory: Trajectory,
-    kerbs: Kerbs | None,
-    settings: Settings,
-    known_raw: Path | None = None,
-    run: Path | None = None,
-) -> None:
-    """Write for every original point: class before and after refinement, confidence, LiDAR points of its voxel, and
-    whether it was removed.
-
-    `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16,
-    looks/ uint8. Of several LiDARs, each has a folder of its name. `known_raw`: a folder with the labels before
-    refinement, which are copied. `run`: the folder of the maps, if it is another one.
-    """
-    for name in LABELS:
-        for one in log.by_lidar:
-            (folder / name / one.lidar).mkdir(parents=True, exist_ok=True)
-    if known_raw is not None:
-        shutil.copytree(known_raw, folder / RAW_LABELS, dirs_exist_ok=True)
-    label_set = open_label_set(settings.classes)
-    ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
-    places = [(run or folder) / name for name in (MAP, REFINED)[known_raw is not None :]]
-    maps = [tiles.open_map(place, label_set) for place in places]
-    beside = evidence.read(folder, label_set)
-    for one in log.by_lidar:
-        moving = beside.moving_points_of(one.lidar)
-        for scan, (*raw, refined) in label_points(one, trajectory, maps, settings, moving, kerbs):
-            place = Path(one.lidar) / scan.name
-            if raw:
-                ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{place}.label")
-            ids[refined.labels].tofile(folder / "labels" / f"{place}.label")
-            refined.confidence.astype("<f2").tofile(folder / "confidence" / f"{place}.bin")
-            refined.looks.tofile(folder / "looks" / f"{place}.bin")
-            refined.removed.astype("<u4").tofile(folder / "removed" / f"{place}.label")
-
-
-def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
-    """The name of the drive, skips with their reasons, times and memory, for run.json."""
-    skips = sorted(set(stats.skips), key=astuple)
-    frames: Counter[str] = Counter()
-    for skip in skips:
-        frames[skip.what] += skip.frames
-    return {
-        "versions": {name: _version(name) for name in PACKAGES},
-        "drive": drive,
-        "name": log.name,
-        "epoch_ns": log.epoch_ns,
-        "local_frame": None if log.frame is None else asdict(log.frame),
-        "counts": dict(sorted(stats.counts.items())),
-        "warnings": stats.warnings,
-        "skips": {
-            "count": len(skips),
-            "frames": dict(sorted(frames.items())),
-            "listed": [asdict(skip) for skip in skips],
-        },
-        "seconds": _seconds(stats),
-        "peak_memory_mb": {name: round(value) for name, value in stats.peak_memory_mb.items()},
-    }
-
-
-def _seconds(stats: RunStats) -> dict[str, float]:
-    return {name: round(value, 3) for name, value in stats.seconds.items()}
-
-
-def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
-    """What is in the maps of a run folder, for run.json."""
-    maps = {name: tiles.open_map(folder / place) for name, place in (("raw", MAP), ("refined", REFINED))}
-    names = maps["raw"].label_set.names
-    labelled = {name: np.zeros(len(names), np.int64) for name in maps}
-    voxels = points = removed = 0
-    for name, tiled in maps.items():
-        for piece in tiled:
-            labelled[name] += np.bincount(piece.labels[piece.shown], minlength=len(names))
-            if name == "raw":
-                voxels, points = voxels + len(piece), points + int(piece.voxels.hits.sum(dtype=np.int64))
-            else:
-                removed += int(piece.removed_hits.sum(dtype=np.int64))
-    return {
-        "voxels": voxels,
-        "points": points,
-        "points_removed": removed,
-        "labelled": {
-            name: dict(zip(names, counts.tolist(), strict=True)) for name, counts in labelled.items()
-        },
-        "refinement": _about_refinement(report),
-    }
-
-
-def with_objects(report: RefinementReport, mapped: Mapped) -> RefinementReport:
-    """The report of a refinement, with the objects that were found while the drive was mapped."""
-    return replace(report, tracked=mapped.objects, untracked=mapped.untracked)
-
-
-def _about_refinement(report: RefinementReport) -> dict[str, Any]:
-    """Steps and objects, for run.json; objects of a few points are only counted."""
-    return {
-        "steps": [
-            {
-                "name": step.name,
-                "voxels_changed": step.changed,
-                "changes": {f"{before} to {after}": n for (before, after), n in sorted(step.changes.items())},
-                "skipped": step.skipped,
-            }
-            for step in report.steps
-        ],
-        "systematic_errors": round(report.systematic_errors, 4),
-        "objects": [asdict(thing) | {"centre": thing.centre.round(3).tolist()} for thing in report.objects],
-        "tracked": [
-            {
-                "motion": thing.motion,
-                "probability": round(thing.probability, 4),
-                "reason": thing.reason,
-                "points": thing.points,
-                "first_stamp": thing.first_stamp,
-                "last_stamp": thing.last_stamp,
-                "path": thing.path.round(2).tolist(),
-            }
-            for thing in report.tracked
-        ],
-        "untracked_segments": report.untracked,
-    }
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

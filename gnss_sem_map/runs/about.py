@@ -1,0 +1,153 @@
+"""What is known of a run, for run.json and metrics.json."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, astuple, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factor_graphs.smoothing import Solution
+from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.mapping.refining import REFINED
+from gnss_sem_map.pipeline import Mapped
+from gnss_sem_map.refinement.steps import RefinementReport
+from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.source import Source
+from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels import tiles
+
+PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
+
+
+def about_mapped(source: Source, mapped: Mapped) -> dict[str, Any]:
+    """What is known of a drive beside its map, for run.json."""
+    scans = mapped.log.scans
+    return about_run(source.name, mapped.log, mapped.stats) | {
+        "inputs": source.inputs,
+        "scans_s": [scans[0].stamp, scans[-1].stamp],
+        "preflight": mapped.preflight.as_dict(),
+        "trajectory": about_solution(mapped.solution),
+        "from_lidar_odometry": mapped.from_lidar_odometry,
+        "passes": [asdict(row) for row in mapped.passes],
+    }
+
+
+def metrics_of(mapped: Mapped) -> dict[str, Any]:
+    """Figures of a drive that need no truth, for metrics.json."""
+    return {"sharpness": {name: figures.as_dict() for name, figures in mapped.sharpness.items()}}
+
+
+def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
+    """The name of the drive, skips with their reasons, times and memory, for run.json."""
+    skips = sorted(set(stats.skips), key=astuple)
+    frames: Counter[str] = Counter()
+    for skip in skips:
+        frames[skip.what] += skip.frames
+    return {
+        "versions": {name: _version(name) for name in PACKAGES},
+        "drive": drive,
+        "name": log.name,
+        "epoch_ns": log.epoch_ns,
+        "local_frame": None if log.frame is None else asdict(log.frame),
+        "counts": dict(sorted(stats.counts.items())),
+        "warnings": stats.warnings,
+        "skips": {
+            "count": len(skips),
+            "frames": dict(sorted(frames.items())),
+            "listed": [asdict(skip) for skip in skips],
+        },
+        "seconds": seconds_of(stats),
+        "peak_memory_mb": {name: round(value) for name, value in stats.peak_memory_mb.items()},
+    }
+
+
+def seconds_of(stats: RunStats) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in stats.seconds.items()}
+
+
+def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
+    """What is in the maps of a run folder, for run.json."""
+    maps = {name: tiles.open_map(folder / place) for name, place in (("raw", MAP), ("refined", REFINED))}
+    names = maps["raw"].label_set.names
+    labelled = {name: np.zeros(len(names), np.int64) for name in maps}
+    voxels = points = removed = 0
+    for name, tiled in maps.items():
+        for piece in tiled:
+            labelled[name] += np.bincount(piece.labels[piece.shown], minlength=len(names))
+            if name == "raw":
+                voxels, points = voxels + len(piece), points + int(piece.voxels.hits.sum(dtype=np.int64))
+            else:
+                removed += int(piece.removed_hits.sum(dtype=np.int64))
+    return {
+        "voxels": voxels,
+        "points": points,
+        "points_removed": removed,
+        "labelled": {
+            name: dict(zip(names, counts.tolist(), strict=True)) for name, counts in labelled.items()
+        },
+        "refinement": _about_refinement(report),
+    }
+
+
+def with_objects(report: RefinementReport, mapped: Mapped) -> RefinementReport:
+    """The report of a refinement, with the objects that were found while the drive was mapped."""
+    return replace(report, tracked=mapped.objects, untracked=mapped.untracked)
+
+
+def about_solution(solution: Solution | None) -> dict[str, Any] | None:
+    if solution is None:
+        return None
+    return {
+        "chi2_per_dof": solution.chi2_per_dof,
+        "imu_noise_inflation": solution.inflation,
+        "iterations": solution.iterations,
+        "fixes": len(solution.rejected),
+        "fixes_rejected": int(solution.rejected.sum()),
+        "relative_poses": len(solution.relative_rejected),
+        "relative_poses_rejected": int(solution.relative_rejected.sum()),
+        "time_offset_s": solution.calibration.time_offset_s,
+        "vehicle_constraint": None if solution.vehicle is None else solution.vehicle.verdict,
+        "wheel_speed": None if solution.wheels is None else solution.wheels.verdict,
+        "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
+    }
+
+
+def _about_refinement(report: RefinementReport) -> dict[str, Any]:
+    """Steps and objects, for run.json; objects of a few points are only counted."""
+    return {
+        "steps": [
+            {
+                "name": step.name,
+                "voxels_changed": step.changed,
+                "changes": {f"{before} to {after}": n for (before, after), n in sorted(step.changes.items())},
+                "skipped": step.skipped,
+            }
+            for step in report.steps
+        ],
+        "systematic_errors": round(report.systematic_errors, 4),
+        "objects": [asdict(thing) | {"centre": thing.centre.round(3).tolist()} for thing in report.objects],
+        "tracked": [
+            {
+                "motion": thing.motion,
+                "probability": round(thing.probability, 4),
+                "reason": thing.reason,
+                "points": thing.points,
+                "first_stamp": thing.first_stamp,
+                "last_stamp": thing.last_stamp,
+                "path": thing.path.round(2).tolist(),
+            }
+            for thing in report.tracked
+        ],
+        "untracked_segments": report.untracked,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

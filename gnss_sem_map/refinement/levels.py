@@ -163,7 +163,7 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
 
 
 @njit(cache=True, nogil=True)
-def _add_rows(rows, places, sums):
+def _add_rows(rows: NDArray[np.float64], places: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
     """Add to every row of the sums (k, m) the row at its place (k,)."""
     for i in range(len(places)):
         for j in range(sums.shape[1]):

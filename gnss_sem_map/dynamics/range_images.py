@@ -103,29 +103,30 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
 
     The sides of a segment are its outermost columns; nearer returns in the three columns beyond hide it.
     """
-    n, flat = len(segments), p_map.reshape(-1)
+    members, flat = np.flatnonzero(segments >= 0), p_map.reshape(-1)
+    segments, n = segments[members], len(members)
     rows, columns, ranges = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n)
     first = np.full(count, -1, np.int32)
     low, high = np.zeros(count, np.int32), np.zeros(count, np.int32)
     for i in range(n):
-        x, y, z = _in_lidar(T_lidar_map, flat, i)
+        x, y, z = _in_lidar(T_lidar_map, flat, members[i])
         ranges[i] = np.sqrt(x * x + y * y + z * z)
         cell, columns[i] = _pixel(x, y, z)
         rows[i] = row_of[cell]
     for i in range(n):
         s = segments[i]
-        if s < 0:
-            continue
         if first[s] < 0:
             first[s] = columns[i]
-        columns[i] = (
-            columns[i] - first[s] + COLUMNS // 2
-        ) % COLUMNS - COLUMNS // 2  # across the seam at the rear
+        columns[i] -= first[s]
+        if columns[i] >= COLUMNS // 2:  # across the seam at the rear
+            columns[i] -= COLUMNS
+        elif columns[i] < -(COLUMNS // 2):
+            columns[i] += COLUMNS
         low[s], high[s] = min(low[s], columns[i]), max(high[s], columns[i])
     counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
     for i in range(n):
         s = segments[i]
-        if s < 0 or rows[i] == 0:
+        if rows[i] == 0:
             continue
         for side, edge, step in ((0, low[s], -1), (1, high[s], 1)):
             if abs(columns[i] - edge) > 1:

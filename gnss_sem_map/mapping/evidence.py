@@ -32,6 +32,10 @@ MOVED, MOVING_POINTS, KEYFRAMES = "moved", "moving_points", "keyframes"
 LIDAR, MOST_NAME_BYTES = "lidar", 1 << 10
 MOST_KEYFRAME_BYTES = 10_000 * 70 * WIDTH * 2
 """Images of the keyframe scans of one chunk that are read: ten thousand of 70 rows."""
+MOVED_HELD = 1 << 18
+"""Voxels of moving points in memory at a time, 15 MB: a tile is refined with those of its neighbours, too."""
+SCANS_AT_ONCE = 16
+"""Keyframe scans after which `free_space` asks no more of the voxels that they decide."""
 FILES_HELD = 2
 """Files of keyframes in memory at a time, some 19 MB each: those of short drives are read once. Of longer ones every
 tile reads so many that none is held."""
@@ -92,10 +96,12 @@ class NearKeyframes:
         return sum(map(len, self.chosen.values()))
 
     def parts(self) -> Iterator[KeyframeScans]:
-        """The scans, file by file; raises DataError."""
+        """The scans, some of a file at a time; raises DataError."""
         for path, scans in self.chosen.items():
             of_file = self.read(path)
-            yield replace(of_file, images=of_file.images[scans], T_lidar_map=of_file.T_lidar_map[scans])
+            for start in range(0, len(scans), SCANS_AT_ONCE):
+                some = scans[start : start + SCANS_AT_ONCE]
+                yield replace(of_file, images=of_file.images[some], T_lidar_map=of_file.T_lidar_map[some])
 
 
 def write(moving_points: Iterable[bytes], keyframes: Iterable[bytes], run: Path) -> None:
@@ -142,7 +148,7 @@ def read(run: Path, label_set: LabelSet) -> RunEvidence:
         raise DataError(
             f"{shown(run)}: found no {FOLDER}/ in it, which is needed to refine the map; make the run again"
         )
-    moved = tiles.open_map(folder / MOVED, label_set, voxels_held=0)
+    moved = tiles.open_map(folder / MOVED, label_set, MOVED_HELD)
     return RunEvidence(moved, _numbered(folder / MOVING_POINTS), _numbered(folder / KEYFRAMES))
 
 

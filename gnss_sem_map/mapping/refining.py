@@ -41,7 +41,8 @@ from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import files_of, name_of
 from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
-from gnss_sem_map.voxels.voxel_map import limits_of
+from gnss_sem_map.voxels.tiles import places_around
+from gnss_sem_map.voxels.voxel_map import VoxelMap, limits_of
 
 REFINED = "refined"
 
@@ -205,10 +206,11 @@ class _Inputs:
         self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
-    def beside(self, tile: Tile) -> Evidence:
-        margin = _moved_reach_m(self.steps, self.raw.fused.voxel_size_m)
+    def beside(self, tile: Tile, around: VoxelMap) -> Evidence:
+        """What is known beside the voxels `around` a tile, those of its halo and maybe more."""
+        margin = _moved_reach_m(self.steps, around.voxel_size_m)
         moved, keyframes = self.raw.evidence.moved.around(tile, margin), None
-        indices = np.concatenate([self.raw.around(tile, margin).indices, moved.indices])
+        indices = np.concatenate([around.indices[places_around(around, tile, margin)], moved.indices])
         if len(indices) and self.steps.free_space.enabled:
             box = (np.stack(limits_of(indices)) + 0.5) * moved.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
@@ -252,7 +254,8 @@ def refine_tiles(
 
 
 def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
-    beside, around = inputs.beside(tile), [inputs.raw.around(tile, inputs.halo)]
+    around = [inputs.raw.around(tile, inputs.halo)]
+    beside = inputs.beside(tile, around[0])
     release_memory()  # 110 MB of tiles that were read and cut
     state, report = refine_tile(tile, around.pop(), beside, inputs.steps, figures)
     about["said"]["report"] = report.to_json()

@@ -103,7 +103,7 @@ def refine_tile(
         if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
             state, halo = _cut(state, tile, needed), needed
             own = _inside(state.voxels, tile)
-        state, report = do(step, state, settings, own if halo else slice(None))
+        state, report = do(step, state, settings, own if halo else None)
         reports.append(report)
     assert state.decided is not None
     state = replace(state, vehicles=tuple(thing for thing in state.vehicles if _holds(tile, thing, size)))

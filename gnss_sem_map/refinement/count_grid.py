@@ -126,8 +126,12 @@ def count_grid(
             keys[part], labels.view(np.uint8)[part], pairs[0], cell_voxels, layer_voxels, reach_layers, pairs[1][part]
         )  # fmt: skip
 
+    slabs = list(_slabs(keys, cell_voxels))
+    if len(slabs) == 1:
+        count(slabs[0])
+        return counts
     with ThreadPoolExecutor(THREADS) as pool:
-        list(pool.map(count, _slabs(keys, cell_voxels)))  # a list: raises what a slab raised
+        list(pool.map(count, slabs))  # a list: raises what a slab raised
     return counts
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.special import entr, expit, logit
 
@@ -145,8 +146,11 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
 
     rows, columns = np.triu_indices(len(terms))
     own = np.stack([moment(a, b) for a, b in zip(rows, columns, strict=True)], axis=1)
+    around_each = np.zeros((cells, len(rows)))
+    for there in ground.surroundings:
+        _add_rows(own, there, around_each)
     sums = np.empty((cells, len(terms), len(terms)))
-    sums[:, rows, columns] = sums[:, columns, rows] = sum(own[there] for there in ground.surroundings)
+    sums[:, rows, columns] = sums[:, columns, rows] = around_each
     count = sums[:, 0, 0]
     scatter = sums - sums[:, :, :1] * sums[:, :1, :] / count[:, None, None]
     of_terms, with_z = scatter[:, 1:Z, 1:Z], scatter[:, 1:Z, Z]
@@ -156,6 +160,14 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
     fewer = np.minimum(sums[:, 0, ON_SIDEWALK], count - sums[:, 0, ON_SIDEWALK])
     variance = np.where(fewer >= FEWEST, left_over / np.maximum(count - len(terms) + 1, 1), np.inf)
     return _Planes(z0, np.asarray(slopes), variance)
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(rows: NDArray[np.float64], places: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
+    """Add to every row of the sums (k, m) the row at its place (k,)."""
+    for i in range(len(places)):
+        for j in range(sums.shape[1]):
+            sums[i, j] += rows[places[i], j]
 
 
 def _are_two(planes: _Planes, settings: LevelSettings) -> NDArray[np.bool_]:

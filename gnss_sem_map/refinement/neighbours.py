@@ -16,6 +16,8 @@ HALF_STENCIL = np.array(
 
 OFFSETS = np.array([(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x, y, z in HALF_STENCIL.tolist()])
 """The same, of packed keys."""
+HALF_COLUMNS = OFFSETS[::3] + 1
+"""The columns that they stand in, three in each but the last: from the key of a voxel to its height there."""
 
 
 def pairs_of_neighbours(keys: NDArray[np.int64]) -> NDArray[np.int32]:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.refinement.neighbours import HALF_STENCIL, OFFSETS
+from gnss_sem_map.refinement.neighbours import HALF_COLUMNS, HALF_STENCIL
 
 LEAST_VOXELS = 5
 LEAST_SPREAD = 0.01
@@ -24,7 +24,7 @@ def flatness(keys: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None) -
     result = np.full(len(keys), np.nan, np.float32)
     wanted = np.ones(len(keys), np.bool_) if wanted is None else wanted
     occupied = np.zeros((len(keys), 2), np.uint16)
-    _mark(keys, OFFSETS, occupied)
+    _mark(keys, HALF_COLUMNS, occupied)
     _upright(occupied, MOMENTS, wanted, result)
     return result
 
@@ -41,17 +41,20 @@ MOMENTS = _moments()
 
 
 @njit(cache=True, nogil=True)
-def _mark(keys, offsets, occupied):
+def _mark(keys, columns, occupied):
     """Set the bits (v, 2) of the occupied neighbours of HALF_STENCIL, and of those opposite."""
-    for k in range(len(offsets)):
-        j = 0
+    for c in range(len(columns)):
+        first = 0  # the first voxel that is not lower
         for i in range(len(keys)):
-            wanted = keys[i] + offsets[k]
-            while keys[j] < wanted:
+            lowest = keys[i] + columns[c] - 1
+            while keys[first] < lowest:
+                first += 1
+            j = first
+            while j < i and keys[j] <= lowest + 2:
+                bit = 1 << (3 * c + keys[j] - lowest)
+                occupied[i, 0] |= bit
+                occupied[j, 1] |= bit
                 j += 1
-            bit = (keys[j] == wanted) << k
-            occupied[i, 0] |= bit
-            occupied[j, 1] |= bit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

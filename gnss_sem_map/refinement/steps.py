@@ -225,7 +225,7 @@ class RefinementReport:
 
 
 def do(
-    step: Step, state: MapState, settings: RefinementSettings, own: NDArray[np.bool_] | slice = slice(None)
+    step: Step, state: MapState, settings: RefinementSettings, own: NDArray[np.bool_] | None = None
 ) -> tuple[MapState, StepReport]:
     """The state after a step, and what it changed in a map's `own` voxels (v,), all by default."""
     section = step.settings(settings)
@@ -238,7 +238,7 @@ def do(
     return after, StepReport(step.name, _changes(state, after, own))
 
 
-def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | slice) -> dict[tuple[str, str], int]:
+def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | None) -> dict[tuple[str, str], int]:
     """How many voxels went from which class to which; a voxel that is new in the map was what its evidence says."""
     if after.scores is before.scores and after.decided is before.decided and after.removed is before.removed:
         return {}
@@ -250,8 +250,7 @@ def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | slice) 
         known = after.decided.voxels.labels.copy()
         known[after.decided.voxels.indices_of(before.voxels.keys)] = source
         source = known
-    source, target = source[own], target[own]
-    differ = target != source
+    differ = target != source if own is None else (target != source) & own
     # -1 comes first; sorting the pairs would take as long as a step does
     pairs = (source[differ].astype(np.intp) + 1) * len(names) + target[differ] + 1
     counts = np.bincount(pairs, minlength=len(names) ** 2).reshape(len(names), -1)

@@ -137,14 +137,23 @@ def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
     import pyarrow.parquet as pq
 
     whole = [name for name in columns if name != "confidence"]
+    table = pa.table({name: _arrow(values) for name, values in columns.items()})
     sink = pa.BufferOutputStream()
     pq.write_table(
-        pa.table(columns), sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
+        table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
         write_statistics=False, store_schema=False,
         column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED")
         | {name: "BYTE_STREAM_SPLIT" for name in columns if name == "confidence"},
     )  # fmt: skip
     return bytes(sink.getvalue())
+
+
+def _arrow(values: NDArray[Any]) -> Any:
+    """Numbers as a column; `pa.array` imports pandas, which takes 0.2 s and 40 MB of every worker."""
+    import pyarrow as pa
+
+    values = np.ascontiguousarray(values)
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
 
 
 def _column(table: Any, name: str) -> NDArray[Any]:

@@ -279,7 +279,8 @@ def _movers(refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]]) -
         "mover_head": "drive, object" if is_of_many else "object",
         "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},
         "mover_rows": [
-            (f"{one['drive']}, {one['id']}" if is_of_many else str(one["id"]), f"{one['class']}, by its {one['class_from']}",
+            (f"{one['drive']}, {one['id']}" if is_of_many else str(one["id"]),
+             f"{one['class']}, by its {one['class_from']}",
              f"{one['speed_mps']:.1f}\u00a0±\u00a0{one['speed_stddev_mps']:.1f}", f"{one['way_m']:.0f}",
              "\u00a0x\u00a0".join(f"{one[side]:.1f}" for side in ("length_m", "width_m", "height_m")),
              *(f"{round(one[end], 1) + 0.0:.1f}" for end in ("first_stamp_s", "last_stamp_s")),

@@ -16,7 +16,7 @@ SETTINGS := s/^[^=]*\.index-url=/export UV_DEFAULT_INDEX=/p; s/^[^=]*\.extra-ind
   s/^[^=]*\.cert=/export SSL_CERT_FILE=/p; s/^[^=]*\.find-links=/export UV_FIND_LINKS=/p
 define install
 	eval "$$($(BIN)/pip config list | sed -n '$(SETTINGS)')"; \
-	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet -c constraints.txt -e '$(1)' || \
+	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(1)' || \
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'
 endef
 

@@ -67,6 +67,22 @@ def test_the_tables_beside_the_paper_are_what_is_measured(
     assert moving == pytest.approx(found, abs=0.051)  # as the table rounds
 
 
+def test_what_the_results_say_of_the_demo_is_what_is_measured(measured: dict[str, Any]) -> None:
+    text = " ".join((ROOT / "docs/results.md").read_text("utf-8").split())
+    metrics = measured["demo"]
+    found = metrics["trajectory"]
+    for says in (
+        f"**Coverage** is {100 * metrics['semantics']['refined']['coverage']:.1f} %",
+        f"the error is {found['ate_m']:.2f} m, which is the error of the simulated GNSS, and"
+        f" {1000 * found['ate_aligned_m']:.0f} mm after alignment",
+        f"expected calibration error is {100 * metrics['calibration']['ece']:.1f} %",
+        f"position has {found['position_nees_per_dof']:.2f} and orientation"
+        f" {found['orientation_nees_per_dof']:.2f}",
+        f"roll and pitch are wrong by {found['tilt_rms_deg']:.3f}°, heading by {found['heading_rms_deg']:.2f}°",
+    ):
+        assert says in text, says
+
+
 def test_what_the_readme_says_of_movers_is_what_is_measured(measured: dict[str, Any]) -> None:
     text = " ".join((ROOT / "README.md").read_text("utf-8").split())
     moving = measured["demo"]["dynamic"]

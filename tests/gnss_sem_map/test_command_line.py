@@ -11,8 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
 from street import Street
 
+from gnss_sem_map.cli import app
+from gnss_sem_map.datasets import readers
 from gnss_sem_map.runs import expected_cost
 
 pytestmark = pytest.mark.integration
@@ -78,6 +81,14 @@ def test_a_dry_run_counts_on_a_damaged_scan_being_skipped(small_drive: Street, t
     done = program("run", drive, "--segmenter", "none", "-o", tmp_path / "new", "--dry-run")
     assert (done.returncode, done.stderr) == (0, "")
     assert "expected: about" in done.stdout
+
+
+def test_the_help_names_every_format_of_drives() -> None:
+    [option] = [
+        each for each in typer.main.get_command(app).commands["run"].params if each.name == "drive_format"
+    ]
+    for name in readers():
+        assert re.search(rf"\b{name}\b", option.help)
 
 
 def test_the_constants_of_the_dry_run_are_those_of_the_page_on_scale() -> None:

@@ -103,7 +103,8 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "settings": read_text(folder / "config.yaml") if is_file(folder / "config.yaml") else "",
         "versions": run.get("versions", {}),
     }  # fmt: skip
-    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined), _movers(refinement, moved),
+    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined),
+                 _movers(refinement, moved, "drives" in run),
                  _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
                  _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
         content |= part
@@ -269,12 +270,13 @@ def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage:
     return [*counts.get(stage, {}), *semantics.get(stage, {}).get("classes", {})]
 
 
-def _movers(refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _movers(
+    refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]], is_of_many: bool
+) -> dict[str, Any]:
     """What was tracked, counted; and what moved, with its speed and the evidence."""
     tracked = refinement.get("tracked", ())
     motions = [str(thing["motion"]) for thing in tracked]
     rows = sorted(moved, key=lambda one: -one["points"])[:MANY_MOVERS]
-    is_of_many = len({one["drive"] for one in moved}) > 1
     return {
         "mover_head": "drive, object" if is_of_many else "object",
         "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},

@@ -21,11 +21,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from sessions_changes import score_changes
 from sessions_coverage import coverage
 
 from factor_graphs.chi_square import quantile
@@ -35,15 +35,10 @@ from factor_graphs.sessions import AnchorPairs, bind
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.dynamics.visibility import hits_and_misses
-from gnss_sem_map.evaluation.changes import ChangeSettings
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
 from gnss_sem_map.evaluation.score_run import read_tum
-from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.passes import LocatedDrive, bind_passes
-from gnss_sem_map.mapping.raw_map import RawMap, open_raw
 from gnss_sem_map.mapping.trajectory import in_frame, locate
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.many_drives import HowMapped, run_drives
@@ -192,89 +187,6 @@ def search_ms(days: Sequence[Day]) -> float:
     return 1000 * (time.perf_counter() - start) / sum(len(day.log.scans) for day in days)
 
 
-def changes(days: Sequence[Day], drives: Sequence[Path], out: Path) -> Figures:
-    """Objects that were found and that there are; those that one session hardly saw do not count.
-
-    One that was found is right when most of its voxels lie in boxes of the truth; one that is there is found when half
-    of its voxels that are seen through are among those that were found.
-    """
-    label_set, second = open_label_set(SETTINGS.classes), days[1]
-    sessions = [open_raw(out / "drives" / drive.name, label_set) for drive in drives]
-    stamps = np.arange(second.true.start + 0.5, second.true.end - 0.5, 0.5)
-    # where the map has what the truth has elsewhere by the error of its place
-    T = second.bound.at(stamps) @ np.linalg.inv(second.true.at(stamps))
-    p = second.true.at(stamps)[:, :3, 3]
-    offset = np.median(np.einsum("kij,kj->ki", T[:, :3, :3], p) + T[:, :3, 3] - p, axis=0)
-    frame = LocalFrame(**read_run(out)["local_frame"])
-    assert second.log.frame is not None
-    G = frame.pose_of(second.log.frame)
-    boxes = json.loads((drives[1] / "truth" / "changes.json").read_text())["changes"]
-    found, voxels = read_run(out)["changes"], _voxels_of_changes(out, frame)
-    covered = [np.zeros(len(of_thing), np.bool_) for of_thing in voxels]
-    told = kinds = wanted = hit = 0
-    for box in boxes:
-        centre = G[:3, :3] @ np.array([box["x_m"], box["y_m"], box["z_m"]]) + G[:3, 3] + offset
-        appeared = box["change"] == "appeared"
-        inside = {
-            n: _inside(voxels[n], box, centre, 0.3)
-            for n, thing in enumerate(found)
-            if (thing["change"] == "appeared") == appeared
-        }
-        for n, rows in inside.items():
-            covered[n] |= rows
-        mine = [n for n, rows in inside.items() if rows.mean() > 0.5]
-        if mine and found[mine[0]]["kind"] != "unknown":
-            told, kinds = told + 1, kinds + (found[mine[0]]["kind"] == box["cause"])
-        if max(box["length_m"], box["width_m"], box["height_m"]) >= 0.5:
-            seen = _seen_through(sessions[int(appeared)], sessions[1 - int(appeared)], box, centre)
-            wanted, hit = (
-                wanted + (seen > 0),
-                hit + (0 < seen <= 2 * sum(int(rows.sum()) for rows in inside.values())),
-            )
-    right = sum(bool(rows.mean() > 0.5) for rows in covered)
-    return {
-        "found": len(found),
-        "right": right,
-        "there": wanted,
-        "recalled": hit,
-        "told": told,
-        "kind_right": kinds,
-    }
-
-
-def _voxels_of_changes(out: Path, frame: LocalFrame) -> list[Array]:
-    """The voxels of every object that was found, (n, 3) m in the map, from the file that users get."""
-    points = laspy.read(out / "changes.laz")
-    places = Georeference(frame).to_map(np.column_stack([points.x, points.y, points.z]))
-    numbers = np.asarray(points.point_source_id, np.int64)
-    return [places[numbers == n] for n in range(numbers.max(initial=-1) + 1)]
-
-
-def _inside(points: Array, box: Figures, centre: Array, margin_m: float) -> NDArray[np.bool_]:
-    off, half = points - centre, np.array([box["length_m"], box["width_m"], box["height_m"]]) / 2 + margin_m
-    c, s = np.cos(box["yaw_rad"]), np.sin(box["yaw_rad"])
-    turned = np.column_stack([off[:, 0] * c + off[:, 1] * s, off[:, 1] * c - off[:, 0] * s, off[:, 2]])
-    return np.asarray((np.abs(turned) <= half).all(axis=1))
-
-
-def _seen_through(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> int:
-    """How many voxels of an object one session has, and the other one looks through; 0 where that is not most of it."""
-    settings = ChangeSettings()
-    centres = np.concatenate([stands.around(tile, 0.0).centres for tile in stands.fused.tiles])
-    places = centres[_inside(centres, box, centre, 0.1)]
-    places = places[places[:, 2] > centre[2] - box["height_m"] / 2 + settings.over_ground_m]
-    if len(places) < settings.least_voxels:
-        return 0
-    counts = np.zeros((2, len(places)), np.int32)
-    keyframes = gone.evidence.keyframes_near(places, settings.farthest_m)
-    for part in keyframes.parts() if keyframes is not None else ():
-        counts += hits_and_misses(places, part, settings.farthest_m)
-    through = int(
-        ((counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])).sum()
-    )
-    return through if through >= max(settings.least_voxels, len(places) / 2) else 0
-
-
 def simulated(gnss: Gnss, seeds: Sequence[int], work: Path) -> Figures:
     """Figures over all seeds."""
     rows: list[Figures] = []
@@ -308,6 +220,8 @@ def of_seed(drives: Sequence[Path], out: Path, seed: int) -> Figures:
     alone = [errors_and_coverage(day, day.alone.trajectory) for day in days]
     bound = [errors_and_coverage(day, day.bound) for day in days]
     count, taken = planted(days, seed)
+    second = days[1]
+    assert second.log.frame is not None
     return {
         "before_m": float(np.median(before)),
         "after_m": float(np.median(after)),
@@ -321,7 +235,7 @@ def of_seed(drives: Sequence[Path], out: Path, seed: int) -> Figures:
         "planted": count,
         "planted_taken": taken,
         "search_ms_per_scan": search_ms(days),
-        "changes": changes(days, drives, out),
+        "changes": score_changes(out, drives, second.true, second.bound, second.log.frame),
     }
 
 

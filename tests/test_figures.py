@@ -49,6 +49,13 @@ def metres(path: str) -> str:
     return f"{value('trajectory', path):.2f} m"
 
 
+def of_units(form: str, *paths: str) -> tuple[str, ...]:
+    """The cells of a row of the table of sessions: of the navigation unit, and of the consumer's receiver."""
+    return tuple(
+        form.format(*(value("sessions", f"{unit}/{path}") for path in paths)) for unit in ("unit", "consumer")
+    )
+
+
 IN_BOTH = {
     "outages": (metres(f"{TRAJECTORY}/graph (default)/inside_outages_m"),
                 metres(f"{TRAJECTORY}/EKF + RTS/inside_outages_m")),
@@ -86,6 +93,16 @@ ROWS = {
             metres(f"{TRAJECTORY}/graph, standing/inside_outages_m")),
         "factor graph |": (metres("simulated/clean/graph (default)/horizontal_m"),
                            metres(f"{TRAJECTORY}/graph (default)/inside_outages_m")),
+    },
+    "docs/sessions.md": {
+        "apart before, median": tuple(f"{100 * value('sessions', f'{unit}/before_m'):.1f}"
+                                      for unit in ("unit", "consumer")),
+        "thickness of surfaces": of_units("{:.2f}", "thickness_ratio"),
+        "bound over alone": of_units("{:.2f}", "error_bound_over_alone"),
+        "planted, and taken": of_units("{:.0f}, **{:.0f}**", "planted", "planted_taken"),
+        "precision, recall": of_units("{:.0f}: **{:.2f}, {:.2f}**", "changes_there", "changes_precision",
+                                      "changes_recall"),
+        "per scan, ms": of_units("{:.1f}", "search_ms_per_scan"),
     },
 }  # fmt: skip
 

@@ -16,6 +16,7 @@ from numba import njit
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
+Numbers = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Triple = tuple[float, float, float]
 

@@ -5,6 +5,8 @@ FROM python:3.11-slim
 # --build-arg VERSION=1.2.3 names the version, which is otherwise the fallback: .git is not copied.
 ARG EXTRAS=""
 ARG VERSION=""
+# GDAL in the wheel of rasterio needs it, and slim images may lack it
+RUN apt-get update && apt-get install --yes --no-install-recommends libexpat1 && rm -rf /var/lib/apt/lists/*
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY gnss_sem_map gnss_sem_map

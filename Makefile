@@ -7,18 +7,30 @@ BIN := $(VENV)/bin
 PYTEST := $(BIN)/pytest -n auto --dist loadfile
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
+# What is imported is compiled once, also where the environment says that nothing is to be kept.
+unexport PYTHONDONTWRITEBYTECODE
+
+# uv installs in seconds what takes pip a minute. It does not read the settings of pip, so it is told them; where it
+# cannot be had, or fails, pip does it.
+SETTINGS := s/^[^=]*\.index-url=/export UV_DEFAULT_INDEX=/p; s/^[^=]*\.extra-index-url=/export UV_INDEX=/p; \
+  s/^[^=]*\.cert=/export SSL_CERT_FILE=/p; s/^[^=]*\.find-links=/export UV_FIND_LINKS=/p
+define install
+	eval "$$($(BIN)/pip config list | sed -n '$(SETTINGS)')"; \
+	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(1)' || \
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'
+endef
 
 .PHONY: test test-unit test-slow test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[segmentation]'
+	-$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt uv
+	$(call install,.[segmentation])
 	touch $@
 
 $(TOOLS): $(PACKAGE)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(call install,.[dev])
 	touch $@
 
 test: $(TOOLS)

@@ -59,7 +59,7 @@ def test_the_demo_says_what_it_did_and_where_the_pictures_are(demo: tuple[Path, 
         "small network",
     ):
         assert says in printed, says
-    for name in ("perspective.png", "topview.png", "report.html", "viewer.html"):
+    for name in ("flight.webp", "perspective.png", "topview.png", "report.html", "viewer.html"):
         assert str(out / name) in printed
         assert (out / name).stat().st_size > 10_000
     (costs,) = (line for line in printed.splitlines() if "mapping " in line)  # every stage once

@@ -29,7 +29,7 @@ LABELS = {
     "corrupted": "the true class images, corrupted as a network would: blurred borders, confused classes",
 }
 """Sources of the demo's class probabilities."""
-PICTURES = ("perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html")
+PICTURES = ("flight.webp", "perspective.png", "topview.png", "trajectory.png", "report.html", "viewer.html")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,11 @@ def _demonstrate(out: Path, world: Path, seconds: float, seed: int, source: str,
                 )
 
     drive, spec = world / drive.relative_to(folder), f"labels:{world / PROBABILITIES}"
-    about = finished_run.run(drive, out, spec, settings, write_labels=True, progress=progress).about
-    metrics = score_run(out, drive / "truth")
+    finished = finished_run.run(drive, out, spec, settings, write_labels=True, progress=progress)
+    about, metrics = finished.about, score_run(out, drive / "truth")
     write_report(out, about, metrics)
+    with stats.stage("flight"):
+        finished.export(["flight"])
     return Demo(
         about | {"seconds": stats.seconds | about["seconds"]},
         metrics,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import typer
@@ -15,10 +16,15 @@ if TYPE_CHECKING:
 
 
 def print_plan(sources: Iterable[Source], settings: Settings, workers: int) -> None:
-    """Open every drive and its segmenter, and print what is there; raises what these raise."""
+    """Open every drive and its segmenter, and print what is there; raises what these raise, ends as a run would."""
+    from gnss_sem_map.segmentation import no_segmenter_message
+
     seconds = memory_mb = 0.0
     for source in sources:
         log = source.open_log()
+        if source.segmenter is None and log.images:
+            typer.echo(no_segmenter_message(source.drive), err=True)
+            raise typer.Exit(1)
         source.open_network(settings, log)
         for line in _of_drive(source, log):
             typer.echo(line)
@@ -53,8 +59,11 @@ def _of_drive(source: Source, log: SensorLog) -> Iterable[str]:
 
 
 def _cost(log: SensorLog, workers: int) -> Expected:
-    from gnss_sem_map.runs.expected_cost import expected_cost
+    from gnss_sem_map.errors import DataError
+    from gnss_sem_map.runs.expected_cost import POINTS_PER_SCAN, expected_cost
 
-    points = len(log.scans[len(log.scans) // 2].read().xyz)
+    points: float = POINTS_PER_SCAN
+    with suppress(DataError):  # the run skips a damaged scan
+        points = len(log.scans[len(log.scans) // 2].read().xyz)
     hours = (log.scans[-1].stamp - log.scans[0].stamp) / 3600
     return expected_cost(log.scan_count, points, hours, workers)

@@ -52,7 +52,8 @@ def run(
         list[str],
         typer.Argument(
             metavar="DRIVE...",
-            help="A drive: a folder of KITTI raw, KITTI odometry or a CSV log, or a ROS bag; several become one map."
+            help="A drive: a folder of KITTI raw, KITTI odometry, KITTI-360 or a CSV log, or a ROS bag; several become"
+            " one map."
             " @FILE stands for the drives in a file, one per line.",
         ),
     ],

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 
 Drive = Annotated[
-    Path, typer.Argument(help="The drive: a folder of KITTI raw, KITTI odometry or a CSV log, or a ROS bag.")
+    Path,
+    typer.Argument(
+        help="The drive: a folder of KITTI raw, KITTI odometry, KITTI-360 or a CSV log, or a ROS bag."
+    ),
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write; an earlier run there is replaced.")]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file of settings (see `config`).")]
@@ -24,7 +27,9 @@ Set = Annotated[
 ]
 Format = Annotated[
     str | None,
-    typer.Option("--format", help="kitti-raw, kitti-odometry, table or rosbag; default: detected."),
+    typer.Option(
+        "--format", help="kitti-raw, kitti-odometry, kitti-360, table (CSV log) or rosbag; default: detected."
+    ),
 ]
 Frames = Annotated[
     str | None,

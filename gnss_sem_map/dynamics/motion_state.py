@@ -144,7 +144,7 @@ def classify_motion(
     for n in alone:
         probability = _probability(misses[n], hits[n])
         motion = Motion.MOVING if probability > 0.5 else Motion.UNKNOWN
-        reason = f"one scan only: seen through {misses[n]:.0f} times, hit {hits[n]:.0f} times"
+        reason = f"one scan only: seen through {misses[n]:,.0f} times, hit {hits[n]:,.0f} times"
         objects.append(_tracked_object([n], segments, motion, probability, reason))
     return objects
 
@@ -168,7 +168,7 @@ def _motion_of_track(
         # the volume that it left or came into is free at other times, as far as it did not cover it itself
         least = elsewhere_misses_per_hit * min(1.0, moved.shift_m / LENGTH_M)
         displaced = missed_elsewhere > least * hit_elsewhere and not bool(is_occupied(hit, missed))
-    reason = f"seen through {missed:.0f} times, hit {hit:.0f} times"
+    reason = f"seen through {missed:,.0f} times, hit {hit:,.0f} times"
     if moved and displaced:
         motion = Motion.MOVING
         reason = f"went {moved.shift_m:.1f} m, known to {moved.stddev_m:.1f} m, {reason}"

@@ -15,6 +15,7 @@ from gnss_sem_map.export.exported import NO_VOXELS, Exported
 from gnss_sem_map.export.pictures import FIELD_OF_VIEW_DEG, colours_by_night, driven_m, lit_view
 from gnss_sem_map.export.render import Camera
 from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.scans.prefetch import prefetch, threads
 
 SIZE_PX = (640, 360)
 FRAME_MS = 80
@@ -40,9 +41,9 @@ def write_flight(exported: Exported, path: Path | str) -> None:
     if not exported.tracks:
         raise DataError("flight: the map has no track to fly along")
     longest = max(exported.tracks, key=lambda track: float(driven_m(track)[-1]))
-    frames = (
-        Image.fromarray(lit_view(exported, colours_by_night(exported), camera)) for camera in cameras(longest)
-    )
+    palette = colours_by_night(exported)
+    drawn = prefetch(lambda camera: lit_view(exported, palette, camera), cameras(longest), threads())
+    frames = (Image.fromarray(pixels) for _, pixels in drawn)
     first = next(frames)
     with replacing(path) as file:
         first.save(

@@ -58,9 +58,10 @@ FILES = {
 MANY_SKIPS = 200
 """Number of skips on the page; run.json lists all."""
 ENOUGH_POINTS = 200
-"""Of a bin of the reliability curve of a group: the share of fewer is chance."""
+"""Of a bin of a reliability curve: the share of fewer is chance."""
 MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
+TITLES = {"accuracy": "accuracy", "iou": "IoU"}
 MAPS = {"map": "before refinement", "refined": "after refinement"}
 
 
@@ -102,7 +103,8 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "settings": read_text(folder / "config.yaml") if is_file(folder / "config.yaml") else "",
         "versions": run.get("versions", {}),
     }  # fmt: skip
-    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined), _movers(refinement, moved),
+    for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined),
+                 _movers(refinement, moved, "drives" in run),
                  _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
                  _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
         content |= part
@@ -179,7 +181,8 @@ def _reliability(calibration: Mapping[str, Any]) -> Chart | None:
         enough = [each for each in group["bins"] if each["points"] >= ENOUGH_POINTS]
         if int(low) in LOOKS and enough:
             curves.append((_group(int(low)), f"g{LOOKS.index(int(low))}", *_confidence_and_right(enough)))
-    curves.append(("all", "b", *_confidence_and_right(calibration["bins"])))
+    enough = [each for each in calibration["bins"] if each["points"] >= ENOUGH_POINTS]
+    curves.append(("all", "b", *_confidence_and_right(enough)))
     return chart(
         "How often labels of a stated confidence are right, measured against truth, by the LiDAR points of the voxel.",
         "stated confidence", "share that is right", curves, (0, 1), (0, 1), width=420, height=340, has_legend=True,
@@ -241,9 +244,11 @@ def _classes(
                 (f"voxels, {stage}", [*map(counts[stage].get, names), sum(counts[stage].values())])
             )
     for stage, scores in semantics.items():
-        for key in ("accuracy", "iou"):
+        for key in TITLES:
             each = [(scores.get("classes", {}).get(name) or {}).get(key) for name in names]
-            columns.append((f"{key}, {stage}", [*map(percent, each), percent(scores.get(f"mean_{key}"))]))
+            columns.append(
+                (f"{TITLES[key]}, {stage}", [*map(percent, each), percent(scores.get(f"mean_{key}"))])
+            )
     if columns and refined is not None:
         means = (refined.confidence.get(name, (0, 0.0)) for name in names)
         stated = [percent(mean) if voxels else None for voxels, mean in means]
@@ -252,7 +257,7 @@ def _classes(
     for stage, scores in semantics.items():
         strict = scores.get("strict", {}).get("mean_iou")
         remarks[f"evaluated points that the {stage} map labels"] = percent(scores.get("coverage"))
-        remarks[f"mean iou, {stage}, if an unlabelled point is a miss"] = percent(strict)
+        remarks[f"mean IoU, {stage}, if an unlabelled point is a miss"] = percent(strict)
     rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
     return {
         "class_head": ("class", *(title for title, _ in columns)),
@@ -265,15 +270,19 @@ def _class_names(counts: Mapping[str, Any], semantics: Mapping[str, Any], stage:
     return [*counts.get(stage, {}), *semantics.get(stage, {}).get("classes", {})]
 
 
-def _movers(refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _movers(
+    refinement: Mapping[str, Any], moved: Sequence[Mapping[str, Any]], is_of_many: bool
+) -> dict[str, Any]:
     """What was tracked, counted; and what moved, with its speed and the evidence."""
     tracked = refinement.get("tracked", ())
     motions = [str(thing["motion"]) for thing in tracked]
     rows = sorted(moved, key=lambda one: -one["points"])[:MANY_MOVERS]
     return {
+        "mover_head": "drive, object" if is_of_many else "object",
         "movers": {f"tracked objects, {motion}": motions.count(motion) for motion in sorted(set(motions))},
         "mover_rows": [
-            (f"{one['drive']}, {one['id']}", f"{one['class']}, by its {one['class_from']}",
+            (f"{one['drive']}, {one['id']}" if is_of_many else str(one["id"]),
+             f"{one['class']}, by its {one['class_from']}",
              f"{one['speed_mps']:.1f}\u00a0±\u00a0{one['speed_stddev_mps']:.1f}", f"{one['way_m']:.0f}",
              "\u00a0x\u00a0".join(f"{one[side]:.1f}" for side in ("length_m", "width_m", "height_m")),
              *(f"{round(one[end], 1) + 0.0:.1f}" for end in ("first_stamp_s", "last_stamp_s")),

@@ -77,7 +77,8 @@ def no_segmenter_message(drive: str) -> str:
             f"  hf download {model} && gnss-sem-map run {drive} --segmenter hf:{model} ...   ({about})"
         )
     lines.append(
-        "For existing labels: --segmenter labels:FOLDER. For several runs, run `gnss-sem-map segment` once."
+        "For existing labels: --segmenter labels:FOLDER; for the geometry alone: --segmenter none. For several runs,"
+        " run `gnss-sem-map segment` once."
     )
     return "\n".join(lines)
 

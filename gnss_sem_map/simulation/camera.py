@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.sensor_log.cameras import Distortion
-from gnss_sem_map.simulation.compiled import Bytes, Floats, Integers, Singles, Triple, kernel
+from gnss_sem_map.simulation.compiled import Bytes, Floats, Numbers, Singles, Triple, kernel
 from gnss_sem_map.simulation.ground import FAR, to_town
 from gnss_sem_map.simulation.id_buffer import pixel_ray, see
 from gnss_sem_map.simulation.noise import gaussian, value_noise
@@ -116,8 +116,8 @@ def _expose(
     rays: Floats,
     sun: Triple,
     distance: Floats,
-    things: Integers,
-    shapes: Integers,
+    things: Numbers,
+    shapes: Numbers,
     linear: Singles,
     kinds: Bytes,
     depth: Singles,
@@ -215,7 +215,7 @@ def render_image(
     size = (camera.height, camera.width)
     linear, kinds = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
     depth, light = np.zeros(size, np.float32), np.full(size, -1, np.int8)
-    distance, things, shapes = np.zeros(size), np.zeros(size, np.int32), np.zeros(size, np.int32)
+    distance, things, shapes = np.zeros(size), np.zeros(size, np.int64), np.zeros(size, np.int64)
     scene, sun = world.scene(stamp, stamp), sun_direction(seed)
     see(scene, T_map_camera, camera.rays, distance, things, shapes)
     _expose(scene, T_map_camera, camera.rays, sun, distance, things, shapes, linear, kinds, depth, light)

@@ -7,7 +7,7 @@ handing over a hundred words costs more than a normal.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from numba import njit
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int32]
+Numbers = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Triple = tuple[float, float, float]
 
@@ -30,3 +31,8 @@ _OPTIONS: Final[dict[str, Any]] = {"cache": True, "nogil": True, "error_model": 
 kernel: Final[_Compile] = njit(**_OPTIONS)
 inlined: Final[_Compile] = njit(**_OPTIONS, inline="always")
 merged: Final[_Compile] = njit(**_OPTIONS, forceinline=True)
+
+
+def kernel_of(signature: str) -> _Compile:
+    """A kernel of these types only: without, one that many call is compiled for every mixture of theirs."""
+    return cast("_Compile", njit(signature, **_OPTIONS))

@@ -1,6 +1,6 @@
 """ID buffer: the visible shape of every pixel, and its distance."""
 
-from gnss_sem_map.simulation.compiled import Floats, Integers, inlined, kernel
+from gnss_sem_map.simulation.compiled import Floats, Numbers, inlined, kernel
 from gnss_sem_map.simulation.ground import FAR, hit_ground
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, cast_ray, into_thing
 from gnss_sem_map.simulation.shapes import hit_shape
@@ -39,7 +39,7 @@ def _on_same(
 
 
 @kernel
-def see(scene: Scene, T: Floats, rays: Floats, distance: Floats, things: Integers, shapes: Integers) -> None:
+def see(scene: Scene, T: Floats, rays: Floats, distance: Floats, things: Numbers, shapes: Numbers) -> None:
     """Fill distance (FAR in the sky), thing and shape of every pixel; see `pixel_ray` for `rays`.
 
     Every second pixel of every second row is cast into the whole scene. Where the four of them around a pixel agree,

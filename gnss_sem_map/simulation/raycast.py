@@ -174,7 +174,7 @@ def cast_ray(
         if low < top[i, j]:
             cell = i * ny + j
             for m in range(start[cell], start[cell + 1]):
-                candidate = members[m]
+                candidate = int(np.int64(members[m]))  # else all that it calls is compiled for two types
                 if candidate in (last, before):
                     continue
                 before, last = last, candidate
@@ -183,7 +183,7 @@ def cast_ray(
                     best, thing, shape, found = closer, candidate, which, True
         link = chain[i, j]
         while link >= 0:
-            candidate = links[link, 0]
+            candidate = int(np.int64(links[link, 0]))
             closer, which = hit_thing(things, shapes, candidate, best, fraction, ox, oy, oz, dx, dy, dz)
             if which >= 0:
                 best, thing, shape, found = closer, candidate, which, True

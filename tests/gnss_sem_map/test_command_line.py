@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,8 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
 from street import Street
 
+from gnss_sem_map.cli import app
+from gnss_sem_map.datasets import readers
 from gnss_sem_map.runs import expected_cost
 
 pytestmark = pytest.mark.integration
@@ -58,6 +62,33 @@ def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_pa
         assert done.returncode in (1, 2)
         assert message in done.stderr
         assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(small_drive: Street, tmp_path: Path) -> None:
+    words = ("run", small_drive.drive, "-o", tmp_path / "new")
+    run, dry = program(*words), program(*words, "--dry-run")
+    assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
+    assert run.returncode == 1
+    assert "--segmenter none" in dry.stderr
+
+
+def test_a_dry_run_counts_on_a_damaged_scan_being_skipped(small_drive: Street, tmp_path: Path) -> None:
+    date = tmp_path / small_drive.drive.parent.name
+    shutil.copytree(small_drive.drive.parent, date)
+    drive = date / small_drive.drive.name
+    for scan in drive.glob("velodyne*/data/*"):
+        scan.write_bytes(b"damaged")
+    done = program("run", drive, "--segmenter", "none", "-o", tmp_path / "new", "--dry-run")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "expected: about" in done.stdout
+
+
+def test_the_help_names_every_format_of_drives() -> None:
+    [option] = [
+        each for each in typer.main.get_command(app).commands["run"].params if each.name == "drive_format"
+    ]
+    for name in readers():
+        assert re.search(rf"\b{name}\b", option.help)
 
 
 def test_the_constants_of_the_dry_run_are_those_of_the_page_on_scale() -> None:

@@ -27,7 +27,9 @@ const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], 
                 ...lineLayers];
 const visible = layers.map(() => true), rows = [];
 let showRemoved = false, mode = 0, frameAsked = false;
-const camera = { azimuth: -0.6, elevation: 0.65, distance: meta.view.distance, target: [...meta.view.target] };
+// on a screen that is higher than wide, from farther away
+const far = Math.max(1, innerHeight / innerWidth);
+const camera = { azimuth: -0.6, elevation: 0.65, distance: far * meta.view.distance, target: [...meta.view.target] };
 
 // Puts voxels onto the graphics card: for each the cell, as numbers of a kind, then class, confidence and origin.
 function upload(node, data, kind, stride) {

@@ -129,9 +129,11 @@ def test_the_report_lists_it(mover, karlsruhe, tmp_path) -> None:
     write_report(tmp_path, {"name": "monday"}, {})
     page = (tmp_path / "report.html").read_text()
     (row,) = read_movers(tmp_path)
-    for text in ("What moved", "monday, 1", "vehicle, by its labels", "went 15.0 m", "objects.geojson"):
+    for text in ("What moved", "<td>1</td>", "vehicle, by its labels", "went 15.0 m", "objects.geojson"):
         assert text in page
     assert f"{row['speed_mps']:.1f}\u00a0±\u00a0{row['speed_stddev_mps']:.1f}" in page
+    write_report(tmp_path, {"name": "week", "drives": {"monday": {}}}, {})
+    assert "<td>monday, 1</td>" in (tmp_path / "report.html").read_text()
 
 
 def test_a_damaged_table_is_named(tmp_path) -> None:

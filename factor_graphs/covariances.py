@@ -7,6 +7,7 @@ cov(x) = R⁻¹ R⁻ᵀ + W cov(y) Wᵀ with W = R⁻¹ S (Kaess and Dellaert 20
 """
 
 from collections import Counter
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -28,6 +29,12 @@ from factor_graphs.elimination import (
 Array = NDArray[np.float64]
 
 
+class Visitor(Protocol):
+    """Sees every keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`."""
+
+    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None: ...
+
+
 class SumVariance:
     """Variance of sums of G x over the keyframes of a window, and of G s of what all keyframes share.
 
@@ -44,7 +51,6 @@ class SumVariance:
         """Covariance of the keyframes known, in their order, and the sum."""
 
     def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None:
-        """Keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`."""
         later = self._beside[rows] if len(self._beside) else np.zeros((len(rows), len(self._sum)))
         own, window = -W @ later, int(self._windows[i])
         if window >= 0:
@@ -66,15 +72,16 @@ class SumVariance:
 
 
 def keyframe_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, sums: SumVariance | None = None
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int, also: Visitor | None = None
 ) -> tuple[Array, Array]:
     """Covariance of (pose tangent, velocity, biases) of every keyframe, (k, 15, 15); of M(k) and W(k), where they are.
 
     M(k) and W(k), the mounting of the IMU and the calibration of the wheels, are what all keyframes share: they are
-    eliminated last, as if they were one more keyframe. `sums` finds the variance of sums over keyframes on the way.
+    eliminated last, as if they were one more keyframe. `also` is shown the joint covariance of each with those it is
+    given, from the last keyframe to the first.
     """
     shared = shared_keys(values, k)
-    groups = by_sections(graph, k, shared) if sums is None else in_time(k, shared)
+    groups = by_sections(graph, k, shared) if also is None else in_time(k, shared)
     linear = (part.linearize(values) for part in split(graph, groups))
     order = [split_key(keys[0])[1] for keys in groups]
     given = {i: (one.R, *_by_keyframe(one)) for i, one in zip(order, eliminate(linear, groups), strict=True)}
@@ -101,8 +108,8 @@ def keyframe_covariances(
         covariance = own @ own.T - cross @ W.T
         covariances[i] = (covariance + covariance.T) / 2
         joints[i] = [i, *later], np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
-        if sums is not None:
-            sums.add(i, W, rows, joints[i][1], joints[i][0])
+        if also is not None:
+            also.add(i, W, rows, joints[i][1], joints[i][0])
         if later:
             children[parents[i]] -= 1
         for j in (i, parents.get(i, i)):

@@ -15,11 +15,13 @@ from factor_graphs.constraints import (
     standing,
     zero_velocity_factors,
 )
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
+from factor_graphs.variance import BiasSteps, imu_noise_shown
 from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe, with_mounting
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
 
@@ -29,6 +31,8 @@ Array = NDArray[np.float64]
 FITTING_CHI2 = (0.8, 1.3)
 # Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
 INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
+# White noise and walk of the IMU are looked at so often.
+NOISE_ROUNDS = 10
 # A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
@@ -50,20 +54,21 @@ def fit_noise(
     in `optimise`.
     """
     loss = "huber" if problem.settings.robust else "quadratic"
-    inflation, motion, values = (
-        (1.0, motion_graph(problem, 1.0), first_values(problem))
+    inflation, of_walk, motion, values = (
+        (1.0, 1.0, motion_graph(problem, 1.0, 1.0), first_values(problem))
         if start is None
-        else (start.inflation, start.motion, start.values)
+        else (start.inflation, start.of_walk, start.motion, start.values)
     )
-    fit = optimise(problem, motion, values, inflation, loss, constraints or [], tolerance)
+    fit = optimise(problem, motion, values, (inflation, of_walk), loss, constraints or [], tolerance)
     if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
         return fit
     stiff, loosest = fit, MAX_INFLATION
     for _ in range(INFLATION_ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
-        motion = motion_graph(problem, inflation)
-        fit = optimise(problem, motion, fit.values, inflation, loss, constraints or [], tolerance)
+        noise = inflation, stiff.of_walk * inflation / stiff.inflation
+        motion = motion_graph(problem, *noise)
+        fit = optimise(problem, motion, fit.values, noise, loss, constraints or [], tolerance)
         if FITTING_CHI2[0] <= fit.chi2_per_dof <= (INFLATED_CHI2 if start is None else FITTING_CHI2[1]):
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
@@ -72,6 +77,22 @@ def fit_noise(
             stiff = fit
         else:
             return stiff
+    return fit
+
+
+def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
+    """The solution with white noise and bias walk of the IMU as their own residuals show them, by the fixes alone.
+
+    A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
+    """
+    k, loss = len(problem.intervals.keyframes), fit.loss
+    for _ in range(NOISE_ROUNDS):
+        steps = BiasSteps(k)
+        covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
+        noise = imu_noise_shown(problem, fit, covariances, steps)
+        if noise == (fit.inflation, fit.of_walk):
+            break
+        fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, loss)
     return fit
 
 
@@ -214,15 +235,8 @@ def _is_bent(fit: Fit, start: Fit) -> bool:
     return fit.inflation > start.inflation or fit.chi2_per_dof > FITTING_CHI2[1]
 
 
-def with_inflation(problem: Problem, fit: Fit, inflation: float) -> Fit:
-    """The same solution, of which the next one starts, with so many times the noise of the IMU."""
-    motion = motion_graph(problem, inflation)
-    loss = "huber" if problem.settings.robust else "quadratic"
-    return optimise(problem, motion, fit.values, inflation, loss)
-
-
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:
     """Take fixes that do not fit out of the solution: only when the others do, and the fit is not too stiff."""
     fits = problem.settings.robust and fit.chi2_per_dof <= FITTING_CHI2[1]
     loss = "truncated" if fits else fit.loss
-    return optimise(problem, fit.motion, fit.values, fit.inflation, loss, constraints)
+    return optimise(problem, fit.motion, fit.values, (fit.inflation, fit.of_walk), loss, constraints)

@@ -106,15 +106,17 @@ class ImuNoise(BaseModel):
     accelerometer_bias_stddev: float = Field(0.1, gt=0, description="Unknown bias at the start, m/s².")
     gyroscope_bias_stddev: float = Field(5e-3, gt=0, description="Unknown bias at the start, rad/s.")
 
-    def scaled(self, factor: float) -> "ImuNoise":
-        """The same unit with `factor` times the white noise and the bias walk."""
-        grown = [
-            "accelerometer_noise_density",
-            "gyroscope_noise_density",
-            "accelerometer_bias_walk",
-            "gyroscope_bias_walk",
-        ]
-        return self.model_copy(update={name: getattr(self, name) * factor for name in grown})
+    def scaled(self, factor: float, of_walk: float | None = None) -> "ImuNoise":
+        """The same unit with `factor` times the white noise, and `of_walk` times the bias walk, if not as much."""
+        of_walk = factor if of_walk is None else of_walk
+        return self.model_copy(
+            update={
+                "accelerometer_noise_density": self.accelerometer_noise_density * factor,
+                "gyroscope_noise_density": self.gyroscope_noise_density * factor,
+                "accelerometer_bias_walk": self.accelerometer_bias_walk * of_walk,
+                "gyroscope_bias_walk": self.gyroscope_bias_walk * of_walk,
+            }
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,11 +107,13 @@ class Problem:
 class Fit:
     """One optimised graph.
 
+    The IMU has `inflation` times the white noise that is expected of it, and `of_walk` times the bias walk.
     `squares` (m,) are the squared whitened residuals of the fixes, chi2 of 3 dof, `relative_squares` those of the
     relative poses, 6 dof.
     """
 
     inflation: float
+    of_walk: float
     loss: str
     motion: gtsam.NonlinearFactorGraph
     graph: gtsam.NonlinearFactorGraph
@@ -198,10 +200,10 @@ def _usable(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[ND
     return used, notes
 
 
-def motion_graph(problem: Problem, inflation: float) -> gtsam.NonlinearFactorGraph:
-    """Every factor but the fixes: the IMU with `inflation` times its noise, and the prior."""
+def motion_graph(problem: Problem, inflation: float, of_walk: float) -> gtsam.NonlinearFactorGraph:
+    """Every factor but the fixes: the IMU with `inflation` times its noise, `of_walk` times its walk, and the prior."""
     graph = gtsam.NonlinearFactorGraph()
-    noise = problem.intervals.noise(problem.noise.scaled(inflation))
+    noise = problem.intervals.noise(problem.noise.scaled(inflation, of_walk))
     for factor in imu_factors(problem.intervals, noise, problem.frame):
         graph.push_back(factor)
     T, velocities = problem.guess
@@ -217,13 +219,14 @@ def optimise(
     problem: Problem,
     motion: gtsam.NonlinearFactorGraph,
     start: gtsam.Values,
-    inflation: float,
+    noise: tuple[float, float],
     loss: str,
     constraints: Iterable[gtsam.NonlinearFactor] = (),
     tolerance: float = RELATIVE_TOLERANCE,
 ) -> Fit:
     """The most probable states, given a loss for the fixes: all but `tolerance` of the cost is gained.
 
+    `noise`: `inflation` and `of_walk` of the motion.
     Raises EstimationError when they are not found.
     """
     graph, kernel = gtsam.NonlinearFactorGraph(motion), LOSSES[loss]
@@ -240,7 +243,8 @@ def optimise(
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)
     return Fit(
-        inflation=inflation,
+        inflation=noise[0],
+        of_walk=noise[1],
         loss=loss,
         motion=motion,
         graph=graph,

@@ -12,7 +12,14 @@ from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.errors import MeasurementError
-from factor_graphs.fitting import FITTING_CHI2, calibrate, constrain, fit_noise, reject, with_inflation
+from factor_graphs.fitting import (
+    FITTING_CHI2,
+    calibrate,
+    constrain,
+    fit_noise,
+    fit_noise_by_components,
+    reject,
+)
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
@@ -21,7 +28,7 @@ from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
-from factor_graphs.variance import missing_imu_noise
+from factor_graphs.variance import BiasSteps, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
@@ -31,8 +38,6 @@ Array = NDArray[np.float64]
 NOTABLE_REJECTION = 0.01
 # The usual specific force of any vehicle is gravity to some per cent; so many times more or less is another unit.
 ANOTHER_UNIT = 2.0
-# The noise of the IMU is looked at again so often.
-NOISE_ROUNDS = 10
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
@@ -49,7 +54,7 @@ class Solution:
     For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
     outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
     `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
-    standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected;
+    standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected, its walk aside;
     `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
     where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
     slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
@@ -117,14 +122,14 @@ def smooth(
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
-    for n in range(NOISE_ROUNDS):
-        fit, constraints, vehicle, odometer = constrain(problem, fit, wheels)
-        fit = reject(problem, fit, constraints)
-        covariances, of_shared = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
-        more = missing_imu_noise(fit, covariances, n > 0) if may_inflate else 1.0
-        if more == 1.0:
+    by_fixes, k = fit, len(problem.intervals.keyframes)
+    for is_last in (not may_inflate, True):
+        fit, constraints, vehicle, odometer = constrain(problem, by_fixes, wheels)
+        fit, steps = reject(problem, fit, constraints), BiasSteps(k)
+        covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
+        if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
             break
-        fit = with_inflation(problem, fit, more * fit.inflation)
+        by_fixes = fit_noise_by_components(problem, by_fixes)
     shared_stddevs = np.sqrt(of_shared.diagonal())
     found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
     if not condensed:
@@ -151,7 +156,7 @@ def _solution(
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
     of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
-    noise = problem.noise.scaled(fit.inflation)
+    noise = problem.noise.scaled(fit.inflation, fit.of_walk)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
     weights, rejected = np.zeros(len(fixes)), ~problem.used
     weights[problem.used], rejected[problem.used] = fit.weights, fit.squares > REJECTION
@@ -210,8 +215,11 @@ def _doubts(
     gravity = problem.frame.gravity
     if not gravity / ANOTHER_UNIT < force < gravity * ANOTHER_UNIT:
         yield f"the usual specific force is {force:.2f} m/s², gravity {gravity:.2f}: is it in g, or without gravity?"
-    if fit.inflation > 1:
-        yield f"the IMU fits with {fit.inflation:.1f} times the noise that was expected"
+    if max(fit.inflation, fit.of_walk) > 1:
+        yield (
+            f"the IMU fits with {fit.inflation:.1f} times the noise that was expected,"
+            f" {fit.of_walk:.1f} times the walk of its biases"
+        )
     if fit.chi2_per_dof > FITTING_CHI2[1]:
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:

@@ -4,6 +4,9 @@ With all standard deviations honest, the squared whitened residuals of a group o
 rows, less what the unknowns take from them, tr(P Aᵀ A) (variance component estimation; Förstner 1979). From all rows
 together they take as many as they are. So the redundancy of the IMU follows from the other factors, each of which binds
 one keyframe only. A total over all residuals hardly shows the IMU: most of them are fixes.
+
+Of the IMU, the steps of its biases are one component, and what is left given these, its white noise, the other: a unit
+may be noisy and steady. From fix to fix white noise counts, in an outage of a minute the walk.
 """
 
 import gtsam
@@ -12,26 +15,64 @@ from numpy.typing import NDArray
 
 from factor_graphs.chi_square import quantile
 from factor_graphs.elimination import PLACES, SIZE, split_key
-from factor_graphs.problem import Fit
+from factor_graphs.graph import from_values
+from factor_graphs.problem import Fit, Problem
 
 Array = NDArray[np.float64]
 
-# Within 99 % of what chance makes of it, the noise of the IMU is as expected; found, it is good enough when it would
-# change by less than this.
-CHANCE, ENOUGH = 0.99, 1.03
+# Within 99 % of what chance makes of it, noise is as expected. Found, it is good enough when it would change by less
+# than a share: a drive shows white noise to some 10 %, walk less well.
+CHANCE, ENOUGH, ENOUGH_OF_WALK = 0.99, 1.05, 1.1
+# A power of the ratio of variances that is changed by, one half if what unknowns take did not follow it; and the most.
+POWER, MOST = 0.75, 4.0
 
 
-def missing_imu_noise(fit: Fit, covariances: Array, is_noisier: bool) -> float:
-    """How many times more noise the IMU has than the fit believes, by its state covariances (k, 15, 15); at least 1.
+class BiasSteps:
+    """Variance of the step of the biases from each of k keyframes to the next, `variance` (k - 1, 6).
 
-    Chance is no reason to change it; once the IMU `is_noisier` for sure, the best estimate is wanted. For a graph
-    without relative poses: each of its other factors binds one keyframe, beside what all share.
+    Known once `keyframe_covariances` has gone through all of them.
+    """
+
+    def __init__(self, k: int) -> None:
+        self.variance = np.zeros((k - 1, 6))
+
+    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None:
+        if i < len(self.variance):
+            own, following = np.arange(9, 15), SIZE * known.index(i + 1) + np.arange(9, 15)
+            self.variance[i] = joint[own, own] + joint[following, following] - 2 * joint[own, following]
+
+
+def imu_noise_shown(problem: Problem, fit: Fit, covariances: Array, steps: BiasSteps) -> tuple[float, float]:
+    """How many times more white noise and bias walk the IMU has than is expected, each at least 1; as fit if it fits.
+
+    By the state covariances (k, 15, 15) of a fit. Chance is no reason to change it; once it is changed, the best
+    estimate is wanted. For a graph without relative poses: each of its other factors binds one keyframe, beside what
+    all share.
     """
     squares, redundancy = _squares(fit, len(covariances)), _redundancy(fit, covariances)
-    if redundancy < 1 or (not is_noisier and squares <= quantile(CHANCE, redundancy)):
-        return 1.0
-    missing = float(np.sqrt(squares / redundancy))
-    return missing if missing > ENOUGH else 1.0
+    of_walk = _of_walk(problem, fit, steps)
+    of_white = squares - of_walk[0], redundancy - of_walk[1]
+    return (
+        _corrected(fit.inflation, *of_white, ENOUGH),
+        _corrected(fit.of_walk, *of_walk, ENOUGH_OF_WALK),
+    )
+
+
+def _corrected(now: float, squares: float, redundancy: float, enough: float) -> float:
+    """The noise that squared residuals of a redundancy show, the same where it is good enough."""
+    if redundancy < 1 or (now == 1.0 and squares <= quantile(CHANCE, redundancy)):
+        return now
+    better = max(1.0, now * min(float(squares / redundancy) ** POWER, MOST))
+    return now if 1 / enough < better / now < enough else better
+
+
+def _of_walk(problem: Problem, fit: Fit, steps: BiasSteps) -> tuple[float, float]:
+    """The squared whitened steps of the biases, and their redundancy."""
+    noise, k = problem.noise.scaled(1.0, fit.of_walk), len(problem.intervals.keyframes)
+    density = np.repeat([noise.accelerometer_bias_walk, noise.gyroscope_bias_walk], 3)
+    believed = density**2 * np.diff(problem.intervals.keyframes)[:, None]
+    walked = np.diff(from_values(fit.values, k)[2], axis=0)
+    return float(np.sum(walked**2 / believed)), float(np.sum(1 - steps.variance / believed))
 
 
 def _squares(fit: Fit, k: int) -> float:

@@ -84,7 +84,9 @@ def test_what_no_group_needs_is_left(bound):
 
 
 def test_the_optimiser_finds_what_gtsams_finds(bound):
-    fit = optimise(bound, motion_graph(bound, 1.0), first_values(bound), 1.0, "huber", tolerance=1e-10)
+    fit = optimise(
+        bound, motion_graph(bound, 1.0, 1.0), first_values(bound), (1.0, 1.0), "huber", tolerance=1e-10
+    )
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-10)
     params.setLinearSolverType("MULTIFRONTAL_QR")

@@ -8,13 +8,14 @@ import pytest
 
 from factor_graphs.accuracy import pose_nees
 from factor_graphs.covariances import keyframe_covariances
+from factor_graphs.elimination import state_keys
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.problem import pose_problem
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.smoothing import smooth
-from factor_graphs.variance import _redundancy, missing_imu_noise
+from factor_graphs.variance import BiasSteps, _redundancy, imu_noise_shown
 
 FRAME, LEVER = LocalFrame(49.0, 8.4, 115.0), np.array([0.5, 0.3, 1.0])
 
@@ -52,6 +53,38 @@ def test_an_imu_three_times_as_noisy_as_said_is_found_out_though_fixes_hide_it(s
     assert abs(np.mean(of_found) - 3) < abs(np.mean(of_believed) - 3)
 
 
+def test_biases_that_walk_faster_than_said_are_told_from_white_noise(simulate):
+    """The walk is found to a half, and the white noise, which is as said, is hardly touched."""
+    walking = {
+        name: 5 * getattr(ImuNoise(), name) for name in ("accelerometer_bias_walk", "gyroscope_bias_walk")
+    }
+    whites, walks = [], []
+    for seed in range(4):
+        drive = simulate(540 + seed, seconds=400.0, noise=ImuNoise(**walking))
+        found = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+        whites.append(found.inflation)
+        walks.append(found.imu_noise.gyroscope_bias_walk / ImuNoise().gyroscope_bias_walk)
+    assert np.median(whites) < 1.5
+    assert 3.0 < np.median(walks) < 7.5
+
+
+def test_the_variance_of_bias_steps_is_that_of_dense_algebra(simulate):
+    drive = simulate(41, seconds=20.0, noise=ImuNoise())
+    fit = fit_noise(pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None))
+    k = sum(key >> 56 == ord("x") for key in fit.values.keys())  # noqa: SIM118
+    steps = BiasSteps(k)
+    keyframe_covariances(fit.graph, fit.values, k, steps)
+    ordering = gtsam.Ordering()
+    for i in range(k):
+        for key in state_keys(i):
+            ordering.push_back(key)
+    A = fit.graph.linearize(fit.values).jacobian(ordering)[0]
+    covariance = np.linalg.inv(A.T @ A)
+    change = np.zeros((6, 15 * k))
+    change[:, 15 * 3 + 9 : 15 * 3 + 15], change[:, 15 * 4 + 9 : 15 * 4 + 15] = -np.eye(6), np.eye(6)
+    np.testing.assert_allclose(steps.variance[3], np.diag(change @ covariance @ change.T), rtol=1e-4)
+
+
 def test_an_honest_imu_is_believed(simulate):
     inflations = []
     for seed in range(8):
@@ -67,5 +100,6 @@ def test_without_information_nothing_is_said(simulate):
     vague = type(drive.fixes)(drive.fixes.stamps, drive.fixes.positions, np.full((len(drive.fixes), 3), 1e3))
     problem = pose_problem(drive.imu, vague, FRAME, SmootherSettings(), LEVER, None)
     fit = fit_noise(problem)
-    covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
-    assert missing_imu_noise(fit, covariances, False) == 1.0
+    steps = BiasSteps(len(problem.intervals.keyframes))
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes), steps)
+    assert imu_noise_shown(problem, fit, covariances, steps) == (1.0, 1.0)

@@ -23,6 +23,7 @@ from gnss_sem_map.export.exported import NO_VOXELS, Exported
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.point_cloud import LAZ_SCALE_M, las_header, las_points
 from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET, Tile
 
@@ -52,7 +53,7 @@ def write_copc(exported: Exported, path: Path | str) -> None:
     if georeference is None:
         raise DataError(f"{exported.title}: COPC needs a georeference; this map is in its drive's own poses")
     octree = _Octree.over(exported, georeference)
-    header = las_header(exported.map.label_set, georeference)
+    header = las_header(exported.map.label_set, georeference, has_times=exported.attributes is not None)
     with replacing(path) as file:
         writer = copclib.FileWriter(file.name, _config(octree, georeference, header))
         for node, records in _nodes(exported, georeference, octree, header):
@@ -143,7 +144,7 @@ def _nodes(
             parts[node].append(records)
 
     for tile in exported.map.tiles:
-        add(list(_points_of(exported.map.read_tile(tile), georeference, octree, header)))
+        add(list(_points_of(*exported.tile(tile), georeference, octree, header)))
         unread.discard(tile)
         for tiles in missing.values():
             tiles.discard(tile)
@@ -163,13 +164,18 @@ def _nodes(
 
 
 def _points_of(
-    piece: SemanticMap, georeference: Georeference, octree: _Octree, header: laspy.LasHeader
+    piece: SemanticMap,
+    attributes: Attributes | None,
+    georeference: Georeference,
+    octree: _Octree,
+    header: laspy.LasHeader,
 ) -> Iterator[tuple[Node, NDArray[np.uint8]]]:
     """The points of a tile, node by node."""
-    piece = piece[np.flatnonzero(piece.states != State.REMOVED)]
-    if not len(piece):
+    stays = np.flatnonzero(piece.states != State.REMOVED)
+    if not len(stays):
         return
-    points = las_points(piece, georeference, header)
+    piece, attributes = piece[stays], None if attributes is None else attributes[stays]
+    points = las_points(piece, attributes, georeference, header)
     levels = np.maximum(octree.depth - _largest_cubes(piece), 0)
     nodes = octree.nodes(np.column_stack([points.x, points.y, points.z]), levels)
     packed = np.zeros(len(nodes), np.int64)  # one number sorts ten times as fast as a row
@@ -226,5 +232,6 @@ def _config(octree: _Octree, georeference: Georeference, header: laspy.LasHeader
     config.copc_info.center_x, config.copc_info.center_y, config.copc_info.center_z = middle.tolist()
     config.copc_info.halfsize = octree.edge_m / 2
     config.copc_info.spacing = octree.edge_m / NODE_CELLS
+    config.las_header.global_encoding |= int(header.global_encoding.gps_time_type)
     config.las_header.generating_software = header.generating_software
     return config

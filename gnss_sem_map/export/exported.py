@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.voxels.attributes import Attributes, read_tile
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.tiles import TiledMap
 
 NO_VOXELS = "the map has no voxels to draw; run.json lists what was skipped"
@@ -32,6 +34,17 @@ class Exported:
     epsg: int | None = None
     """CRS of the files, see `Georeference`."""
     geoid: Path | None = None
+    attributes: Path | None = None
+    """Folder of the attributes of voxels, see `voxels.attributes`; None where they are not known."""
+
+    def tiles(self) -> Iterator[tuple[SemanticMap, Attributes | None]]:
+        """The map tile by tile, with the attributes of its voxels; raises DataError."""
+        return (self.tile(tile) for tile in self.map.tiles)
+
+    def tile(self, tile: Tile) -> tuple[SemanticMap, Attributes | None]:
+        """One of them."""
+        piece = self.map.read_tile(tile)
+        return piece, None if self.attributes is None else read_tile(self.attributes, tile, len(piece))
 
     @cached_property
     def georeference(self) -> Georeference | None:

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, gps_of_utc_ns
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import TiledMap
 
@@ -25,6 +27,7 @@ PLY_VERTEX = np.dtype(
 )  # fmt: skip
 PLY_TYPES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
 PLY_UNLABELLED = 255
+ADJUSTED_BY_S = 1_000_000_000
 UNLABELLED_COLOUR = (150, 150, 150)
 LAZ_SCALE_M = 0.001
 LAZ_CHUNK = 250_000
@@ -99,9 +102,10 @@ def write_laz(exported: Exported, path: Path | str) -> None:
     Coordinates are those of the delivery (see `Georeference`), and a text in the header says which; a map without a
     frame stays in its own metres, without a CRS. `classification` holds the class set's ASPRS codes, 0 where no camera
     looked and 1 where looking gave no class; colours are those of the classes. Extra bytes: `sem_label` (SemanticKITTI
-    raw id), `confidence`, `hits`, `state`. `gps_time` and `intensity` are 0: a map is a sum, of which drives and moving
-    objects can be taken out again, and neither the last moment nor the median of what was taken out is known. Raises
-    DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system as OGC WKT 1).
+    raw id), `confidence`, `hits`, `state`. `gps_time` (adjusted standard GPS time, s) is when the last point of the
+    voxel was measured, `intensity` the median of its points, 65535 for 1; both are 0 where they are not known, see
+    `voxels.attributes`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system
+    as OGC WKT 1).
     """
     _write_points(exported, path, removed=False)
 
@@ -115,21 +119,25 @@ def _write_points(exported: Exported, path: Path | str, removed: bool) -> None:
     import laspy
 
     georeference = exported.georeference
-    header = las_header(exported.map.label_set, georeference)
+    header = las_header(exported.map.label_set, georeference, has_times=exported.attributes is not None)
     with (
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
     ):
-        for piece in exported.map:
+        for piece, attributes in exported.tiles():
             chosen = np.flatnonzero((piece.states == State.REMOVED) == removed)
             for start in range(0, len(chosen), LAZ_CHUNK):
-                part = piece[chosen[start : start + LAZ_CHUNK]]
-                writer.write_points(las_points(part, georeference, header))
+                part = chosen[start : start + LAZ_CHUNK]
+                of_part = None if attributes is None else attributes[part]
+                writer.write_points(las_points(piece[part], of_part, georeference, header))
 
 
-def las_header(label_set: LabelSet, georeference: Georeference | None) -> laspy.LasHeader:
-    """The header of a file of voxels: coordinate system, names of the classes, extra bytes."""
+def las_header(
+    label_set: LabelSet, georeference: Georeference | None, has_times: bool = False
+) -> laspy.LasHeader:
+    """The header of a file of voxels: coordinate system, what `gps_time` is, names of the classes, extra bytes."""
     import laspy
+    from laspy.header import GpsTimeType
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -138,6 +146,8 @@ def las_header(label_set: LabelSet, georeference: Georeference | None) -> laspy.
     header.offsets = np.floor(_placed(np.zeros((1, 3)), georeference)[0])
     header.add_extra_dims([laspy.ExtraBytesParams(name, kind, text) for name, kind, text in EXTRA_BYTES])
     header.global_encoding.wkt = True
+    if has_times:
+        header.global_encoding.gps_time_type = GpsTimeType.STANDARD
     if georeference is not None:
         # LAS 1.4 asks for WKT 1; laspy's own add_crs writes WKT 2, which older readers refuse
         header.vlrs.append(WktCoordinateSystemVlr(georeference.crs.to_wkt("WKT1_GDAL")))
@@ -157,7 +167,10 @@ def _placed(p_map: NDArray[np.float64], georeference: Georeference | None) -> ND
 
 
 def las_points(
-    piece: SemanticMap, georeference: Georeference | None, header: laspy.LasHeader
+    piece: SemanticMap,
+    attributes: Attributes | None,
+    georeference: Georeference | None,
+    header: laspy.LasHeader,
 ) -> laspy.ScaleAwarePointRecord:
     """One point for every voxel."""
     import laspy
@@ -173,4 +186,16 @@ def las_points(
     points.withheld = states == State.REMOVED
     points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
     points.confidence, points.hits, points.state = piece.confidence, piece.voxels.hits, states
+    if attributes is not None:
+        points.gps_time = adjusted_gps_time(attributes.last_us)
+        points.intensity = 257 * attributes.intensity.astype(np.uint16)  # to 16 bit
     return points
+
+
+def adjusted_gps_time(unix_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Moments (n,), Unix time in us, as adjusted standard GPS time: s since the GPS epoch, with leap seconds, less 1e9.
+
+    0 before that epoch, as in drives whose log does not say the date. Source: ASPRS LAS 1.4 R15, table 4.
+    """
+    gps_ns = gps_of_utc_ns(1000 * unix_us) - GPS_EPOCH_NS
+    return np.where(gps_ns < 0, 0.0, (gps_ns - ADJUSTED_BY_S * 1_000_000_000) / 1e9)

@@ -40,7 +40,7 @@ from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
-from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, write_point_labels
+from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, LabelledDrive, write_point_labels
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
@@ -178,14 +178,12 @@ class Run:
                     copy_changes(self.folder, folder, before, georeference, self.label_set)
                 for file in self.folder.glob("objects.*"):
                     link_or_copy(file, folder / file.name)
+                if labelled := sorted(self.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
+                    write_point_labels(
+                        folder, (_labelled(known, folder) for known in labelled), refined.kerbs, settings
+                    )
                 about = self.about | {"map": about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
-                for known in sorted(self.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
-                    one = Run(known.parent)
-                    part = folder / DRIVES / known.parent.name
-                    write_point_labels(
-                        part, one.drive(), one.trajectory, refined.kerbs, settings, known, folder
-                    )
             else:
                 known = self.folder / RAW_LABELS
                 run_folder.write_again(
@@ -248,7 +246,6 @@ class Run:
         chosen = list(formats)
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
-        refined = tiles.open_map(self.folder / "refined", self.label_set)
         about = self.about
         if to is None and delivery not in (None, self.settings.delivery):
             raise ConfigError(
@@ -256,14 +253,10 @@ class Run:
             )
         delivery = delivery or self.settings.delivery
         check_delivery(delivery.crs, delivery.geoid)
-        exported = Exported(
-            refined,
-            tracks_of(self.folder),
-            str(about["name"]),
-            about.get("changes", ()),
-            delivery.crs,
-            delivery.geoid,
-        )
+        exported = run_folder.exported_of(
+            self.folder, tracks_of(self.folder), str(about["name"]), delivery, about.get("changes", ()),
+            self.label_set,
+        )  # fmt: skip
         if to is None:
             written = []
             for done, name in enumerate(chosen, 1):
@@ -307,6 +300,12 @@ class Run:
         inputs = [self.folder] if place.resolve() != self.folder.resolve() else []
         with run_folder.claimed_run(place, inputs), new_folder(place) as folder:
             yield folder
+
+
+def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:
+    """A drive of a map of several that is made again in `folder`, whose labels before refinement are known."""
+    drive = Run(known_raw.parent)
+    return LabelledDrive(folder / DRIVES / known_raw.parent.name, drive.drive(), drive.trajectory, known_raw)
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:

@@ -50,7 +50,7 @@ from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correc
 from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.merged_run import write_merged
-from gnss_sem_map.runs.point_label_files import write_point_labels
+from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
@@ -273,10 +273,13 @@ def _write(
         refined = pipeline.refine(
             folder, settings, stats, progress, earlier, executor=executor, work=claim.work
         )
-        for source in labelled:
-            part, log = folder / DRIVES / source.name, source.open_log().in_our_conventions(settings.sensors)
-            trajectory = Trajectory.load(part / "trajectory.parquet")
-            write_point_labels(part, log, trajectory, refined.kerbs, settings, run=folder)
+        if labelled:
+            write_point_labels(
+                folder,
+                (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled),
+                refined.kerbs,
+                settings,
+            )
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
@@ -297,6 +300,11 @@ def _write(
         }
         write_merged(folder, settings, about, progress)
     return about
+
+
+def _labelled(source: Source, folder: Path, settings: Settings) -> LabelledDrive:
+    log = source.open_log().in_our_conventions(settings.sensors)
+    return LabelledDrive(folder, log, Trajectory.load(folder / "trajectory.parquet"))
 
 
 def _summary(drive: Path) -> dict[str, Any]:

@@ -33,7 +33,8 @@ from gnss_sem_map.export.trajectories import (
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
-from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.files.untrusted import is_folder
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping.moving_points import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
 from gnss_sem_map.mapping.trajectory import DriveTrajectory
@@ -48,10 +49,11 @@ from gnss_sem_map.runs.about import (
     seconds_of,
     with_objects,
 )
-from gnss_sem_map.runs.point_label_files import write_point_labels
+from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.attributes import ATTRIBUTES
 
 RUN_FILES = re.compile(
     "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
@@ -94,10 +96,11 @@ def write_run(
     with mapped.stats.stage("export"):
         write_plot(folder, mapped.log, mapped.solution)
         write_objects(folder, source.name, mapped, settings)
+        if write_labels:
+            labelled = LabelledDrive(folder, mapped.log, mapped.trajectory)
+            write_point_labels(folder, [labelled], refined.kerbs, settings)
         track = _while_mapping(mapped.trajectory, mapped.log)
         write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
-        if write_labels:
-            write_point_labels(folder, mapped.log, mapped.trajectory, refined.kerbs, settings)
     about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
     write_about(folder, settings, about, metrics_of(mapped))
 
@@ -143,9 +146,10 @@ def write_again(
         if not (folder / file.name).exists():  # what moved may be known anew
             shutil.copyfile(file, folder / file.name)
     with stats.stage("export"):
-        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]), settings.delivery)
         if log is not None:
-            write_point_labels(folder, log, trajectory, refined.kerbs, settings, known_raw)
+            labelled = LabelledDrive(folder, log, trajectory, known_raw)
+            write_point_labels(folder, [labelled], refined.kerbs, settings)
+        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]), settings.delivery)
     tracked = about["map"]["refinement"]
     about |= changed | {
         "seconds": about["seconds"] | seconds_of(stats),
@@ -167,8 +171,21 @@ def write_map_files(
     progress: Progress = silent,
 ) -> None:
     """Write the refined map of a run folder in all formats."""
-    refined = tiles.open_map(folder / REFINED)
-    write_exports(Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid), folder, progress)
+    write_exports(exported_of(folder, tracks, title, delivery, changes), folder, progress)
+
+
+def exported_of(
+    folder: Path,
+    tracks: Sequence[Trajectory],
+    title: str,
+    delivery: DeliverySettings,
+    changes: Sequence[Mapping[str, Any]] = (),
+    label_set: LabelSet | None = None,
+) -> Exported:
+    """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
+    refined = tiles.open_map(folder / REFINED, label_set)
+    attributes = folder / ATTRIBUTES if is_folder(folder / ATTRIBUTES) else None
+    return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, attributes)
 
 
 def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeference | None:

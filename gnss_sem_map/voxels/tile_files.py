@@ -93,7 +93,7 @@ def _read(
         names = ["key", *(f"log_{name}" for name in label_set.names), "hits", *needed]
         names += [name for name in known if name in file.schema_arrow.names]
         table = file.read(columns=names)
-        columns = {name: _column(table, name) for name in names}
+        columns = {name: numbers_of(table, name) for name in names}
         _check(columns, len(label_set.names))
         return columns
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
@@ -120,7 +120,7 @@ def decode_voxels(content: bytes, tile: Tile, voxel_size_m: float, label_set: La
     import pyarrow.parquet as pq
 
     table = pq.ParquetFile(pa.BufferReader(content)).read()
-    columns = {name: _column(table, name) for name in table.column_names}
+    columns = {name: numbers_of(table, name) for name in table.column_names}
     return _voxels_of(columns, tile, voxel_size_m, label_set)
 
 
@@ -137,7 +137,7 @@ def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
     import pyarrow.parquet as pq
 
     whole = [name for name in columns if name != "confidence"]
-    table = pa.table({name: _arrow(values) for name, values in columns.items()})
+    table = pa.table({name: arrow_column(values) for name, values in columns.items()})
     sink = pa.BufferOutputStream()
     pq.write_table(
         table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
@@ -148,7 +148,7 @@ def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
     return bytes(sink.getvalue())
 
 
-def _arrow(values: NDArray[Any]) -> Any:
+def arrow_column(values: NDArray[Any]) -> Any:
     """Numbers as a column; `pa.array` imports pandas, which takes 0.2 s and 40 MB of every worker."""
     import pyarrow as pa
 
@@ -156,7 +156,7 @@ def _arrow(values: NDArray[Any]) -> Any:
     return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values)])
 
 
-def _column(table: Any, name: str) -> NDArray[Any]:
+def numbers_of(table: Any, name: str) -> NDArray[Any]:
     """A column as numbers without gaps; raises ValueError for anything else."""
     import pyarrow as pa
 

@@ -27,7 +27,8 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, labelled_scans
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs.run_folder import about_run, write_point_labels
+from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
+from gnss_sem_map.runs.run_folder import about_run
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
@@ -89,7 +90,7 @@ def unaccounted(place: Place, harm: Harm, out: Path, with_labels: bool) -> list[
         log, segmenter, SETTINGS, out, work, force=True
     )  # so short and damaged, it may look wrong
     kerbs = pipeline.refine(out, SETTINGS, mapped.stats).kerbs
-    write_point_labels(out, mapped.log, mapped.trajectory, kerbs, SETTINGS)
+    write_point_labels(out, [LabelledDrive(out, mapped.log, mapped.trajectory)], kerbs, SETTINGS)
     refined, static = tiles.read(out / "refined"), tiles.read(out / "refined").standing
     about = about_run(place.drive.name, log, mapped.stats)
     counts, frames = about["counts"], about["skips"]["frames"]

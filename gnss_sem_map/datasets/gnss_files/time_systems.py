@@ -26,6 +26,11 @@ def gps_minus_utc_s(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(np.searchsorted(at, stamps_ns, side="right"), np.int64)
 
 
+def gps_of_utc_ns(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """GPS time (n,) of stamps of UTC, both ns since 1970 as if days had no leap seconds."""
+    return stamps_ns + 1_000_000_000 * np.searchsorted(_LEAPS, stamps_ns, side="right")
+
+
 def nearest(stamp_ns: NDArray[np.int64], period_ns: int, near_ns: int) -> NDArray[np.int64]:
     """Times of a day or a week, ns from its start, moved by whole periods so that the first is nearest to a moment."""
     shift = round((near_ns - int(stamp_ns[0])) / period_ns) * period_ns

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
-from gnss_sem_map.mapping.labelled_scans import map_points
+from gnss_sem_map.mapping.labelled_scans import Drive, map_points
 from gnss_sem_map.mapping.trajectory import estimate_trajectory
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels.tile_files import PACKING
@@ -31,10 +31,11 @@ def main() -> None:
     parser.add_argument("drive", type=Path)
     log, settings = open_drive(parser.parse_args().drive), Settings()
     trajectory, _ = estimate_trajectory(log, settings, RunStats())
+    drive = Drive(log, trajectory, None, settings)
     keys, scans, sums = [], [], []
     for number, scan in enumerate(log.scans):
         points = scan.read()
-        p_map, usable = map_points(points, scan, trajectory, log, settings.mapping)
+        p_map, usable = map_points(points, scan, drive)
         intensity = np.clip(np.rint(255 * points.intensity[usable]), 0, 255).astype(np.int64)
         found, voxel = np.unique(keys_of(p_map, settings.mapping.voxel_size_m), return_inverse=True)
         keys.append(found)

@@ -50,6 +50,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/simulation/test_rigs.py",
         "gnss_sem_map/simulation/test_sessions.py",
         "gnss_sem_map/simulation/test_town.py",
+        "gnss_sem_map/test_attributes.py",
         "gnss_sem_map/test_finished_run.py",
         "gnss_sem_map/test_many_drives.py",
         "gnss_sem_map/test_run_again.py",

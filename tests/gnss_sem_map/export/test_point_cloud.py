@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.georeference import Georeference
-from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
+from gnss_sem_map.export.point_cloud import adjusted_gps_time, write_laz, write_ply, write_removed
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
@@ -197,3 +197,21 @@ def test_an_empty_map_gives_empty_files_that_still_open(
     write_laz(Exported(in_memory(empty, karlsruhe)), tmp_path / "map.laz")
     assert len(plyfile.PlyData.read(tmp_path / "map.ply")["vertex"].data) == 0
     assert len(laspy.read(tmp_path / "map.laz").points) == 0
+
+
+@pytest.mark.parametrize(
+    ("utc", "gps_s"),
+    [
+        ("1980-01-06T00:00:00", 0),
+        ("2011-09-14T01:46:25", 1_000_000_000),
+        ("2016-12-31T23:59:59", 1_167_264_016),
+        ("2017-01-01T00:00:00", 1_167_264_018),  # after the leap second
+    ],
+)
+def test_times_are_adjusted_standard_gps_time(utc: str, gps_s: int) -> None:
+    unix_us = np.array([np.datetime64(utc, "us")]).astype(np.int64)
+    assert adjusted_gps_time(unix_us + 250_000) == gps_s - 1_000_000_000 + 0.25
+
+
+def test_a_moment_before_gps_has_no_gps_time() -> None:
+    assert adjusted_gps_time(np.array([0, 12_000_000, -5])).tolist() == [0, 0, 0]

@@ -16,7 +16,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.labelled_scans import Drive, map_points
-from gnss_sem_map.mapping.sightings import Rows, Sightings, rows_of
+from gnss_sem_map.mapping.sightings import Seen, Sightings
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.scans.prefetch import prefetch, threads
@@ -101,7 +101,7 @@ def _label_some(
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
     one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
 
-    def label(scan: Scan) -> tuple[list[PointLabels], Rows | None] | None:
+    def label(scan: Scan) -> tuple[list[PointLabels], Seen | None] | None:
         try:
             points = scan.read()
             p_map, valid = map_points(points, scan, drive)
@@ -130,16 +130,15 @@ def _label_some(
             return found, None
         counted = _of_their_voxels(found[-1].removed[valid], places[-1], maps[-1])
         of_points = np.flatnonzero(valid)[counted]
-        return found, rows_of(
-            keys[counted], points.intensity[of_points], _moments_us(points, scan, drive.log)[of_points]
-        )
+        moments_us = _moments_us(points, scan, drive.log)[of_points]
+        return found, Seen(keys[counted], points.intensity[of_points], moments_us)
 
     for scan, done in prefetch(label, scans, threads=threads()):
         if done is None:
             continue
-        found, rows = done
-        if sightings is not None and rows is not None:
-            sightings.add(rows)
+        found, seen = done
+        if sightings is not None and seen is not None:
+            sightings.add(seen)
         yield scan, found
 
 

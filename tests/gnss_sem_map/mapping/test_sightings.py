@@ -10,7 +10,7 @@ import pytest
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import sightings
-from gnss_sem_map.mapping.sightings import Sightings, rows_of
+from gnss_sem_map.mapping.sightings import Seen, Sightings
 from gnss_sem_map.voxels.attributes import read_tile
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -50,8 +50,8 @@ def tiled(points: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> TiledMap:
 def written(points: list[tuple[np.ndarray, np.ndarray, np.ndarray]], tiled: TiledMap, folder: Path) -> Path:
     (folder / "waiting").mkdir(parents=True)
     seen = Sightings(folder / "waiting")
-    for keys, intensity, moments in points:
-        seen.add(rows_of(keys, intensity, moments))
+    for each in points:
+        seen.add(Seen(*each))
     seen.write(tiled, folder / "attributes")
     return folder / "attributes"
 
@@ -82,18 +82,25 @@ def test_any_order_and_any_memory_give_the_same_bytes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     at_once = written(points, tiled, tmp_path / "at_once")
-    monkeypatch.setattr(sightings, "MOST_ROWS", 3 * POINTS // 2)
+    monkeypatch.setattr(sightings, "MOST_ROWS", 1 << 12)
+    monkeypatch.setattr(sightings, "READ_AT_ONCE", 500)
     by_parts = written(points[::-1], tiled, tmp_path / "by_parts")
-    assert any(path.stat().st_size > 24 * 3 * POINTS for path in (tmp_path / "by_parts/waiting").iterdir())
+    waiting = [
+        sum(path.stat().st_size for path in (tmp_path / name / "waiting").iterdir())
+        for name in ("at_once", "by_parts")
+    ]
+    assert waiting[1] > 1.2 * waiting[0]  # the same rows more than once
     for tile in tiled.tiles:
         assert (at_once / name_of(tile)).read_bytes() == (by_parts / name_of(tile)).read_bytes()
 
 
-def test_intensities_that_are_none_count_as_dark_or_bright() -> None:
-    keys = pack(np.zeros((4, 3), int))
-    rows = rows_of(keys, np.array([np.nan, -1, 1, np.inf], np.float32), np.arange(4))
-    assert rows["place"].astype(np.uint8).tolist() == [0, 255]
-    assert rows["points"].tolist() == [2, 2]
+def test_intensities_that_are_none_count_as_dark_or_bright(tiled: TiledMap, tmp_path: Path) -> None:
+    values = np.array([np.nan, -1, np.nan, 1, np.inf, 7, 0.25], np.float32)
+    voxels = tiled.read_voxels(tiled.tiles[0])
+    seen = [Seen(voxels.keys[i // 3 : i // 3 + 1], values[i : i + 1], np.array([i])) for i in range(7)]
+    found = read_tile(written(seen, tiled, tmp_path), tiled.tiles[0], len(voxels))
+    assert found.intensity[:4].tolist() == [0, 255, 64, 0]
+    assert found.last_us[:4].tolist() == [2, 5, 6, 0]
 
 
 def test_a_damaged_file_is_refused_by_name(

@@ -1,12 +1,12 @@
 """When each voxel of a finished map was last seen, and how strongly it reflects: of the points of all scans.
 
-A row holds the points of one voxel with one of 256 intensities: how many they are, and the last moment. Rows are joined
-exactly, in any order. A part of them is in memory; the others wait on disk, tile by tile, until all scans are read.
+A row holds points of one voxel with one of 256 intensities: how many they are, and the last moment. Rows add up
+exactly, in any order. Some of them are in memory; the others wait on disk, a file for each strip of a tile, until all
+scans are read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ from gnss_sem_map.voxels.tiles import TiledMap
 
 Rows = NDArray[np.void]
 ROW = np.dtype([("place", "<u8"), ("last_us", "<i8"), ("points", "<u4")], align=True)
-"""The place is that of the tile, of the voxel in it (see `local_keys`), and the intensity. Aligned rows are joined in
+"""The place is that of the tile, of the voxel in it (see `local_keys`), and the intensity. Aligned rows are sorted in
 half the time."""
 LEVEL_BITS = 8
 LOCAL_BITS = 2 * TILE_BITS + Z_BITS
@@ -31,7 +31,9 @@ TILE_SHIFT = LOCAL_BITS + LEVEL_BITS
 TILE_AXIS_BITS = AXIS_BITS - TILE_BITS
 MOST_ROWS = 1 << 19
 """In memory: 21 MB, and 20 MB more while they are put away."""
-READ_AT_ONCE = 1 << 19
+STRIP_BITS = 4
+"""A tile is decided in so many strips, 2^4 of 6.4 m: few MB at a time."""
+STRIP_SHIFT = TILE_SHIFT - STRIP_BITS
 
 
 class Seen(NamedTuple):
@@ -49,7 +51,7 @@ class Sightings:
     """Rows of all scans: a table of those in memory, and the files of a folder with the others."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._tiles, self._rows = folder, set[int](), 0
+        self._folder, self._strips, self._rows = folder, set[int](), 0
         slots = 2 * MOST_ROWS
         self._places, self._last_us = np.empty(slots, np.uint64), np.empty(slots, np.int64)
         self._points = np.zeros(slots, np.uint32)  # 0: an empty slot
@@ -70,31 +72,33 @@ class Sightings:
             self._put_away()
             for tile in tiled_map.tiles:
                 local = local_keys(tiled_map.read_voxels(tile))
-                attributes.write_tile(_attributes_of(local, self._rows_of(tile)), beside, tile)
+                attributes.write_tile(self._attributes_of(tile, local), beside, tile)
 
     def _put_away(self) -> None:
+        """Append the rows of the table to the files of their strips."""
         slots = np.flatnonzero(self._points)
         slots = slots[np.argsort(self._places[slots])]
         rows = np.zeros(len(slots), ROW)
         rows["place"], rows["points"] = self._places[slots], self._points[slots]
         rows["last_us"] = self._last_us[slots]
         self._points[:], self._rows = 0, 0
-        of_rows = rows["place"] >> np.uint64(TILE_SHIFT)
-        for tile in np.unique(of_rows).tolist():
-            first, last = np.searchsorted(of_rows, np.array([tile, tile + 1], np.uint64))
-            self._tiles.add(tile)
-            with (self._folder / str(tile)).open("ab") as file:
-                rows[first:last].tofile(file)
+        strips = rows["place"] >> np.uint64(STRIP_SHIFT)
+        starts = _starts(strips)
+        ends = np.append(starts, len(rows))[1:]
+        for strip, start, end in zip(strips[starts].tolist(), starts, ends, strict=True):
+            self._strips.add(strip)
+            with (self._folder / str(strip)).open("ab") as file:
+                rows[start:end].tofile(file)
 
-    def _rows_of(self, tile: Tile) -> Rows:
-        """All rows of a tile, joined."""
+    def _attributes_of(self, tile: Tile, local: NDArray[np.uint32]) -> Attributes:
+        """Attributes of the voxels (v,) of a tile, which are sorted."""
+        found = Attributes(np.zeros(len(local), np.int64), np.zeros(len(local), np.uint8))
         first = AXIS_OFFSET >> TILE_BITS
         number = tile[0] + first << TILE_AXIS_BITS | tile[1] + first
-        rows = np.empty(0, ROW)
-        if number in self._tiles:
-            for part in _parts_of(self._folder / str(number)):
-                rows = _joined([rows, part])
-        return rows
+        for strip in range(number << STRIP_BITS, number + 1 << STRIP_BITS):
+            if strip in self._strips:
+                _decide(np.fromfile(self._folder / str(strip), ROW), local, found)
+        return found
 
 
 @njit(cache=True, nogil=True)
@@ -123,23 +127,18 @@ def _count(keys, intensity, moments_us, first, rows, most, places, points, last_
     return len(keys), rows
 
 
-def _parts_of(file: Path) -> Iterator[Rows]:
-    with file.open("rb") as opened:
-        while len(part := np.fromfile(opened, ROW, READ_AT_ONCE)):
-            yield part
-
-
-def _joined(parts: Sequence[Rows]) -> Rows:
-    """One row for each place, in their order."""
-    rows = np.concatenate([np.empty(0, ROW), *parts])
+def _decide(rows: Rows, local: NDArray[np.uint32], found: Attributes) -> None:
+    """Set the attributes of those of the voxels (v,) of a tile that have rows."""
     rows = rows.take(np.argsort(rows["place"], kind="stable"))  # quick: of sorted parts
-    starts = _starts(rows["place"])
-    if len(starts) == len(rows):
-        return rows
-    joined = rows.take(starts)
-    joined["points"] = np.add.reduceat(rows["points"], starts)
-    joined["last_us"] = np.maximum.reduceat(rows["last_us"], starts)
-    return joined
+    of_rows = rows["place"] >> np.uint64(LEVEL_BITS) & np.uint64((1 << LOCAL_BITS) - 1)
+    starts = _starts(of_rows)
+    places = np.searchsorted(local, of_rows[starts].astype(np.uint32))
+    found.last_us[places] = np.maximum.reduceat(rows["last_us"], starts)
+    until = np.cumsum(rows["points"], dtype=np.int64)
+    before = until[starts] - rows["points"][starts]
+    points = np.diff(before, append=until[-1])
+    middles = np.searchsorted(until, before + (points + 1) // 2)
+    found.intensity[places] = rows["place"][middles] & np.uint64((1 << LEVEL_BITS) - 1)
 
 
 def _starts(values: NDArray[np.uint64]) -> NDArray[np.int64]:
@@ -147,22 +146,3 @@ def _starts(values: NDArray[np.uint64]) -> NDArray[np.int64]:
     changes = np.ones(len(values), np.bool_)
     changes[1:] = values[1:] != values[:-1]
     return np.flatnonzero(changes)
-
-
-def _attributes_of(local: NDArray[np.uint32], rows: Rows) -> Attributes:
-    """Attributes of voxels (v,), which are sorted, of the joined rows of their tile."""
-    found = Attributes(np.zeros(len(local), np.int64), np.zeros(len(local), np.uint8))
-    if not len(rows):
-        return found
-    of_rows = rows["place"] >> np.uint64(LEVEL_BITS) & np.uint64((1 << LOCAL_BITS) - 1)
-    starts = _starts(of_rows)
-    places = np.searchsorted(local, of_rows[starts].astype(np.uint32))
-    found.last_us[places] = np.maximum.reduceat(rows["last_us"], starts)
-    until = np.cumsum(rows["points"], dtype=np.int64)
-    before, points = (
-        until[starts] - rows["points"][starts],
-        np.add.reduceat(rows["points"], starts, dtype=np.int64),
-    )
-    middles = np.searchsorted(until, before + (points + 1) // 2)
-    found.intensity[places] = rows["place"][middles] & np.uint64((1 << LEVEL_BITS) - 1)
-    return found

@@ -83,7 +83,6 @@ def test_any_order_and_any_memory_give_the_same_bytes(
 ) -> None:
     at_once = written(points, tiled, tmp_path / "at_once")
     monkeypatch.setattr(sightings, "MOST_ROWS", 1 << 12)
-    monkeypatch.setattr(sightings, "READ_AT_ONCE", 500)
     by_parts = written(points[::-1], tiled, tmp_path / "by_parts")
     waiting = [
         sum(path.stat().st_size for path in (tmp_path / name / "waiting").iterdir())
@@ -92,6 +91,13 @@ def test_any_order_and_any_memory_give_the_same_bytes(
     assert waiting[1] > 1.2 * waiting[0]  # the same rows more than once
     for tile in tiled.tiles:
         assert (at_once / name_of(tile)).read_bytes() == (by_parts / name_of(tile)).read_bytes()
+
+
+def test_nothing_is_known_where_no_scan_was_read(tiled: TiledMap, tmp_path: Path) -> None:
+    tile = tiled.tiles[0]
+    found = read_tile(written([], tiled, tmp_path), tile, len(tiled.read_voxels(tile)))
+    assert not found.last_us.any()
+    assert not found.intensity.any()
 
 
 def test_intensities_that_are_none_count_as_dark_or_bright(tiled: TiledMap, tmp_path: Path) -> None:

@@ -126,18 +126,17 @@ def decide(
     stood = is_whole & ~gone & is_occupied(hits, misses)
     moved_of = [one | by_itself for one, by_itself in zip(_of_voxels(gone, segments), free, strict=True)]
     occupied = [is_occupied(*counted) for counted in counts]
-    alone = [(of_scan.number < 0) & there for of_scan, there in zip(segments, occupied, strict=True)]
-    stood_of = [one | by_itself for one, by_itself in zip(_of_voxels(stood, segments), alone, strict=True)]
+    stood_of = [
+        2 * whole + ((of_scan.number < 0) & there)
+        for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
+    ]
     stays = standing(places, counts, moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
-    stands = [
-        (of_scan.number >= 0) | there
-        for of_scan, there in zip(segments[:count], occupied[:count], strict=True)
-    ]
+    stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
-    return Decision(moved, stands, first_seen_here, is_sharp)
+    return Decision(moved, stands[:count], first_seen_here, is_sharp)
 
 
 def _parted(
@@ -306,6 +305,6 @@ def moved_points(
     gone = np.append(moved, False).take(near.voxel)
     if not gone.any() or reach_m == 0:
         return gone
-    beside = near.is_body & ~np.append(stands, False).take(near.voxel)
+    beside = near.is_body & ~(gone | np.append(stands, False).take(near.voxel))
     grown = gone | closer_than(near.p_near, gone, beside, reach_m)
     return grown | closer_than(near.p_near[:, :2], grown, ~near.is_body, FOOT_REACH_M)

@@ -13,7 +13,7 @@ def of_scans(*scans):
 
 
 def stands(in_mover, alone, counted=HIT, whole=True):
-    """Whether a voxel stays that is part of a mover in some scans, and of what stands, or of a part of it, in others."""
+    """Whether a voxel stays that is part of a mover in some scans, and in others of what stands, whole or not."""
     scans = [(True, 0)] * in_mover + [(False, 1 + whole)] * alone
     stays = standing(
         [np.array([0], np.int32)] * len(scans),

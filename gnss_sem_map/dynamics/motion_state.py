@@ -26,6 +26,11 @@ FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
 
 
+LARGER, GRANULE_M, FREE_SHARE = 1.5, 0.5, 1 / 3
+"""A segment larger than its object by this factor and so much is not of it alone. How large the object is tell the
+segments that other scans mostly saw through, if so many are."""
+
+
 class Motion(StrEnum):
     """Motion state of an object."""
 
@@ -133,6 +138,14 @@ def classify_motion(
         whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere)
         if not (is_shown or is_sharp or whole.displaced):
             continue
+        if whole.motion in GONE and (beside := _beside(members, segments, hits, misses)):
+            objects.append(
+                _tracked_object(beside, segments, Motion.PARKED, 0.0, "beside something that moved")
+            )
+            members = [n for n in members if n not in set(beside)]
+            whole = _tracked_object(
+                members, segments, whole.motion, whole.probability, whole.reason, whole.displaced
+            )
         gone = [n for n in members if misses[n] > max(2 * hits[n], MISSES_OF_ONE_SEGMENT)]
         if whole.motion in GONE or not gone:
             if whole.motion in GONE or is_shown:
@@ -178,6 +191,18 @@ def _motion_of_track(
     else:
         motion = Motion.PARKED if hit > 0 else Motion.UNKNOWN
     return _tracked_object(members, segments, motion, max(vanished, float(displaced)), reason, displaced)
+
+
+def _beside(
+    members: list[int], segments: list[Segment], hits: NDArray[np.float64], misses: NDArray[np.float64]
+) -> list[int]:
+    """Segments of a track that are too large for the object: it was so close to something that both are one cluster."""
+    free = [n for n in members if misses[n] > hits[n]]
+    if not free or len(free) < FREE_SHARE * len(members):
+        return []
+    extents = {n: float(np.linalg.norm(np.ptp(segments[n].outline, axis=0))) for n in members}
+    largest = LARGER * max(extents[n] for n in free) + GRANULE_M
+    return [n for n in members if misses[n] <= hits[n] and extents[n] > largest]
 
 
 def _elsewhere(

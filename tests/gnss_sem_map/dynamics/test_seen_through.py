@@ -64,3 +64,15 @@ def test_two_people_apart_are_two_segments():
     for outline, (low, high) in zip(apart.outlines(), apart.levels(), strict=True):
         assert np.ptp(outline[:, 0]) < 0.5
         assert 0.3 <= low < high <= 1.7
+
+
+def test_of_a_car_a_person_beside_it_is_told_apart_and_a_window_is_not():
+    """Both are as often seen through; what is behind a window is long and low."""
+    for length, high, goes in ((0.5, 1.7, True), (1.7, 1.7, True), (3.0, 1.4, False)):
+        car, other = block(0.0, 5.0, 4.5, 0.3, 1.5), block(0.5, 4.8, length, 0.7 if high < 1.5 else 0.3, high)
+        p_map, n = np.concatenate([car, other]), len(car) + len(other)
+        segments, voxel = find_segments(p_map, np.zeros(n, bool), np.zeros(n), np.ones(n), EPS_M)
+        assert len(segments.truncated) == 1
+        is_other = np.arange(n) >= len(car)
+        groups = free_groups(segments, *counts(voxel, is_other, 10, 30), EPS_M)
+        np.testing.assert_array_equal(groups[voxel] >= 0, is_other & goes)

@@ -26,9 +26,10 @@ FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
 
 
-LARGER, GRANULE_M, FREE_SHARE = 1.5, 0.5, 1 / 3
-"""A segment larger than its object by this factor and so much is not of it alone. How large the object is tell the
-segments that other scans mostly saw through, if so many are."""
+PERSON_M, LARGER, GRANULE_M, FREE_SHARE = 1.2, 1.5, 0.5, 1 / 3
+"""A segment larger than a person by this factor and so much is not of the person alone. A track is of a person if so
+many of its segments are mostly seen through, and most of these no longer than PERSON_M: a car that waits shows its
+side."""
 
 
 class Motion(StrEnum):
@@ -196,13 +197,15 @@ def _motion_of_track(
 def _beside(
     members: list[int], segments: list[Segment], hits: NDArray[np.float64], misses: NDArray[np.float64]
 ) -> list[int]:
-    """Segments of a track that are too large for the object: it was so close to something that both are one cluster."""
+    """Segments of a person's track that are too large: both the person and what is close to it are one cluster."""
     free = [n for n in members if misses[n] > hits[n]]
     if not free or len(free) < FREE_SHARE * len(members):
         return []
     extents = {n: float(np.linalg.norm(np.ptp(segments[n].outline, axis=0))) for n in members}
-    largest = LARGER * max(extents[n] for n in free) + GRANULE_M
-    return [n for n in members if misses[n] <= hits[n] and extents[n] > largest]
+    usual = float(np.median([extents[n] for n in free]))
+    if usual > PERSON_M:
+        return []
+    return [n for n in members if misses[n] <= hits[n] and extents[n] > LARGER * usual + GRANULE_M]
 
 
 def _elsewhere(

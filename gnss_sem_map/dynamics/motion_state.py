@@ -26,7 +26,7 @@ FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
 
 
-PERSON_M, LARGER, GRANULE_M, FREE_SHARE = 1.2, 1.5, 0.5, 1 / 3
+PERSON_M, LARGER, GRANULE_M, FREE_SHARE = 1.2, 1.5, 0.5, 0.2
 """A segment larger than a person by this factor and so much is not of the person alone. A track is of a person if so
 many of its segments are mostly seen through, and most of these no longer than PERSON_M: a car that waits shows its
 side."""

@@ -24,12 +24,10 @@ LENGTH_M = 5.0
 """Length of a car."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
-
-
-PERSON_M, LARGER, GRANULE_M, FREE_SHARE = 1.2, 1.5, 0.5, 0.2
-"""A segment larger than a person by this factor and so much is not of the person alone. A track is of a person if so
-many of its segments are mostly seen through, and most of these no longer than PERSON_M: a car that waits shows its
-side."""
+PERSON_M, SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.2, 1.5, 0.5, 0.2
+"""A segment that is larger than SIZE_RATIO times the usual size of its track, and SIZE_MARGIN_M, is not of the person
+alone. A track is of a person if at least FREE_SHARE of its segments are mostly seen through, and most of these are no
+longer than PERSON_M: a car that waits shows its side."""
 
 
 class Motion(StrEnum):
@@ -143,7 +141,7 @@ def classify_motion(
             objects.append(
                 _tracked_object(beside, segments, Motion.PARKED, 0.0, "beside something that moved")
             )
-            members = [n for n in members if n not in set(beside)]
+            members = [n for n in members if n not in beside]
             whole = _tracked_object(
                 members, segments, whole.motion, whole.probability, whole.reason, whole.displaced
             )
@@ -205,7 +203,7 @@ def _beside(
     usual = float(np.median([extents[n] for n in free]))
     if usual > PERSON_M:
         return []
-    return [n for n in members if misses[n] <= hits[n] and extents[n] > LARGER * usual + GRANULE_M]
+    return [n for n in members if misses[n] <= hits[n] and extents[n] > SIZE_RATIO * usual + SIZE_MARGIN_M]
 
 
 def _elsewhere(

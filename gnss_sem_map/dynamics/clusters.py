@@ -106,11 +106,11 @@ class Segments:
     """The segments of one scan, stored by voxel."""
 
     keys: NDArray[np.int64]
-    """(v,) keys of the voxels, in ascending order; each voxel belongs to one segment."""
+    """(v,) keys of the voxels, in ascending order; each voxel belongs to one segment at most."""
     parts: PointSets
     """(v,) the points of each voxel that belong to its segment."""
     number: NDArray[np.int32]
-    """(v,) the segment of each voxel."""
+    """(v,) the segment of each voxel, -1 for one in a cluster that is no object: it is too large, or too small."""
     truncated: NDArray[np.bool_]
     """(s,) segments that are cut off by the edge of the image or hidden in part by something nearer."""
 
@@ -127,21 +127,27 @@ class Segments:
         """For every segment, its voxels by the means of their points (v, 2) m."""
         order = np.argsort(self.number, kind="stable")
         means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
-        return np.split(means, np.cumsum(np.bincount(self.number, minlength=len(self.truncated)))[:-1])
+        ends = np.cumsum(np.bincount(self.number + 1, minlength=len(self.truncated) + 1))
+        return np.split(means, ends[:-1])[1:]  # without what is in no segment
 
     def levels(self) -> list[tuple[float, float]]:
         """For every segment the lowest and the highest of its voxels, by the means of their points, m."""
         heights = self.parts.sums[:, 2] / self.parts.points
-        lowest = np.full(len(self.truncated), np.inf)
+        lowest = np.full(len(self.truncated) + 1, np.inf)
         highest = -lowest
-        np.minimum.at(lowest, self.number, heights)
+        np.minimum.at(
+            lowest, self.number, heights
+        )  # what is in no segment counts for the last, which is none
         np.maximum.at(highest, self.number, heights)
-        return list(zip(lowest.tolist(), highest.tolist(), strict=True))
+        return list(zip(lowest[:-1].tolist(), highest[:-1].tolist(), strict=True))
 
     def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
         """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
-        weights, count = counts * self.parts.points, len(self.truncated)
-        return np.array([np.bincount(self.number, row, count) for row in weights], np.float64)
+        return np.array([self.sums(row * self.parts.points) for row in counts], np.float64)
+
+    def sums(self, values: NDArray[np.generic]) -> NDArray[np.float64]:
+        """Sums over the voxels of every segment (s,) of values of all voxels (v,)."""
+        return np.asarray(np.bincount(self.number + 1, values, len(self.truncated) + 1)[1:], np.float64)
 
 
 @njit(cache=True, nogil=True)
@@ -191,18 +197,16 @@ def find_segments(
     shown = ~fits[clusters] & (
         voxels.labelled > 0
     )  # of clusters that are too large or too small, the labelled part
-    part = _cluster(keys[shown], eps_m)
+    part = cluster(keys[shown], eps_m)
     number[shown] = part + np.int32(fits.sum())
     truncated = np.zeros(part.max(initial=-1) + 1, np.bool_)
     truncated[part] = (whole.points > whole.labelled)[
         clusters[shown]
     ]  # the cluster has points outside of the image
-    kept = number >= 0
-    row_of = np.where(kept, np.cumsum(kept, dtype=np.int32) - 1, -1).astype(np.int32)
-    row = np.where(is_object | ~shown.take(voxel), row_of.take(voxel), np.int32(-1))
-    parts = PointSets.of(p_map, is_object, gaps_m, row, int(kept.sum())).without_boxes()
+    row = np.where(is_object | ~shown.take(voxel), voxel, np.int32(-1))
+    parts = PointSets.of(p_map, is_object, gaps_m, row, len(keys)).without_boxes()
     all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
-    return Segments(keys[kept], parts, number[kept], all_truncated), row
+    return Segments(keys, parts, number, all_truncated), row
 
 
 def _is_vehicle_sized(whole: PointSets, beams: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -219,12 +223,12 @@ def _object_clusters(
 
     Clusters that are too large are split; clusters inside the box of another are merged with it.
     """
-    clusters = _cluster(keys, eps_m)
+    clusters = cluster(keys, eps_m)
     count = int(clusters.max(initial=-1)) + 1
     boxes = voxels.merged(clusters, count)
     size = boxes.highest - boxes.lowest
     large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_M)[clusters]
-    clusters[large] = _cluster(keys[large], SPLIT_EPS_SHARE * eps_m) + np.int32(count)
+    clusters[large] = cluster(keys[large], SPLIT_EPS_SHARE * eps_m) + np.int32(count)
     used, of_used = np.unique(clusters, return_inverse=True)
     boxes = voxels.merged(of_used, len(used))
     owners = _enclosing_clusters(boxes.lowest, boxes.highest)
@@ -245,17 +249,17 @@ def split_segments(
     not, the segment is clustered again with a smaller distance, and its clusters that were seen through become a new
     segment.
     """
-    points, number, count = segments.parts.points, segments.number.copy(), len(segments.truncated)
+    points, number = segments.parts.points, segments.number.copy()
     once_empty = misses > displaced_misses_per_hit * hits
     stood = (hits > 0) & (misses == 0)
     all_of, empty_of, stood_of = (
-        np.bincount(number, points * which, count) for which in (np.ones_like(stood), once_empty, stood)
+        segments.sums(points * which) for which in (np.ones_like(stood), once_empty, stood)
     )
     least = np.maximum(MIXED_SHARE * all_of, LEAST_DENSE_POINTS)
     truncated = segments.truncated
     for mixed in np.flatnonzero((empty_of >= least) & (stood_of >= least)):
         part = np.flatnonzero(number == mixed)
-        clusters = _cluster(segments.keys[part], SPLIT_EPS_SHARE * eps_m)
+        clusters = cluster(segments.keys[part], SPLIT_EPS_SHARE * eps_m)
         hit, missed = (np.bincount(clusters, points[part] * counts[part]) for counts in (hits, misses))
         moved = (missed > displaced_misses_per_hit * hit)[clusters]
         if min(points[part[moved]].sum(), points[part[~moved]].sum()) >= least[mixed]:
@@ -264,6 +268,6 @@ def split_segments(
     return replace(segments, number=number, truncated=truncated)
 
 
-def _cluster(keys: NDArray[np.int64], eps_m: float) -> NDArray[np.int32]:
+def cluster(keys: NDArray[np.int64], eps_m: float) -> NDArray[np.int32]:
     """Cluster of every voxel (v,): voxels nearer than `eps_m` are in one cluster."""
     return dbscan(unpack(keys), eps_m / VOXEL_M, min_samples=1)

@@ -24,6 +24,10 @@ LENGTH_M = 5.0
 """Length of a car."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
+PERSON_M, SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.2, 1.5, 0.5, 0.2
+"""A segment that is larger than SIZE_RATIO times the usual size of its track, and SIZE_MARGIN_M, is not of the person
+alone. A track is of a person if at least FREE_SHARE of its segments are mostly seen through, and most of these are no
+longer than PERSON_M: a car that waits shows its side."""
 
 
 class Motion(StrEnum):
@@ -133,6 +137,14 @@ def classify_motion(
         whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere)
         if not (is_shown or is_sharp or whole.displaced):
             continue
+        if whole.motion in GONE and (beside := _beside(members, segments, hits, misses)):
+            objects.append(
+                _tracked_object(beside, segments, Motion.PARKED, 0.0, "beside something that moved")
+            )
+            members = [n for n in members if n not in beside]
+            whole = _tracked_object(
+                members, segments, whole.motion, whole.probability, whole.reason, whole.displaced
+            )
         gone = [n for n in members if misses[n] > max(2 * hits[n], MISSES_OF_ONE_SEGMENT)]
         if whole.motion in GONE or not gone:
             if whole.motion in GONE or is_shown:
@@ -178,6 +190,20 @@ def _motion_of_track(
     else:
         motion = Motion.PARKED if hit > 0 else Motion.UNKNOWN
     return _tracked_object(members, segments, motion, max(vanished, float(displaced)), reason, displaced)
+
+
+def _beside(
+    members: list[int], segments: list[Segment], hits: NDArray[np.float64], misses: NDArray[np.float64]
+) -> list[int]:
+    """Segments of a person's track that are too large: both the person and what is close to it are one cluster."""
+    free = [n for n in members if misses[n] > hits[n]]
+    if not free or len(free) < FREE_SHARE * len(members):
+        return []
+    extents = {n: float(np.linalg.norm(np.ptp(segments[n].outline, axis=0))) for n in members}
+    usual = float(np.median([extents[n] for n in free]))
+    if usual > PERSON_M:
+        return []
+    return [n for n in members if misses[n] <= hits[n] and extents[n] > SIZE_RATIO * usual + SIZE_MARGIN_M]
 
 
 def _elsewhere(

@@ -27,6 +27,7 @@ from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.seen_through import free_groups, with_free_groups
 from gnss_sem_map.dynamics.standing import is_occupied, standing
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.tracking import Segment
@@ -83,7 +84,9 @@ class Decision:
     """What has moved in consecutive scans."""
 
     moved: list[NDArray[np.bool_]]
-    """For each scan, which of the voxels (v,) of its segments."""
+    """For each scan, which of the voxels (v,) of its points above ground."""
+    stands: list[NDArray[np.bool_]]
+    """For each scan, the voxels (v,) that do not belong to something that moved beside them."""
     objects: tuple[TrackedObject, ...]
     """Those that are first seen in one of these scans."""
     is_sharp: bool
@@ -102,16 +105,15 @@ def decide(
     """
     _check_order(observations)
     if not observations:
-        return Decision([], (), False)
+        return Decision([], [], (), False)
     places = _places(observations)
     counts = _observations_by_others(observations, places, before, settings.farthest_m)
     is_sharp = are_sharp(counts)
-    segments = [
-        split_segments(
-            seen.segments, counted[0], counted[1], settings.segment_eps_m, settings.displaced_misses_per_hit
-        )
+    parted = [
+        _parted(seen.segments, counted[0], counted[1], settings, is_sharp)
         for seen, counted in zip(observations, counts, strict=True)
     ]
+    segments, free = [one[0] for one in parted], [one[1] for one in parted]
     hits, misses = np.concatenate(
         [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
     )
@@ -122,13 +124,35 @@ def decide(
         gone[list(one.segments)] = one.motion in GONE
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
-    moved_of, stood_of = _of_voxels(gone, segments), _of_voxels(stood, segments)
+    moved_of = [one | by_itself for one, by_itself in zip(_of_voxels(gone, segments), free, strict=True)]
+    occupied = [is_occupied(*counted) for counted in counts]
+    stood_of = [
+        2 * whole + ((of_scan.number < 0) & there)
+        for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
+    ]
     stays = standing(places, counts, moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
+    stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
-    return Decision(moved, first_seen_here, is_sharp)
+    return Decision(moved, stands[:count], first_seen_here, is_sharp)
+
+
+def _parted(
+    segments: Segments,
+    hits: NDArray[np.int32],
+    misses: NDArray[np.int32],
+    settings: MotionSettings,
+    is_sharp: bool,
+) -> tuple[Segments, NDArray[np.bool_]]:
+    """The segments of a scan, taken apart by hits and misses of their voxels (v,), and which voxels moved (v,)."""
+    eps_m = settings.segment_eps_m
+    parted = split_segments(segments, hits, misses, eps_m, settings.displaced_misses_per_hit)
+    if not is_sharp:
+        return parted, np.zeros(len(segments.keys), np.bool_)
+    groups = free_groups(parted, hits, misses, eps_m)
+    return with_free_groups(parted, groups), groups >= 0
 
 
 def _with_track(one: TrackedObject, listed: Sequence[Segment]) -> TrackedObject:
@@ -142,7 +166,7 @@ def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> 
     """For each scan, for its voxels (v,) what is true of their segments (s,), which are those of all scans."""
     ends = np.cumsum([len(of_scan.truncated) for of_scan in segments])[:-1]
     parts = zip(np.split(of_segments, ends), segments, strict=True)
-    return [part[of_scan.number] for part, of_scan in parts]
+    return [np.append(part, False)[of_scan.number] for part, of_scan in parts]
 
 
 def _check_order(observations: Sequence[Observation]) -> None:
@@ -271,11 +295,16 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
     return listed
 
 
-def moved_points(near: NearPoints, moved: NDArray[np.bool_], reach_m: float) -> NDArray[np.bool_]:
-    """Which of the points (h,) have moved: those of `moved` voxels (v,), body points near them, foot points below."""
+def moved_points(
+    near: NearPoints, moved: NDArray[np.bool_], stands: NDArray[np.bool_], reach_m: float
+) -> NDArray[np.bool_]:
+    """Which of the points (h,) have moved: those of `moved` voxels (v,), body points near them, foot points below.
+
+    Points of voxels that stand (v,) are not taken for those of what moves near them.
+    """
     gone = np.append(moved, False).take(near.voxel)
     if not gone.any() or reach_m == 0:
         return gone
-    beside = near.is_body & (near.voxel < 0)
+    beside = near.is_body & ~(gone | np.append(stands, False).take(near.voxel))
     grown = gone | closer_than(near.p_near, gone, beside, reach_m)
     return grown | closer_than(near.p_near[:, :2], grown, ~near.is_body, FOOT_REACH_M)

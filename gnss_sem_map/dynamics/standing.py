@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 LARGEST_MISSES_PER_HIT = 0.05
 """What stands is seen through at most so often: parked cars reach 0.03 with sharp poses."""
-LEAST_SHARE = 0.5
-"""A place stands if it does so in more than this share of the scans in which it belongs to something that moved."""
 
 
 def is_occupied(hits: ArrayLike, misses: ArrayLike) -> NDArray[np.bool_]:
@@ -28,17 +26,18 @@ def standing(
     places: Sequence[NDArray[np.int32]],
     counts: Sequence[NDArray[np.int32]],
     moved: Sequence[NDArray[np.bool_]],
-    stood: Sequence[NDArray[np.bool_]],
+    stood: Sequence[NDArray[np.integer]],
 ) -> list[NDArray[np.bool_]]:
     """For each scan, the voxels (v,) that stand, whatever the rest of their segment did.
 
     `places` (v,) number the voxels of each scan, the same in all scans; `counts` (2, v) are their hits and misses.
-    `moved` and `stood` (v,) tell which of them are in a segment that moved, and in a whole one that stands.
+    `moved` (v,) tells which of them are in a segment that moved; `stood` (v,) is 2 for those in a whole one that
+    stands, 1 for others that do. A place stands if these add up to more than the scans in which it moved.
     """
     number = 1 + max((int(place.max(initial=-1)) for place in places), default=-1)
     times_moved, times_stood = np.zeros((2, number), np.int32)
     for place, is_moved, is_stood in zip(places, moved, stood, strict=True):
         times_moved[place] += is_moved
         times_stood[place] += is_stood
-    stands = times_stood > LEAST_SHARE * times_moved
+    stands = times_stood > times_moved
     return [stands[place] & is_occupied(*counted) for place, counted in zip(places, counts, strict=True)]

@@ -217,7 +217,8 @@ class _Chunk:
 
         def taken(place: int) -> tuple[WaitingPoints, NDArray[np.bool_]]:
             points = WaitingPoints.take(self._waiting(numbers[place]))
-            return points, moved_points(points.near, decision.moved[place], settings.dynamics.grow_m)
+            moved, stands = decision.moved[place], decision.stands[place]
+            return points, moved_points(points.near, moved, stands, settings.dynamics.grow_m)
 
         removed, moving = new_table(settings), {}
         for place, (points, moved) in prefetch(taken, range(len(numbers)), THREADS):

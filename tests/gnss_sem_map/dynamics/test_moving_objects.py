@@ -11,7 +11,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement.vehicles import Motion
 
 LIDAR_HEIGHT_M, SCAN_S = 1.7, 0.1
-CAR = (4.2, 1.8, 1.5)
+CAR, PERSON = (4.2, 1.8, 1.5), (0.3, 0.5, 1.7)
 AZIMUTHS, ELEVATIONS = np.radians(np.arange(-180, 180, 0.4)), np.radians(np.arange(-24.8, 2.0, 0.42))
 RAYS = np.stack(
     [
@@ -39,11 +39,17 @@ def cast(origin, boxes):
     return origin + RAYS[seen] * best[seen, None], what[seen]
 
 
+def box_at(x, y, size, floor=0.2):
+    return np.array([x - size[0] / 2, y - size[1] / 2, floor]), np.array(
+        [x + size[0] / 2, y + size[1] / 2, size[2]]
+    )
+
+
 def car_at(x, y):
-    return np.array([x - CAR[0] / 2, y - CAR[1] / 2, 0.2]), np.array([x + CAR[0] / 2, y + CAR[1] / 2, CAR[2]])
+    return box_at(x, y, CAR)
 
 
-def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=None):
+def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=None, size=CAR):
     """Drive along x past facades and cars (functions of time -> x, y or None); the points of each car that went.
 
     Returns, for each car, the share of its points in all scans that was removed, that share of everything else, and
@@ -55,7 +61,7 @@ def drive(cars, scans=40, ego_speed=6.0, view_deg=180.0, drift_m=0.0, settings=N
     for scan in range(scans):
         t = scan * SCAN_S
         places = [car(t) for car in cars]
-        boxes = facades + [car_at(*place) if place else car_at(1e4, 0) for place in places]
+        boxes = facades + [box_at(*(place or (1e4, 0)), size) for place in places]
         origin = np.array([ego_speed * t, 0.0, LIDAR_HEIGHT_M])
         p_map, what = cast(origin, boxes)
         offset = p_map - origin
@@ -85,8 +91,10 @@ def decided(seen, settings=None, first=0, last=None, window=1000):
     images = KeyframeScans.of(before) if before else None
     decision = decide(observations, last - first, images, settings)
     moving = {
-        observation.number: near.indices[moved_points(near, moved, settings.grow_m)]
-        for (observation, near), moved in zip(seen[first:last], decision.moved, strict=True)
+        observation.number: near.indices[moved_points(near, moved, stands, settings.grow_m)]
+        for (observation, near), moved, stands in zip(
+            seen[first:last], decision.moved, decision.stands, strict=True
+        )
     }
     return moving, decision.objects
 
@@ -206,6 +214,21 @@ def test_a_drive_that_stands_still_tells_movers_from_parked_cars():
     assert share[-1] > 0.98
     np.testing.assert_array_equal(share[:-1], 0)
     assert others < 2e-4
+
+
+@pytest.mark.parametrize("y", [-10.3, 11.3])
+def test_a_person_close_to_a_wall_goes_and_the_wall_stays(y):
+    """25 cm lie between them: no cluster tells them apart, and no image."""
+    share, others, objects = drive([going(8, y, 1.4)], view_deg=0.0, size=PERSON)
+    assert share[0] > 0.9
+    assert others < 1e-4
+    assert any(one.motion == Motion.MOVING and one.track is not None for one in objects)
+
+
+def test_a_person_who_stands_at_a_wall_stays():
+    share, others, _ = drive([parked(12, 11.3)], view_deg=0.0, size=PERSON)
+    assert share[0] == 0
+    assert others == 0
 
 
 def test_one_scan_alone_removes_nothing():

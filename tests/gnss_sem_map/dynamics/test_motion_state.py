@@ -1,0 +1,34 @@
+"""What a track is of: segments that are too large for what moved are of something beside it."""
+
+import numpy as np
+
+from gnss_sem_map.dynamics.motion_state import Motion, MotionSettings, classify_motion
+from gnss_sem_map.dynamics.tracking import Segment
+
+
+def segment(scan, x, length):
+    """A segment of 50 points along x."""
+    outline = np.column_stack([np.linspace(x - length / 2, x + length / 2, 20), np.full(20, 8.0)])
+    return Segment(scan, 0.1 * scan, np.array([x, 8.0]), 50, False, False, outline, np.zeros(2))
+
+
+def test_a_person_who_comes_off_a_hedge_leaves_the_hedge():
+    """In the first scans both are one cluster, and so one track."""
+    segments = [segment(scan, 0.12 * scan, 5.0 if scan < 8 else 0.5) for scan in range(24)]
+    hits = np.where(np.arange(24) < 8, 2000.0, 100.0)
+    misses = np.where(np.arange(24) < 8, 150.0, 5000.0)
+    objects = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
+    motions = {n: one.motion for one in objects for n in one.segments}
+    assert all(motions[n] == Motion.PARKED for n in range(8))
+    assert all(motions[n] == Motion.MOVING for n in range(8, 24))
+
+
+def test_a_car_that_waits_and_drives_on_is_one_object():
+    """It is as large while it waits, and others do not see through it there."""
+    places = [3.0] * 8 + [3.0 + 0.8 * scan for scan in range(16)]
+    segments = [segment(scan, x, 4.3) for scan, x in enumerate(places)]
+    hits = np.where(np.arange(24) < 8, 2000.0, 100.0)
+    misses = np.where(np.arange(24) < 8, 150.0, 5000.0)
+    (one,) = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
+    assert one.motion == Motion.MOVING
+    assert one.segments == tuple(range(24))

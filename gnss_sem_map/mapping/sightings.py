@@ -88,7 +88,7 @@ class Sightings:
         for strip, start, end in zip(strips[starts].tolist(), starts, ends, strict=True):
             self._strips.add(strip)
             with (self._folder / str(strip)).open("ab") as file:
-                rows[start:end].tofile(file)
+                file.write(rows[start:end].tobytes())  # `tofile` would not say why it fails
 
     def _attributes_of(self, tile: Tile, local: NDArray[np.uint32]) -> Attributes:
         """Attributes of the voxels (v,) of a tile, which are sorted."""

@@ -20,7 +20,7 @@ define install
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'
 endef
 
-.PHONY: test test-unit test-slow test-faults check demo notebooks docs package clean
+.PHONY: test test-unit test-slow test-demo test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -34,11 +34,11 @@ $(TOOLS): $(PACKAGE)
 	touch $@
 
 test: $(TOOLS)
-	$(PYTEST) -m 'not slow and not faults'
+	$(PYTEST) -m 'not slow and not demo and not faults'
 
 # What every change should pass at once: no process is started, no drive simulated, no real data read.
 test-unit: $(TOOLS)
-	$(PYTEST) -m 'not slow and not faults and not integration'
+	$(PYTEST) -m 'not slow and not demo and not faults and not integration'
 
 # Executed in build/notebooks, where the site finds them with their pictures.
 notebooks: $(TOOLS)
@@ -62,6 +62,9 @@ package: $(TOOLS)
 
 test-slow: $(TOOLS)
 	$(PYTEST) -m slow
+
+test-demo: $(TOOLS)
+	$(PYTEST) -m demo
 
 test-faults: $(TOOLS)
 	$(PYTEST) tests/faults

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pages import ROOT, blocks, shell
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.demo
 
 CLASSES = ("road", "sidewalk", "vehicle", "building", "vegetation")
 

@@ -13,6 +13,7 @@ from scipy.special import betaincc
 
 from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.dynamics.own_motion import motion_of
+from gnss_sem_map.dynamics.seen_through import PERSON_M
 from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
 
@@ -24,7 +25,7 @@ LENGTH_M = 5.0
 """Length of a car."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
-PERSON_M, SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.2, 1.5, 0.5, 0.2
+SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.5, 0.5, 0.2
 """A segment that is larger than SIZE_RATIO times the usual size of its track, and SIZE_MARGIN_M, is not of the person
 alone. A track is of a person if at least FREE_SHARE of its segments are mostly seen through, and most of these are no
 longer than PERSON_M: a car that waits shows its side."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.files.atomic import adding_folder
 from gnss_sem_map.voxels import attributes
 from gnss_sem_map.voxels.attributes import Attributes
-from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, home
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_BITS, Z_OFFSET, Tile, local_keys
 from gnss_sem_map.voxels.tiles import TiledMap
 
@@ -104,7 +104,7 @@ class Sightings:
 @njit(cache=True, nogil=True)
 def _count(keys, intensity, moments_us, first, rows, most, places, points, last_us):
     """Count points from the first on, until a row more than `most` would be needed: the next point, and the rows."""
-    mask, slots = (1 << TILE_BITS) - 1, uint64(len(places) - 1)
+    mask, slots = (1 << TILE_BITS) - 1, len(places)
     for i in range(first, len(keys)):
         x, y, z = keys[i] >> 2 * AXIS_BITS, keys[i] >> AXIS_BITS & AXIS_MASK, keys[i] & AXIS_MASK
         tile = x >> TILE_BITS << TILE_AXIS_BITS | y >> TILE_BITS
@@ -113,10 +113,9 @@ def _count(keys, intensity, moments_us, first, rows, most, places, points, last_
         if intensity[i] > 0:  # not for NaN
             level = int(np.rint(min(np.float32(255) * intensity[i], np.float32(255))))
         place = uint64(tile << TILE_SHIFT | local << LEVEL_BITS | level)
-        h = place * uint64(0x9E3779B97F4A7C15)
-        slot = (h ^ (h >> uint64(29))) * uint64(0xD6E8FEB86659FD93) >> uint64(20) & slots
+        slot = home(place, slots)
         while points[slot] > 0 and places[slot] != place:
-            slot = (slot + uint64(1)) & slots
+            slot = (slot + 1) & (slots - 1)
         if points[slot] == 0:
             if rows == most:
                 return i, rows

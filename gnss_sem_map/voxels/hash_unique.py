@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, uint64
+from numba import njit
 from numpy.typing import NDArray
+
+from gnss_sem_map.voxels.kernels import home
 
 LEAST_BITS = 10
 
@@ -47,9 +49,7 @@ def _numbered(keys):
 @njit(cache=True, nogil=True, inline="always")
 def slot_of(key, found, table, bits):
     """Slot of a key in the table, or the empty slot for it."""
-    h = uint64(key) * uint64(0x9E3779B97F4A7C15)
-    h = (h ^ (h >> uint64(29))) * uint64(0xD6E8FEB86659FD93)
-    slot = h >> uint64(64 - bits)
+    slot = home(key, 1 << bits)
     while table[slot] >= 0 and found[table[slot]] != key:
-        slot = (slot + uint64(1)) & uint64(len(table) - 1)
+        slot = (slot + 1) & (len(table) - 1)
     return slot

@@ -59,7 +59,7 @@ def _prefetch(typing_context: Any, table: Any, row: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _home(key, size):
+def home(key, size):
     """Row where the search for a key begins: a multiplicative hash, scaled to any table size.
 
     Rows are in the order of their hash, so that rehashing into a larger table writes from front to back.
@@ -73,7 +73,7 @@ def _home(key, size):
 @njit(cache=True, nogil=True)
 def find_or_insert(rows, key):
     """Row of a key in a hash table (slots, words), or the empty row for it; at least one row must be empty."""
-    slot = _home(key, len(rows))
+    slot = home(key, len(rows))
     while rows[slot, 0] != key and rows[slot, 0] != 0:
         slot += 1
         if slot == len(rows):
@@ -128,7 +128,7 @@ def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations
     runs, next_observed = len(starts) - 1, np.searchsorted(observed, start)
     for run in range(runs):
         if run + PREFETCH_AHEAD < runs:
-            _prefetch(rows, _home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
+            _prefetch(rows, home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
         first, end = starts[run], starts[run + 1]
         slot = find_or_insert(rows, keys[first])
         if rows[slot, 0] == 0:

@@ -1,4 +1,4 @@
-"""Viewer pages: writing one, and reading what it holds."""
+"""Viewer pages: writing one, reading what it holds, and looking at a place of it."""
 
 import base64
 import json
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from browsers import Browser
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.viewer import write_viewer
@@ -61,3 +62,11 @@ def hostile(street: SemanticMap) -> SemanticMap:
     )
     spiteful = LabelSet("x", names, old.colours, old.semantic_kitti_ids, old.asprs_codes, {})
     return replace(street, voxels=replace(street.voxels, label_set=spiteful))
+
+
+def look_at(browser: Browser, metres: tuple[float, float, float], distance_m: float) -> None:
+    """Turn the camera to a place of the map, from so far away."""
+    browser.run(
+        f"camera.target = {list(metres)}.map((m, k) => m / meta.voxel_m - meta.origin[k]);"
+        f"camera.distance = {distance_m} / meta.voxel_m;"
+    )

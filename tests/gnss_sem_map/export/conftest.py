@@ -1,9 +1,11 @@
 """A short street as a semantic map, a track along it, and where on Earth it lies."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from browsers import Browser, opened_browser
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
@@ -93,3 +95,9 @@ def track() -> Trajectory:
 def karlsruhe() -> LocalFrame:
     """Where KITTI was recorded; half a degree west of its UTM zone's central meridian."""
     return LocalFrame(49.0, 8.4, 115.0)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with opened_browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened

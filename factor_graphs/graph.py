@@ -103,10 +103,11 @@ def prior_factors(
 def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:
     """Keyframe states (k, 4, 4), (k, 3), (k, 6) as GTSAM values."""
     values = gtsam.Values()
+    # named, or the binding tries all kinds of value in turn: 42 µs a bias in place of 10
     for i, (pose, velocity, bias) in enumerate(zip(T, velocities, biases, strict=True)):
-        values.insert(X(i), gtsam.Pose3(pose))
+        values.insert(X(i), pose3=gtsam.Pose3(pose))
         values.insert(V(i), velocity)
-        values.insert(B(i), gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
+        values.insert(B(i), constant_bias=gtsam.imuBias.ConstantBias(bias[:3], bias[3:]))
     return values
 
 

@@ -115,9 +115,9 @@ class StreamingSmoother:
         graph.push_back(gtsam.PriorFactorPose3(X(i), pose, diagonal(stddevs[:6])))
         graph.push_back(gtsam.PriorFactorVector(V(i), state.velocity, diagonal(stddevs[6:9])))
         graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, diagonal(stddevs[9:])))
-        values.insert(X(i), pose)
+        values.insert(X(i), pose3=pose)
         values.insert(V(i), state.velocity)
-        values.insert(B(i), bias)
+        values.insert(B(i), constant_bias=bias)
         self._smoother.update(graph, values, dict.fromkeys((X(i), V(i), B(i)), state.stamp))
         self._keyframe_stamps = {i: state.stamp}
 
@@ -136,9 +136,9 @@ class StreamingSmoother:
         ):
             graph.push_back(factor)
             ahead = factor.preintegratedMeasurements().predict(ahead, bias)
-            values.insert(X(i), ahead.pose())
+            values.insert(X(i), pose3=ahead.pose())
             values.insert(V(i), ahead.velocity())
-            values.insert(B(i), bias)
+            values.insert(B(i), constant_bias=bias)
             stamps |= {key: float(intervals.keyframes[i - first]) for key in (X(i), V(i), B(i))}
         known = self._keyframe_stamps | dict(enumerate(intervals.keyframes.tolist(), first))
         at = np.array([_keyframe_at(known, stamp) for stamp in relative.stamps.ravel()], dtype=int).reshape(

@@ -145,20 +145,21 @@ class TiledAttributes:
     def read_tile(self, tile: Tile) -> Attributes:
         """Those of all voxels of a tile; raises DataError."""
         parts = [
-            _read(folder / name_of(tile), tile)
-            for folder, names in zip(self.folders, self._names, strict=True)
-            if name_of(tile) in names
+            _read(folder / name_of(tile), tile, voxels[name_of(tile)])
+            for folder, voxels in zip(self.folders, self._voxels, strict=True)
+            if name_of(tile) in voxels
         ]
         return parts[0] if len(parts) == 1 else combined(parts)
 
     def whole(self) -> Attributes:
         """Those of all voxels at once; raises DataError."""
-        return combined([self.read_tile(tile_of(name)) for name in sorted(frozenset().union(*self._names))])
+        return combined([self.read_tile(tile_of(name)) for name in sorted(set[str]().union(*self._voxels))])
 
     @cached_property
-    def _names(self) -> list[frozenset[str]]:
-        """Of the tiles of every drive: none of them may be missing."""
-        return [frozenset(files_of(folder.parent / "map")) for folder in self.folders]
+    def _voxels(self) -> list[dict[str, int]]:
+        """Name of every tile of the map of each drive -> how many voxels it has."""
+        files = [files_of(folder.parent / "map") for folder in self.folders]
+        return [{name: about["voxels"] for name, about in of_drive.items()} for of_drive in files]
 
 
 def open_attributes(run: Path) -> TiledAttributes | None:
@@ -168,10 +169,13 @@ def open_attributes(run: Path) -> TiledAttributes | None:
     return TiledAttributes(folders) if all(map(is_folder, folders)) else None
 
 
-def _read(path: Path, tile: Tile) -> Attributes:
+def _read(path: Path, tile: Tile, voxels: int) -> Attributes:
     content = read_bytes(path)
     try:
-        return decode(content, tile)
+        found = decode(content, tile)
+        if len(found) != voxels:
+            raise ValueError(f"found {len(found)} voxels, expected {voxels}")
+        return found
     except ValueError as error:
         raise DataError(
             f"{shown(path)}: damaged attributes ({error}); make the run again, or remove the folder"

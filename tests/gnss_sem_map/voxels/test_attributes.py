@@ -122,11 +122,11 @@ def run(tmp_path: Path) -> Path:
     known = in_table(points_of(4, 5))
     write(((tile, known[rows]) for tile, rows in indices_by_tile(known.keys)), tmp_path / ATTRIBUTES)
     (tmp_path / "map").mkdir()
-    names = [path.name for path in (tmp_path / ATTRIBUTES).iterdir()]
-    about = {"voxels": 0, "points": 0, "sha256": ""}
-    described = describe(0.2, open_label_set(), None, dict.fromkeys(names, about))
+    voxels = {name_of(tile): len(rows) for tile, rows in indices_by_tile(known.keys)}
+    about = {name: {"voxels": count, "points": 0, "sha256": ""} for name, count in voxels.items()}
+    described = describe(0.2, open_label_set(), None, about)
     (tmp_path / "map/map.json").write_text(json.dumps(described))
-    for name in names:
+    for name in voxels:
         (tmp_path / "map" / name).touch()
     return tmp_path
 
@@ -155,6 +155,10 @@ def test_a_damaged_file_is_refused_by_name(run: Path) -> None:
             refused.append(str(error))
     assert len(refused) > 10
     assert all(name_of(tile) in message for message in refused)
+    other, _ = list(indices_by_tile(right.of(in_table(points_of(4, 5)).keys).keys))[1]
+    path.write_bytes((run / ATTRIBUTES / name_of(other)).read_bytes())
+    with pytest.raises(DataError, match="expected"):
+        opened.read_tile(tile)
     path.unlink()
     with pytest.raises(DataError, match=name_of(tile)):
         opened.read_tile(tile)

@@ -126,8 +126,8 @@ def decode(content: bytes, tile: Tile) -> Attributes:
     keys = global_keys(tile, local)
     if not (keys[1:] > keys[:-1]).all():
         raise ValueError("its keys are not sorted and unique")
-    if not ((intensity >= 0) & (intensity <= 255)).all():
-        raise ValueError("it has intensities beyond 0..255")
+    if not ((intensity >= 0) & (intensity <= 255) & (points > 0)).all():
+        raise ValueError("it has intensities beyond 0..255, or voxels without points")
     return Attributes(keys, points.astype(np.int64), last_us.astype(np.int64), intensity.astype(np.uint8))
 
 

@@ -14,7 +14,7 @@ from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.kernels import PREFETCH_AHEAD, find_or_insert, home, prefetch_row, rehash, run_starts
 from gnss_sem_map.voxels.voxel_map import HIGHEST_LOAD
 
-SMALLEST_TABLE = 1 << 16
+SMALLEST_TABLE = 1 << 17
 WORDS = 8
 """Of a row: its key, the last moment, points and stride of the sample, the sample."""
 KEY, LAST, FIRST_LEVEL = 0, 1, 24
@@ -30,7 +30,7 @@ class AttributeTable:
     """Hash table of voxels; it grows as needed. Scans are added in one order, on which samples depend."""
 
     def __init__(self) -> None:
-        self._rows, self._count = np.zeros((SMALLEST_TABLE, WORDS), np.int64), 0
+        self._rows, self._count = _empty(SMALLEST_TABLE), 0
 
     def add(self, keys: NDArray[np.int64], levels: NDArray[np.int16], moments_us: NDArray[np.int64]) -> None:
         """Add points (n,): their voxels, their intensities (see `seen_of`) or WAITS, and when they were measured."""
@@ -42,7 +42,7 @@ class AttributeTable:
                 keys, levels, moments_us, done,
             )  # fmt: skip
             if done < len(keys):
-                self._rows = np.zeros((len(rows) * 3 // 2, WORDS), np.int64)
+                self._rows = _empty(len(rows) * 3 // 2)
                 rehash(rows, self._rows)
 
     def attributes(self) -> Attributes:
@@ -54,6 +54,13 @@ class AttributeTable:
         _find_medians(rows.view(np.uint32), rows.view(np.uint8), order, intensity)
         points = rows.view(np.uint32)[order, POINTS].astype(np.int64)
         return Attributes(rows[order, KEY], points, rows[order, LAST], intensity)
+
+
+def _empty(rows: int) -> NDArray[np.int64]:
+    """A table of empty rows, each in a cache line."""
+    room = np.zeros((rows + 1) * WORDS, np.int64)
+    start = -room.ctypes.data // room.itemsize % WORDS
+    return room[start : start + rows * WORDS].reshape(rows, WORDS)
 
 
 def seen_of(

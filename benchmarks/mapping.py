@@ -46,7 +46,7 @@ from gnss_sem_map.scans.projection import ClassImage, class_image
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.kernels import _prefetch
+from gnss_sem_map.voxels.kernels import prefetch_row
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelTable
 
@@ -243,7 +243,7 @@ def _touch(rows: Any, ints: Any, places: Any, nothing: Any) -> None:
     """The least that fusing a point into any voxel can cost: fetch its row, add to all of its 32 bytes."""
     for i in range(len(places)):
         if i + 16 < len(places):
-            _prefetch(rows, places[i + 16])
+            prefetch_row(rows, places[i + 16])
         for c in range(8):
             ints[places[i], c] += nothing[c]
 

@@ -76,8 +76,7 @@ def run(
     write_labels: Annotated[
         bool,
         typer.Option(
-            help="Also write a class per original LiDAR point (of several drives, in OUT/drives/NAME/), and into"
-            " map.laz when each voxel was last seen, and its intensity."
+            help="Also write a class per original LiDAR point (of several drives, in OUT/drives/NAME/)."
         ),
     ] = False,
     crs: Crs = None,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.georeference import Georeference
-from gnss_sem_map.voxels.attributes import Attributes, read_tile
+from gnss_sem_map.voxels.attributes import Attributes, TiledAttributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.tiles import TiledMap
@@ -34,8 +34,8 @@ class Exported:
     epsg: int | None = None
     """CRS of the files, see `Georeference`."""
     geoid: Path | None = None
-    attributes: Path | None = None
-    """Folder of the attributes of voxels, see `voxels.attributes`; None where they are not known."""
+    attributes: TiledAttributes | None = None
+    """Of its voxels; None where they are not known."""
 
     def tiles(self) -> Iterator[tuple[SemanticMap, Attributes | None]]:
         """The map tile by tile, with the attributes of its voxels; raises DataError."""
@@ -44,7 +44,7 @@ class Exported:
     def tile(self, tile: Tile) -> tuple[SemanticMap, Attributes | None]:
         """One of them."""
         piece = self.map.read_tile(tile)
-        return piece, None if self.attributes is None else read_tile(self.attributes, tile, len(piece))
+        return piece, None if self.attributes is None else self.attributes.of(tile, piece.voxels.keys)
 
     @cached_property
     def georeference(self) -> Georeference | None:

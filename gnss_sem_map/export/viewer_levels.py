@@ -79,7 +79,7 @@ def visit_nodes(tiled_map: TiledMap, visit: Callable[[Node], None], most_voxels:
 
 
 def _of_tile(corner: Tile, piece: SemanticMap) -> Node:
-    keys = local_keys(piece.voxels)
+    keys = local_keys(piece.voxels.keys)
     x, y, z = keys >> (TILE_BITS + Z_BITS), keys >> Z_BITS & (COLUMNS - 1), keys & ((1 << Z_BITS) - 1)
     order = np.argsort(
         _spread(x) | _spread(y) << np.uint64(1) | _spread(z) << np.uint64(2)

@@ -6,6 +6,7 @@ bytes for any number of processes and any interruptions.
 
 NUMBER/record.json           counts, skips, moving objects, checksums
        static/x_y.parquet    the voxels of a tile (`voxels.tile_files`); removed/ likewise
+       seen/x_y.parquet      the attributes of those of static/ (`voxels.attributes`); seen_removed/ likewise
        moving_points.npz     the points that moved (`mapping.evidence`)
        keyframes.npz         range images for free-space evidence, if they are of use
 """
@@ -35,12 +36,14 @@ from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.chunks import MappedChunk
 from gnss_sem_map.mapping.waiting_points import WAITING
+from gnss_sem_map.voxels.attributes import Attributes, combined, decode, encode
 from gnss_sem_map.voxels.tile_files import Tile, decode_voxels, encode_voxels
-from gnss_sem_map.voxels.tiles import by_tile, joined_voxels
+from gnss_sem_map.voxels.tiles import by_tile, indices_by_tile, joined_voxels
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 RECORD = "record.json"
 STATIC, REMOVED = "static", "removed"
+SEEN, SEEN_REMOVED = "seen", "seen_removed"
 MOVING_POINTS, KEYFRAMES = "moving_points.npz", "keyframes.npz"
 
 
@@ -124,6 +127,17 @@ class ChunkStore:
         nothing = joined_voxels([], self.voxel_size_m, self.label_set)
         return reduce(add, (self._read(path, tile, checksum) for path, checksum in files), nothing)
 
+    def attributes(self, tile: Tile) -> Attributes:
+        """Those of all voxels of a tile: of the points that moved only where no other is."""
+        static, removed = (
+            combined(
+                [self._decoded(path, tile, checksum) for path, checksum in self._parts[layer].get(tile, [])]
+            )
+            for layer in (SEEN, SEEN_REMOVED)
+        )
+        alone = np.flatnonzero(~np.isin(removed.keys, static.keys, assume_unique=True))
+        return combined([static, removed[alone]])
+
     def whole(self, layer: str) -> VoxelMap:
         """A whole layer in memory, sorted by key."""
         parts = [self.tile(layer, tile) for tile in self.tiles()]
@@ -143,7 +157,9 @@ class ChunkStore:
     @cached_property
     def _parts(self) -> dict[str, dict[Tile, list[tuple[Path, str]]]]:
         """Layer -> tile -> files of the chunks, with their checksums."""
-        parts: dict[str, dict[Tile, list[tuple[Path, str]]]] = {STATIC: {}, REMOVED: {}}
+        parts: dict[str, dict[Tile, list[tuple[Path, str]]]] = {
+            layer: {} for layer in (STATIC, REMOVED, SEEN, SEEN_REMOVED)
+        }
         for number, record in enumerate(self._records):
             for name, checksum in record["files"].items():
                 layer, slash, file = name.partition("/")
@@ -165,6 +181,9 @@ class ChunkStore:
             reason = error.strerror if isinstance(error, OSError) else "its checksum differs"
             raise DataError(f"{path}: damaged chunk ({reason}); --resume maps it again") from None
 
+    def _decoded(self, path: Path, tile: Tile, checksum: str) -> Attributes:
+        return decode(_content(path, checksum), tile)
+
     def _read(self, path: Path, tile: Tile, checksum: str) -> VoxelMap:
         return decode_voxels(_content(path, checksum), tile, self.voxel_size_m, self.label_set)
 
@@ -174,6 +193,9 @@ def _files(chunk: MappedChunk) -> Iterator[tuple[str, bytes]]:
     for layer, voxels in ((STATIC, chunk.static), (REMOVED, chunk.removed)):
         for (x, y), part in by_tile(voxels):
             yield f"{layer}/{x}_{y}.parquet", encode_voxels(part)
+    for layer, seen in ((SEEN, chunk.attributes), (SEEN_REMOVED, chunk.attributes_removed)):
+        for (x, y), rows in indices_by_tile(seen.keys):
+            yield f"{layer}/{x}_{y}.parquet", encode(seen[rows])
     file = io.BytesIO()
     evidence.write_moving_points(chunk.moving, file, chunk.lidar)
     yield MOVING_POINTS, file.getvalue()

@@ -33,6 +33,8 @@ from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
+from gnss_sem_map.voxels.attribute_table import WAITS, AttributeTable
+from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
 
 WINDOWS = 2
@@ -54,6 +56,10 @@ class MappedChunk:
     static: VoxelMap
     removed: VoxelMap
     """The points that moved; none of them is in `static`."""
+    attributes: Attributes
+    """Of the voxels of `static`."""
+    attributes_removed: Attributes
+    """Of the voxels of `removed`."""
     moving: Mapping[int, NDArray[np.int64]]
     """Frame number -> indices of the points that moved among the usable points of the scan."""
     objects: tuple[TrackedObject, ...]
@@ -186,6 +192,8 @@ class _Chunk:
     def __init__(self, drive: Drive, number: int, first: int, folder: Path) -> None:
         self._drive, self._number, self._first, self._folder = drive, number, first, folder
         self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
+        self._seen = AttributeTable()
+        """Of the points that stay."""
         self.observations: list[Observation] = []
         self.last_images: WaitingImages | None = None
         """Of its last window of scans, once it is decided."""
@@ -195,9 +203,11 @@ class _Chunk:
         """Write the points that may have moved; raises DataError."""
         with writing_to(self._folder):
             WaitingPoints.of(seen, near).write(self._waiting(seen.scan.number))
+        seen.levels[near.indices] = WAITS  # they are added when it is known whether they moved
 
     def add(self, seen: LabelledScan, observation: Observation | None) -> None:
         self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)
+        self._seen.add(seen.keys, seen.levels, seen.moments_us)
         if observation is not None:
             self._keyframes.add(observation.stamp, observation.seen)
             self.observations.append(observation)
@@ -220,9 +230,11 @@ class _Chunk:
             moved, stands = decision.moved[place], decision.stands[place]
             return points, moved_points(points.near, moved, stands, settings.dynamics.grow_m)
 
-        removed, moving = new_table(settings), {}
+        removed, seen_removed, moving = new_table(settings), AttributeTable(), {}
         for place, (points, moved) in prefetch(taken, range(len(numbers)), THREADS):
             removed.add(points.keys[moved], points.pixels[moved], points.classes, points.heights[moved])
+            for table, chosen in ((self._seen, ~moved), (seen_removed, moved)):
+                table.add(points.keys[chosen], points.levels[chosen], points.moments_us[chosen])
             moving[numbers[place]] = points.near.indices[moved].astype(np.int64)
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
@@ -230,7 +242,10 @@ class _Chunk:
         static = self._all.to_map() - gone
         number, lidar = self._first + self._number, self._drive.log.lidar
         objects = tuple(replace(one, lidar=lidar, chunk=number) for one in decision.objects)
-        return MappedChunk(number, lidar, static, gone, moving, objects, keyframes, self.stats)
+        return MappedChunk(
+            number, lidar, static, gone, self._seen.attributes(), seen_removed.attributes(), moving, objects,
+            keyframes, self.stats,
+        )  # fmt: skip
 
     def _last_window(self) -> frozenset[int]:
         window = self._drive.settings.dynamics.window_scans

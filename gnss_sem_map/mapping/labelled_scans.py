@@ -38,6 +38,7 @@ from gnss_sem_map.scans.projection import (
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
+from gnss_sem_map.voxels.attribute_table import seen_of
 from gnss_sem_map.voxels.voxel_map import keys_of
 
 READ_AHEAD = 4
@@ -137,6 +138,10 @@ class LabelledScan:
     """(m,) the voxel of each."""
     heights: NDArray[np.uint8]
     """(m,) how high each lies in its voxel, see `VoxelMap.heights`."""
+    levels: NDArray[np.int16]
+    """(m,) intensities, see `voxels.attribute_table`."""
+    moments_us: NDArray[np.int64]
+    """(m,) when each was measured, Unix time in us; of a scan that is motion-compensated, its stamp."""
     p_map: NDArray[np.float64]
     """(m, 3) m."""
     pixels: NDArray[np.int32]
@@ -197,7 +202,12 @@ def _see(
     stats.counts["points unlabelled"] += count - len(classes)
     if not keys[:count].all():
         keys_of(p_map, mapping.voxel_size_m)  # its error names the point
-    return LabelledScan(drive, scan, points, valid, keys[:count], heights[:count], p_map, pixels, classes)
+    levels, moments_us = seen_of(
+        points.intensity, stamps if len(stamps) else np.array([scan.stamp]), valid, log.epoch_ns // 1000
+    )
+    return LabelledScan(
+        drive, scan, points, valid, keys[:count], heights[:count], levels, moments_us, p_map, pixels, classes
+    )
 
 
 Labelled = tuple[Image, ClassImage]

@@ -20,10 +20,12 @@ from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
 from gnss_sem_map.mapping.raw_map import MAP, open_raw
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels import attributes, tiles
+from gnss_sem_map.voxels.attributes import ATTRIBUTES, Attributes, combined, open_attributes
 from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HEIGHT_UNITS, HITS_LIMIT
 from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.tiles import indices_by_tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap, keys_of, unpack
 
 PARKED = "vehicle"
@@ -52,13 +54,18 @@ class MergedRuns:
     """The map of the moving points."""
     keyframes: list[tuple[Path, NDArray[np.float64]]]
     """Files of keyframe scans of both runs, each with T_first_run (4, 4); none unless both runs have some."""
+    attributes: Attributes | None
+    """Of the voxels of both; None unless both are known."""
     frame: LocalFrame
     """Of the first run."""
     alignment: Alignment
 
     def write_raw(self, run: Path) -> None:
-        """Write `map/` and `evidence/` of a run folder; moving points, which belong to one drive, are left out."""
+        """Write `map/`, `attributes/` and `evidence/` of a run folder, without moving points: they are of one drive."""
         tiles.write(SemanticMap.of(self.static + self.moved), run / MAP, self.frame)
+        if self.attributes is not None:
+            known, of_tiles = self.attributes, indices_by_tile(self.attributes.keys)
+            attributes.write(((tile, known[rows]) for tile, rows in of_tiles), run / ATTRIBUTES)
         (run / evidence.FOLDER / evidence.KEYFRAMES).mkdir(parents=True)
         tiles.write(SemanticMap.of(self.moved), run / evidence.FOLDER / evidence.MOVED, self.frame)
         for number, (path, T_first_run) in enumerate(self.keyframes):
@@ -105,9 +112,25 @@ def merge_runs(
         merge(static[0], static[1], frames[0], frames[1], T),
         merge(moved[0], moved[1], frames[0], frames[1], T),
         keyframes if all(one.keyframes for one in known) else [],
+        _attributes(first, second, places[1], static[0].voxel_size_m),
         frames[0],
         alignment,
     )
+
+
+def _attributes(
+    first: Path, second: Path, T_first_second: NDArray[np.float64], voxel_size_m: float
+) -> Attributes | None:
+    """The attributes of both runs, in the frame of the first."""
+    parts = []
+    for run, T in ((first, np.eye(4)), (second, T_first_second)):
+        known = open_attributes(run)
+        if known is None:
+            return None
+        whole = known.whole()
+        p_first = _moved((unpack(whole.keys) + np.float64(0.5)) * voxel_size_m, T)
+        parts.append(replace(whole, keys=keys_of(p_first, voxel_size_m)))
+    return combined(parts)
 
 
 def _without(run: Path, label_set: LabelSet, moved: VoxelMap) -> VoxelMap:

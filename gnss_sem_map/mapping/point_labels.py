@@ -16,11 +16,10 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.labelled_scans import Drive, map_points
-from gnss_sem_map.mapping.sightings import Seen, Sightings
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.scans.prefetch import prefetch, threads
-from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import TiledMap
 from gnss_sem_map.voxels.voxel_map import keys_of
@@ -52,14 +51,12 @@ def label_points(
     settings: Settings,
     moving_points: Sequence[Path] = (),
     kerbs: Kerbs | None = None,
-    sightings: Sightings | None = None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
     """For every usable scan, the labels of its original points by each of the maps, of which the last is refined.
 
     Two rules apply to the refined map only: the points in the files `moving_points` (see `mapping.evidence`) are
     removed vehicles, whatever the class of their voxel; and the points in its `kerbs` are classified one by one as road
-    or sidewalk. Of the maps only the part around some scans is in memory. Points are added to the `sightings` of the
-    refined map, but for those that moved through static voxels. Raises DataError.
+    or sidewalk. Of the maps only the part around some scans is in memory. Raises DataError.
     """
     files = list(moving_points)
     moving: dict[int, NDArray[np.int64]] = {}
@@ -73,7 +70,7 @@ def label_points(
         parts = [tiled.inside(box) for tiled in maps]
         while files and not {scan.number for scan in scans} <= moving.keys():
             moving |= read_moving_points(files.pop(0))
-        yield from _label_some(drive, scans, parts, moving, kerbs, sightings)
+        yield from _label_some(drive, scans, parts, moving, kerbs)
         for scan in scans:
             moving.pop(scan.number, None)
 
@@ -97,11 +94,10 @@ def _label_some(
     maps: Sequence[SemanticMap],
     moving: Mapping[int, NDArray[np.int64]],
     kerbs: Kerbs | None,
-    sightings: Sightings | None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
     one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
 
-    def label(scan: Scan) -> tuple[list[PointLabels], Seen | None] | None:
+    def label(scan: Scan) -> list[PointLabels] | None:
         try:
             points = scan.read()
             p_map, valid = map_points(points, scan, drive)
@@ -126,35 +122,11 @@ def _label_some(
                     " is said to have moved; was the scan changed? make the run again"
                 )
             _remove(found[-1], usable[moved], maps[-1])
-        if sightings is None:
-            return found, None
-        counted = _of_their_voxels(found[-1].removed[valid], places[-1], maps[-1])
-        of_points = np.flatnonzero(valid)[counted]
-        moments_us = _moments_us(points, scan, drive.log)[of_points]
-        return found, Seen(keys[counted], points.intensity[of_points], moments_us)
+        return found
 
     for scan, done in prefetch(label, scans, threads=threads()):
-        if done is None:
-            continue
-        found, seen = done
-        if sightings is not None and seen is not None:
-            sightings.add(seen)
-        yield scan, found
-
-
-def _of_their_voxels(
-    removed: NDArray[np.bool_], places: NDArray[np.int64], semantic_map: SemanticMap
-) -> NDArray[np.bool_]:
-    """Mask (m,) of the points that are removed where their voxel is, and stay where it stays."""
-    counted = places >= 0
-    counted[counted] = removed[counted] == (semantic_map.states[places[counted]] == State.REMOVED)
-    return counted
-
-
-def _moments_us(points: Points, scan: Scan, log: SensorLog) -> NDArray[np.int64]:
-    """When each point (n,) was measured, Unix time in us; of a scan that is motion-compensated, its stamp."""
-    stamps = np.full(len(points.xyz), scan.stamp) if points.stamps is None else points.stamps
-    return np.rint(1e6 * np.nan_to_num(stamps)).astype(np.int64) + log.epoch_ns // 1000
+        if done is not None:
+            yield scan, done
 
 
 def _look_up(semantic_map: SemanticMap, places: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:

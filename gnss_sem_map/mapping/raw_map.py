@@ -19,7 +19,8 @@ from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, 
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.execution import Executor, InProcess
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels import attributes, tiles
+from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest, of_map, of_work, save
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -69,7 +70,7 @@ def open_raw(run: Path, label_set: LabelSet) -> RawMap:
 
 
 def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:
-    """Write `map/` and `evidence/` of a run folder from the chunks of a drive; raises DataError, OSError."""
+    """Write `map/`, `attributes/` and `evidence/` of a run folder of chunks of a drive; raises DataError, OSError."""
 
     def fused() -> Iterator[tuple[Tile, SemanticMap]]:
         for tile in store.tiles():
@@ -85,6 +86,7 @@ def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:
     (run / evidence.FOLDER).mkdir()
     moved_to = run / evidence.FOLDER / evidence.MOVED
     tiles.write_tiles(moved(), moved_to, frame, store.voxel_size_m, store.label_set)
+    attributes.write(((tile, store.attributes(tile)) for tile in store.tiles()), run / ATTRIBUTES)
     evidence.write(store.contents(MOVING_POINTS), store.contents(KEYFRAMES), run)
 
 

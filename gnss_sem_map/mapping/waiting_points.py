@@ -25,6 +25,10 @@ class WaitingPoints:
     """(h,) the voxel of each."""
     heights: NDArray[np.uint8]
     """(h,) how high each lies in its voxel."""
+    levels: NDArray[np.int16]
+    """(h,) intensity of each, see `voxels.attribute_table`."""
+    moments_us: NDArray[np.int64]
+    """(h,) when each was measured."""
     pixels: NDArray[np.int32]
     """(h,) row of `classes` for each point, -1 if the image does not show it."""
     classes: NDArray[np.uint8]
@@ -38,14 +42,21 @@ class WaitingPoints:
         shown = pixels >= 0
         rows = np.full(len(here), -1, np.int32)
         rows[shown] = np.arange(np.count_nonzero(shown))
-        return cls(near, seen.keys[here], seen.heights[here], rows, seen.classes[pixels[shown]])
+        return cls(
+            near, seen.keys[here], seen.heights[here], seen.levels[here], seen.moments_us[here],
+            rows, seen.classes[pixels[shown]],
+        )  # fmt: skip
+
+    @property
+    def _columns(self) -> tuple[NDArray[Any], ...]:
+        return self.keys, self.heights, self.levels, self.moments_us, self.pixels, self.classes
 
     def write(self, path: Path) -> None:
         """Write them into a file of their own; raises OSError."""
         near = self.near
         with path.open("wb") as file:
             arrays: list[NDArray[Any]] = [near.indices, near.p_near, near.is_body, near.voxel]
-            for array in [*arrays, self.keys, self.heights, self.pixels, self.classes]:
+            for array in [*arrays, *self._columns]:
                 np.save(file, array, allow_pickle=False)
 
     @classmethod
@@ -53,6 +64,6 @@ class WaitingPoints:
         """Read them and remove the file; raises OSError."""
         with path.open("rb") as file:
             near = NearPoints(*(np.load(file, allow_pickle=False) for _ in range(4)))
-            points = cls(near, *(np.load(file, allow_pickle=False) for _ in range(4)))
+            points = cls(near, *(np.load(file, allow_pickle=False) for _ in range(6)))
         path.unlink()
         return points

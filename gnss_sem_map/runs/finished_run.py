@@ -47,6 +47,7 @@ from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 
@@ -166,7 +167,7 @@ class Run:
         log = self.drive() if has_labels else None
         with self._rewritten(out) as folder:
             old_labels = shutil.ignore_patterns(*LABELS)
-            for name in (MAP, evidence.FOLDER, DRIVES, TRACKS):
+            for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / name):
                     shutil.copytree(
                         self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels

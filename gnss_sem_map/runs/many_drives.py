@@ -54,6 +54,7 @@ from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_label
 from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
+from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.map_json import read_frame
 
 Array = NDArray[np.float64]
@@ -322,7 +323,9 @@ def _summary(drive: Path) -> dict[str, Any]:
 def _link_all(drive: Path, part: Path) -> None:
     """Link what belongs to one drive, out of its own folder or out of a run of this drive alone."""
     part.mkdir(parents=True)
-    for name in (MAP, evidence.FOLDER):
+    for name in (MAP, ATTRIBUTES, evidence.FOLDER):
+        if not is_folder(drive / name):
+            continue  # older versions knew no attributes
         ignore = shutil.ignore_patterns(ownership.MARKER)
         shutil.copytree(drive / name, part / name, copy_function=link_or_copy, ignore=ignore)
     for file in (

@@ -1,7 +1,4 @@
-"""Point labels of a run: for every original LiDAR point what the maps say of it, a file for each scan.
-
-As all scans are read for that, the attributes of voxels that need all of them are found in the same pass.
-"""
+"""Point labels of a run: for every original LiDAR point what the maps say of it, a file for each scan."""
 
 from __future__ import annotations
 
@@ -9,24 +6,19 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
-from gnss_sem_map.files.untrusted import is_folder
-from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED
-from gnss_sem_map.mapping.sightings import Sightings
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.tiles import TiledMap
 
 RAW_LABELS = "labels_raw"
@@ -50,21 +42,15 @@ class LabelledDrive:
 def write_point_labels(
     run: Path, drives: Iterable[LabelledDrive], kerbs: Kerbs | None, settings: Settings
 ) -> None:
-    """Write for every original point of some drives of a run what its maps say of it, and attributes of its voxels.
+    """Write for every original point of some drives of a run what its maps say of it.
 
     Of points: class before and after refinement, confidence, LiDAR points of its voxel, and whether it was removed.
     `.label` files hold uint32, SemanticKITTI raw ids or, in removed/, 1 for moving vehicles; confidence/ holds float16,
-    looks/ uint8. Of several LiDARs, each has a folder of its name. Attributes are those of `voxels.attributes`; they
-    need all drives of the run, and are left out otherwise.
+    looks/ uint8. Of several LiDARs, each has a folder of its name.
     """
     refined = tiles.open_map(run / REFINED, open_label_set(settings.classes))
-    with TemporaryDirectory(prefix=".sightings-", dir=run) as waiting:
-        sightings, done = Sightings(Path(waiting)), set()
-        for drive in drives:
-            _label(drive, run, refined, kerbs, settings, sightings)
-            done.add(drive.folder)
-        if done == (set((run / DRIVES).iterdir()) if is_folder(run / DRIVES) else {run}):
-            sightings.write(refined, run / ATTRIBUTES)
+    for drive in drives:
+        _label(drive, run, refined, kerbs, settings)
 
 
 def _label(
@@ -73,7 +59,6 @@ def _label(
     refined: TiledMap,
     kerbs: Kerbs | None,
     settings: Settings,
-    sightings: Sightings,
 ) -> None:
     folder, label_set = drive.folder, refined.label_set
     for name in LABELS:
@@ -88,9 +73,7 @@ def _label(
     beside = evidence.read(folder, label_set)
     for one in drive.log.by_lidar:
         moving = beside.moving_points_of(one.lidar)
-        for scan, (*raw, after) in label_points(
-            one, drive.trajectory, maps, settings, moving, kerbs, sightings
-        ):
+        for scan, (*raw, after) in label_points(one, drive.trajectory, maps, settings, moving, kerbs):
             place = Path(one.lidar) / scan.name
             if raw:
                 ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{place}.label")

@@ -33,7 +33,6 @@ from gnss_sem_map.export.trajectories import (
 from gnss_sem_map.files.output_folder import Claim, claimed, new_folder
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
-from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping.moving_points import MOVABLE
 from gnss_sem_map.mapping.refining import REFINED, Refined
@@ -53,7 +52,7 @@ from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_label
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.attributes import ATTRIBUTES
+from gnss_sem_map.voxels.attributes import open_attributes
 
 RUN_FILES = re.compile(
     "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
@@ -184,8 +183,7 @@ def exported_of(
 ) -> Exported:
     """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
     refined = tiles.open_map(folder / REFINED, label_set)
-    attributes = folder / ATTRIBUTES if is_folder(folder / ATTRIBUTES) else None
-    return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, attributes)
+    return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder))
 
 
 def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeference | None:

@@ -1,12 +1,14 @@
-"""Attributes of voxels: the last moment and the intensity, in a Parquet file beside the map for each of its tiles.
+"""Attributes of voxels: last moment and median intensity, in a Parquet file beside the map for each of its tiles.
 
-Neither is a sum, so neither is in the tiles of a map, from which drives and moving objects are subtracted. A row of a
-file belongs to the voxel in the same row of the tile.
+Neither is a sum, so neither is in the tiles of a map, from which drives and moving objects are subtracted. Chunks of
+scans have such files as well, and are `combined`, as are the drives of a map.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,63 +16,168 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import read_bytes, shown
-from gnss_sem_map.voxels.map_json import name_of
-from gnss_sem_map.voxels.tile_files import PACKING, Tile, arrow_column, numbers_of
+from gnss_sem_map.files.untrusted import is_folder, read_bytes, shown
+from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.voxels.map_json import files_of, name_of, tile_of
+from gnss_sem_map.voxels.tile_files import PACKING, Tile, arrow_column, global_keys, local_keys, numbers_of
 
 ATTRIBUTES = "attributes"
-"""Folder in a run."""
+"""Folder beside a map."""
+COLUMNS = ("key", "points", "last_us", "intensity")
 
 
 @dataclass(frozen=True, eq=False)
 class Attributes:
-    """What the scans say of voxels beside their classes."""
+    """What points say of their voxels beside their classes."""
 
+    keys: NDArray[np.int64]
+    """(v,) of the voxels, sorted, unique."""
+    points: NDArray[np.int64]
+    """(v,) that tell it."""
     last_us: NDArray[np.int64]
-    """(v,) when the last point of a voxel was measured, Unix time in us; 0 where none is known."""
+    """(v,) when the last of them was measured, Unix time in us; 0 where none is known."""
     intensity: NDArray[np.uint8]
-    """(v,) the median of its points, 255 for an intensity of 1; of two in the middle the lower one."""
+    """(v,) their median, 255 for an intensity of 1; of two in the middle the lower one."""
+
+    def __len__(self) -> int:
+        return len(self.keys)
 
     def __getitem__(self, chosen: NDArray[np.int64]) -> Attributes:
-        return Attributes(self.last_us[chosen], self.intensity[chosen])
+        return Attributes(*(column[chosen] for column in self.columns))
+
+    @property
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        return self.keys, self.points, self.last_us, self.intensity
+
+    def of(self, keys: NDArray[np.int64]) -> Attributes:
+        """Those of voxels (n,); 0 where there are none."""
+        if len(keys) == len(self) and (keys == self.keys).all():
+            return self
+        places = np.searchsorted(self.keys, keys)
+        places[places == len(self)] = 0
+        known = self.keys[places] == keys if len(self) else np.zeros(len(keys), np.bool_)
+        found = [np.zeros(len(keys), column.dtype) for column in self.columns[1:]]
+        for column, values in zip(found, self.columns[1:], strict=True):
+            column[known] = values[places[known]]
+        return Attributes(keys, *found)
 
 
-def write_tile(attributes: Attributes, folder: Path, tile: Tile) -> None:
-    """Write the attributes of a tile; raises OSError."""
+NOTHING = Attributes(
+    np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.uint8)
+)
+
+
+def combined(parts: Sequence[Attributes]) -> Attributes:
+    """Those of all points of some parts, in any order: the last moment, and the median of the medians.
+
+    Each median counts as often as it has points.
+    """
+    keys, points, last_us, intensity = map(
+        np.concatenate, zip(NOTHING.columns, *(part.columns for part in parts), strict=True)
+    )
+    order = np.lexsort((intensity, keys))
+    keys, points, last_us, intensity = keys[order], points[order], last_us[order], intensity[order]
+    changes = np.ones(len(keys), np.bool_)
+    changes[1:] = keys[1:] != keys[:-1]
+    starts = np.flatnonzero(changes)
+    if not len(starts):
+        return NOTHING
+    until = np.cumsum(points)
+    before = until[starts] - points[starts]
+    of_voxel = np.diff(before, append=until[-1])
+    middles = np.searchsorted(until, before + (of_voxel + 1) // 2)
+    return Attributes(keys[starts], of_voxel, np.maximum.reduceat(last_us, starts), intensity[middles])
+
+
+def encode(attributes: Attributes) -> bytes:
+    """The file of a tile."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    columns: dict[str, NDArray[Any]] = {
-        "last_us": attributes.last_us,
-        "intensity": attributes.intensity.astype(np.int32),
-    }
-    table = pa.table({name: arrow_column(values) for name, values in columns.items()})
-    with (folder / name_of(tile)).open("wb") as file:
-        pq.write_table(
-            table, file, compression="zstd", compression_level=PACKING, use_dictionary=False,
-            write_statistics=False, store_schema=False, write_page_checksum=True,
-            column_encoding=dict.fromkeys(columns, "DELTA_BINARY_PACKED"),
-        )  # fmt: skip
+    _, points, last_us, intensity = attributes.columns
+    values = local_keys(attributes.keys), points, last_us, intensity.astype(np.int32)
+    table = pa.table({name: arrow_column(column) for name, column in zip(COLUMNS, values, strict=True)})
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
+        write_statistics=False, store_schema=False, write_page_checksum=True,
+        column_encoding=dict.fromkeys(COLUMNS, "DELTA_BINARY_PACKED"),
+    )  # fmt: skip
+    return bytes(sink.getvalue())
 
 
-def read_tile(folder: Path, tile: Tile, voxels: int) -> Attributes:
-    """The attributes of a tile with so many voxels; raises DataError."""
+def write(attributes: Iterable[tuple[Tile, Attributes]], folder: Path) -> None:
+    """Write those of the tiles of a map into a new folder; raises OSError."""
+    folder.mkdir()
+    for tile, of_tile in attributes:
+        (folder / name_of(tile)).write_bytes(encode(of_tile))
+
+
+def decode(content: bytes, tile: Tile) -> Attributes:
+    """What `encode` wrote; raises ValueError where it is damaged."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path = folder / name_of(tile)
-    content = read_bytes(path)
     try:
         table = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True).read()
-        if table.num_rows != voxels:
-            raise ValueError(f"found {table.num_rows} voxels, expected {voxels}")
-        last_us, intensity = numbers_of(table, "last_us"), numbers_of(table, "intensity")
-        if not ((intensity >= 0) & (intensity <= 255)).all():
-            raise ValueError("it has intensities beyond 0..255")
-    except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
+        local, points, last_us, intensity = (numbers_of(table, name) for name in COLUMNS)
+    except (pa.ArrowException, OSError, KeyError) as error:
+        raise ValueError(" ".join(str(error).split())[:200]) from None
+    keys = global_keys(tile, local)
+    if not (keys[1:] > keys[:-1]).all():
+        raise ValueError("its keys are not sorted and unique")
+    if not ((intensity >= 0) & (intensity <= 255) & (points > 0)).all():
+        raise ValueError("it has intensities beyond 0..255, or voxels without points")
+    return Attributes(keys, points.astype(np.int64), last_us.astype(np.int64), intensity.astype(np.uint8))
+
+
+@dataclass(frozen=True)
+class TiledAttributes:
+    """The attributes of a map on disk, tile by tile; `open_attributes` makes it."""
+
+    folders: tuple[Path, ...]
+    """Of its drives."""
+
+    def of(self, tile: Tile, keys: NDArray[np.int64]) -> Attributes:
+        """Those of voxels (n,) of a tile; raises DataError."""
+        return self.read_tile(tile).of(keys)
+
+    def read_tile(self, tile: Tile) -> Attributes:
+        """Those of all voxels of a tile; raises DataError."""
+        parts = [
+            _read(folder / name_of(tile), tile, voxels[name_of(tile)])
+            for folder, voxels in zip(self.folders, self._voxels, strict=True)
+            if name_of(tile) in voxels
+        ]
+        return parts[0] if len(parts) == 1 else combined(parts)
+
+    def whole(self) -> Attributes:
+        """Those of all voxels at once; raises DataError."""
+        return combined([self.read_tile(tile_of(name)) for name in sorted(set[str]().union(*self._voxels))])
+
+    @cached_property
+    def _voxels(self) -> list[dict[str, int]]:
+        """Name of every tile of the map of each drive -> how many voxels it has."""
+        files = [files_of(folder.parent / "map") for folder in self.folders]
+        return [{name: about["voxels"] for name, about in of_drive.items()} for of_drive in files]
+
+
+def open_attributes(run: Path) -> TiledAttributes | None:
+    """The attributes of a run folder; None where it has none, or one of its drives, as older versions wrote them."""
+    drives = sorted((run / DRIVES).iterdir()) if is_folder(run / DRIVES) else [run]
+    folders = tuple(drive / ATTRIBUTES for drive in drives)
+    return TiledAttributes(folders) if all(map(is_folder, folders)) else None
+
+
+def _read(path: Path, tile: Tile, voxels: int) -> Attributes:
+    content = read_bytes(path)
+    try:
+        found = decode(content, tile)
+        if len(found) != voxels:
+            raise ValueError(f"found {len(found)} voxels, expected {voxels}")
+        return found
+    except ValueError as error:
         raise DataError(
-            f"{shown(path)}: damaged attributes ({reason}); make the run again with --write-labels, or remove the"
-            f" folder {shown(folder)} to export without them"
+            f"{shown(path)}: damaged attributes ({error}); make the run again, or remove the folder"
+            f" {shown(path.parent)} to export without them"
         ) from None
-    return Attributes(last_us.astype(np.int64), intensity.astype(np.uint8))

@@ -21,7 +21,7 @@ from gnss_sem_map.files.untrusted import read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack, unpack
 
 TILE_BITS = 9
 Z_BITS = 14
@@ -126,7 +126,7 @@ def decode_voxels(content: bytes, tile: Tile, voxel_size_m: float, label_set: La
 
 def _columns_of(voxels: VoxelMap) -> dict[str, NDArray[Any]]:
     # Parquet's smallest integer is 32 bits; it packs small ones tightly
-    columns: dict[str, NDArray[Any]] = {"key": local_keys(voxels)}
+    columns: dict[str, NDArray[Any]] = {"key": local_keys(voxels.keys)}
     columns |= {f"log_{name}": voxels.evidence[:, i] for i, name in enumerate(voxels.label_set.names)}
     columns |= {"hits": voxels.hits}
     return columns if voxels.heights is None else columns | {HEIGHTS: voxels.heights}
@@ -174,16 +174,16 @@ def _voxels_of(
     return VoxelMap(
         voxel_size_m,
         label_set,
-        _global(tile, columns["key"]),
+        global_keys(tile, columns["key"]),
         np.stack([columns[f"log_{name}"] for name in label_set.names], axis=1, dtype=np.int32),
         columns["hits"].astype(np.uint32),
         None if heights is None else heights.astype(np.int64),
     )
 
 
-def local_keys(voxels: VoxelMap) -> NDArray[np.uint32]:
+def local_keys(keys: NDArray[np.int64]) -> NDArray[np.uint32]:
     """Keys of voxels inside their tile."""
-    x, y, height = voxels.indices.T.astype(np.int64)
+    x, y, height = unpack(keys).T.astype(np.int64)
     z = height + Z_OFFSET
     if len(z) and (z.min() < 0 or z.max() >= 1 << Z_BITS):
         raise DataError(
@@ -195,7 +195,7 @@ def local_keys(voxels: VoxelMap) -> NDArray[np.uint32]:
     return np.asarray(local, np.uint32)
 
 
-def _global(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
+def global_keys(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
     """Keys of a tile's voxels."""
     wide, mask = local.astype(np.int64), (1 << TILE_BITS) - 1
     first = pack(np.array([[tile[0] << TILE_BITS, tile[1] << TILE_BITS, -Z_OFFSET]]))

@@ -40,7 +40,7 @@ map is read once. Those of a large tile at work are among them, see `Recent.leav
 def write(semantic_map: SemanticMap, folder: Path, frame: LocalFrame | None) -> None:
     """Write a map into a new folder; raises DataError for voxels more than 2^13 above or below the origin."""
     voxels = semantic_map.voxels
-    pieces = ((tile, semantic_map[indices]) for tile, indices in _indices_by_tile(voxels.keys))
+    pieces = ((tile, semantic_map[indices]) for tile, indices in indices_by_tile(voxels.keys))
     write_tiles(pieces, folder, frame, voxels.voxel_size_m, voxels.label_set)
 
 
@@ -130,7 +130,7 @@ class TiledMap:
 def in_memory(semantic_map: SemanticMap, frame: LocalFrame | None = None) -> TiledMap:
     """The tiles of a map that is in memory."""
     voxels = semantic_map.voxels
-    indices = dict(_indices_by_tile(voxels.keys))
+    indices = dict(indices_by_tile(voxels.keys))
     return TiledMap(
         voxels.voxel_size_m, voxels.label_set, frame, tuple(indices),
         lambda tile: semantic_map[indices[tile]], lambda tile: voxels[indices[tile]],
@@ -218,11 +218,11 @@ def read(
 
 def by_tile(voxels: VoxelMap) -> Iterator[tuple[Tile, VoxelMap]]:
     """The voxels of each tile, tile by tile in order."""
-    for tile, indices in _indices_by_tile(voxels.keys):
+    for tile, indices in indices_by_tile(voxels.keys):
         yield tile, voxels[indices]
 
 
-def _indices_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
+def indices_by_tile(keys: NDArray[np.int64]) -> Iterator[tuple[Tile, NDArray[np.int64]]]:
     """For each tile the indices of its voxels in the sorted keys, in ascending order."""
     x = keys >> (2 * AXIS_BITS + TILE_BITS)
     y = (keys >> (AXIS_BITS + TILE_BITS)) & ((1 << (AXIS_BITS - TILE_BITS)) - 1)

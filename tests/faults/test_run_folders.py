@@ -85,7 +85,7 @@ DAMAGES = [_cut, _flip, _empty, _lost, _noise, _folder, _pipe, _list, _other_typ
 FILES = [
     "run.json", "config.yaml", "metrics.json", "trajectory.parquet", "map/map.json", "map/TILE", "refined/map.json",
     "refined/TILE", "labels/0000000003.label", "labels_raw/0000000003.label", "confidence/0000000003.bin",
-    "looks/0000000003.bin", "removed/0000000003.label",
+    "looks/0000000003.bin", "removed/0000000003.label", "attributes/TILE",
 ]  # fmt: skip
 
 

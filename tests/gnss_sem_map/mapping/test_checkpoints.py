@@ -232,6 +232,7 @@ from gnss_sem_map.mapping import checkpoints
 from gnss_sem_map.mapping.chunks import MappedChunk
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.attributes import NOTHING
 from gnss_sem_map.labels.label_set import open_label_set
 
 folder, written = Path(sys.argv[2]), random_map(count=200_000)
@@ -239,7 +240,9 @@ store = checkpoints.open_store(folder / "work", "x", 1, False, 0.2, open_label_s
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 for attempt in (
     lambda: tiles.write(written, folder / "map", FRAME),
-    lambda: store.write(MappedChunk(0, "", written.voxels, written.voxels - written.voxels, {}, (), None, RunStats())),
+    lambda: store.write(MappedChunk(
+        0, "", written.voxels, written.voxels - written.voxels, NOTHING, NOTHING, {}, (), None, RunStats()
+    )),
 ):
     try:
         attempt()

@@ -221,9 +221,23 @@ def find_segments(
         clusters[shown]
     ]  # the cluster has points outside of the image
     row = np.where(is_object | ~shown.take(voxel), voxel, np.int32(-1))
-    parts = PointSets.of(p_map, is_object, gaps_m, row, len(keys)).without_boxes()
+    parts = voxels.without_boxes()
+    _keep_labelled(p_map, is_object, voxel, shown, parts.points, parts.sums)
     all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
     return Segments(keys, parts, number, all_truncated), row
+
+
+@njit(cache=True, nogil=True)
+def _keep_labelled(p_map, is_object, voxel, shown, points, sums):
+    """Count and sum (v,), (v, 3) only the labelled points of the voxels that are `shown` (v,)."""
+    for v in np.flatnonzero(shown):
+        points[v], sums[v] = 0, 0.0
+    for i in range(len(voxel)):
+        v = voxel[i]
+        if shown[v] and is_object[i]:
+            points[v] += 1
+            for axis in range(3):
+                sums[v, axis] += p_map[i, axis]
 
 
 def _is_vehicle_sized(whole: PointSets, beams: NDArray[np.float64]) -> NDArray[np.bool_]:

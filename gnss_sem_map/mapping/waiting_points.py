@@ -14,6 +14,10 @@ from gnss_sem_map.mapping.labelled_scans import LabelledScan
 
 WAITING = ".waiting"
 """Ending of the folders of such files."""
+OF_POINTS: list[tuple[type[np.generic], int]] = [
+    (np.int32, 1), (np.float32, 3), (np.bool_, 1), (np.int32, 1), (np.int64, 1), (np.uint8, 1), (np.int32, 1),
+]  # fmt: skip
+"""Type and columns of what a file holds of each point: bare arrays, as sixteen headers took 0.9 ms per scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +47,23 @@ class WaitingPoints:
     def write(self, path: Path) -> None:
         """Write them into a file of their own; raises OSError."""
         near = self.near
+        arrays: list[NDArray[Any]] = [near.indices, near.p_near, near.is_body, near.voxel]
+        arrays += [self.keys, self.heights, self.pixels]
         with path.open("wb") as file:
-            arrays: list[NDArray[Any]] = [near.indices, near.p_near, near.is_body, near.voxel]
-            for array in [*arrays, self.keys, self.heights, self.pixels, self.classes]:
-                np.save(file, array, allow_pickle=False)
+            file.write(np.array([len(self.keys), *self.classes.shape], np.int64).tobytes())
+            for array, (dtype, _) in zip(arrays, OF_POINTS, strict=True):
+                file.write(np.ascontiguousarray(array, dtype).data)
+            file.write(np.ascontiguousarray(self.classes, np.uint8).data)
 
     @classmethod
     def take(cls, path: Path) -> WaitingPoints:
         """Read them and remove the file; raises OSError."""
         with path.open("rb") as file:
-            near = NearPoints(*(np.load(file, allow_pickle=False) for _ in range(4)))
-            points = cls(near, *(np.load(file, allow_pickle=False) for _ in range(4)))
+            count, *shape = np.fromfile(file, np.int64, 3)
+            arrays = [
+                np.fromfile(file, dtype, count * columns).reshape((count, columns) if columns > 1 else count)
+                for dtype, columns in OF_POINTS
+            ]
+            classes = np.fromfile(file, np.uint8, shape[0] * shape[1]).reshape(shape)
         path.unlink()
-        return points
+        return cls(NearPoints(*arrays[:4]), *arrays[4:], classes)

@@ -262,7 +262,7 @@ def _object_clusters(
     clusters[large] = cluster(keys[large], SPLIT_EPS_SHARE * eps_m) + np.int32(count)
     is_used = np.bincount(clusters) > 0
     of_used = (np.cumsum(is_used) - 1)[clusters]
-    boxes = voxels.merged(of_used, np.count_nonzero(is_used))
+    boxes = voxels.merged(of_used, int(is_used.sum()))
     owners = _enclosing_clusters(boxes.lowest, boxes.highest)
     return owners[of_used], int(owners.max(initial=-1)) + 1
 

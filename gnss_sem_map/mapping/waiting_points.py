@@ -66,4 +66,5 @@ class WaitingPoints:
             ]
             classes = np.fromfile(file, np.uint8, shape[0] * shape[1]).reshape(shape)
         path.unlink()
-        return cls(NearPoints(*arrays[:4]), *arrays[4:], classes)
+        keys, heights, pixels = arrays[4:]
+        return cls(NearPoints(*arrays[:4]), keys, heights, pixels, classes)

@@ -101,6 +101,27 @@ def _merge(
             all_highest[w, axis] = max(all_highest[w, axis], highest[i, axis])
 
 
+def boxes_of(
+    places: NDArray[np.float64], part: NDArray[np.integer], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest coordinates (p, k) m of sets of places (v, k); `part` as in `PointSets.of`."""
+    lowest = np.full((count, places.shape[1]), np.inf)
+    highest = -lowest
+    _bound(places, part, lowest, highest)
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def _bound(places, part, lowest, highest):
+    for i in range(len(part)):
+        p = part[i]
+        if p < 0:
+            continue
+        for axis in range(places.shape[1]):
+            lowest[p, axis] = min(lowest[p, axis], places[i, axis])
+            highest[p, axis] = max(highest[p, axis], places[i, axis])
+
+
 @dataclass(frozen=True, eq=False)
 class Segments:
     """The segments of one scan, stored by voxel."""
@@ -125,21 +146,17 @@ class Segments:
 
     def outlines(self) -> list[NDArray[np.float32]]:
         """For every segment, its voxels by the means of their points (v, 2) m."""
-        order = np.argsort(self.number, kind="stable")
+        inside = np.flatnonzero(self.number >= 0)
+        order = inside[np.argsort(self.number[inside], kind="stable")]
         means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
-        ends = np.cumsum(np.bincount(self.number + 1, minlength=len(self.truncated) + 1))
-        return np.split(means, ends[:-1])[1:]  # without what is in no segment
+        ends = np.cumsum(np.bincount(self.number[inside], minlength=len(self.truncated)))
+        return np.split(means, ends[:-1]) if len(ends) else []
 
     def levels(self) -> list[tuple[float, float]]:
         """For every segment the lowest and the highest of its voxels, by the means of their points, m."""
-        heights = self.parts.sums[:, 2] / self.parts.points
-        lowest = np.full(len(self.truncated) + 1, np.inf)
-        highest = -lowest
-        np.minimum.at(
-            lowest, self.number, heights
-        )  # what is in no segment counts for the last, which is none
-        np.maximum.at(highest, self.number, heights)
-        return list(zip(lowest[:-1].tolist(), highest[:-1].tolist(), strict=True))
+        heights = self.parts.sums[:, 2:] / self.parts.points[:, None]
+        lowest, highest = boxes_of(heights, self.number, len(self.truncated))
+        return list(zip(lowest[:, 0].tolist(), highest[:, 0].tolist(), strict=True))
 
     def sums_of(self, counts: NDArray[np.int32]) -> NDArray[np.float64]:
         """Sums over the points of every segment (k, s) of k counts per voxel (k, v)."""
@@ -204,9 +221,23 @@ def find_segments(
         clusters[shown]
     ]  # the cluster has points outside of the image
     row = np.where(is_object | ~shown.take(voxel), voxel, np.int32(-1))
-    parts = PointSets.of(p_map, is_object, gaps_m, row, len(keys)).without_boxes()
+    parts = voxels.without_boxes()
+    _keep_labelled(p_map, is_object, voxel, shown, parts.points, parts.sums)
     all_truncated = np.concatenate([np.zeros(fits.sum(), np.bool_), truncated])
     return Segments(keys, parts, number, all_truncated), row
+
+
+@njit(cache=True, nogil=True)
+def _keep_labelled(p_map, is_object, voxel, shown, points, sums):
+    """Count and sum (v,), (v, 3) only the labelled points of the voxels that are `shown` (v,)."""
+    for v in np.flatnonzero(shown):
+        points[v], sums[v] = 0, 0.0
+    for i in range(len(voxel)):
+        v = voxel[i]
+        if shown[v] and is_object[i]:
+            points[v] += 1
+            for axis in range(3):
+                sums[v, axis] += p_map[i, axis]
 
 
 def _is_vehicle_sized(whole: PointSets, beams: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -229,8 +260,9 @@ def _object_clusters(
     size = boxes.highest - boxes.lowest
     large = (np.hypot(size[:, 0], size[:, 1]) > LARGE_M)[clusters]
     clusters[large] = cluster(keys[large], SPLIT_EPS_SHARE * eps_m) + np.int32(count)
-    used, of_used = np.unique(clusters, return_inverse=True)
-    boxes = voxels.merged(of_used, len(used))
+    is_used = np.bincount(clusters) > 0
+    of_used = (np.cumsum(is_used) - 1)[clusters]
+    boxes = voxels.merged(of_used, int(is_used.sum()))
     owners = _enclosing_clusters(boxes.lowest, boxes.highest)
     return owners[of_used], int(owners.max(initial=-1)) + 1
 

@@ -242,10 +242,13 @@ def observe(
     seen = RangeImage.of(p_map, T_map_lidar, rows)
     cell_m = float(np.clip(CELL_M_PER_DEG * rows.gap_on_ground_deg, GROUND_CELL_M, LARGEST_CELL_M))
     heights, centre = height_over_ground(p_map, cell_m), T_map_lidar[:2, 3]
-    above = (heights > FOOT_HEIGHT_M) & within_radius(p_map, centre, settings.farthest_object_m)
-    is_body = heights > BODY_HEIGHT_M
-    candidates = np.flatnonzero(above & is_body & (is_object | ~is_known))
-    points = p_map.take(candidates, axis=0)
+    above = np.flatnonzero(
+        (heights > FOOT_HEIGHT_M) & within_radius(p_map, centre, settings.farthest_object_m)
+    )
+    p_above, is_body = p_map.take(above, axis=0), heights.take(above) > BODY_HEIGHT_M
+    is_object = is_object.take(above)
+    candidates = np.flatnonzero(is_body & (is_object | ~is_known.take(above)))
+    points = p_above.take(candidates, axis=0)
     gaps = range_images.gaps_at(points, seen.T_lidar_map, rows)
     segments, voxel_of_candidates = find_segments(
         points, is_object.take(candidates), *gaps, settings.segment_eps_m
@@ -254,12 +257,12 @@ def observe(
         points, segments.of_points(voxel_of_candidates), seen.T_lidar_map, rows.of_return, seen.image,
         len(segments.truncated), HIDING_M,
     )  # fmt: skip
-    voxel = np.full(len(p_map), -1, np.int32)
+    voxel = np.full(len(above), -1, np.int32)
     voxel[candidates] = voxel_of_candidates
-    keep = np.flatnonzero(above & in_cells_near(p_map, voxel >= 0, settings.grow_m))
+    keep = np.flatnonzero(in_cells_near(p_above, voxel >= 0, settings.grow_m))
     near = NearPoints(
-        indices=keep.astype(np.int32),
-        p_near=(p_map.take(keep, axis=0) - T_map_lidar[:3, 3]).astype(np.float32),
+        indices=above.take(keep).astype(np.int32),
+        p_near=(p_above.take(keep, axis=0) - T_map_lidar[:3, 3]).astype(np.float32),
         is_body=is_body.take(keep),
         voxel=voxel.take(keep),
     )

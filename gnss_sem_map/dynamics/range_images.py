@@ -28,7 +28,7 @@ SLENDER = 0.7
 LEAST_FILLED = 3
 """A 3 x 3 window with fewer returns is no evidence: sky, glass, or the edge of the view."""
 BLOCK = 1024
-CLUSTER = 256
+CLUSTER = 128
 """Positions in a row that are hidden together: they should be neighbours, see `visibility.spatial_order`."""
 
 

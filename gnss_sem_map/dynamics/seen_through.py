@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.dynamics.clusters import Segments, cluster
+from gnss_sem_map.dynamics.clusters import Segments, boxes_of, cluster
 
 LEAST_MISSES, MISSES_PER_HIT = 3, 1.0
 """A voxel is free if at least so many scans saw through it, and more than so many per scan that hit it."""
@@ -38,7 +38,8 @@ def free_groups(
     if not len(free):
         return groups
     group, points = cluster(segments.keys[free], eps_m), segments.parts.points[free]
-    size = _extents(segments.parts.sums[free] / points[:, None], group)
+    lowest, highest = boxes_of(segments.parts.sums[free] / points[:, None], group, group.max() + 1)
+    size = highest - lowest
     hit, missed = (np.bincount(group, points * counts[free]) for counts in (hits, misses))
     moved = (size[:, 2] > LEAST_HEIGHT_M) | (missed > CERTAIN_MISSES_PER_HIT * hit)
     longest = np.maximum(PERSON_M, np.minimum(LENGTH_PER_HEIGHT * size[:, 2], CYCLIST_M))
@@ -46,15 +47,6 @@ def free_groups(
     moved = moved[group] & ((segments.number[free] < 0) | is_person[group])
     groups[free[moved]] = group[moved]
     return groups
-
-
-def _extents(places: NDArray[np.float64], group: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Extents (g, 3) m of groups of places (v, 3) m."""
-    lowest = np.full((group.max() + 1, 3), np.inf)
-    highest = -lowest
-    np.minimum.at(lowest, group, places)
-    np.maximum.at(highest, group, places)
-    return np.asarray(highest - lowest)
 
 
 def with_free_groups(segments: Segments, groups: NDArray[np.int32]) -> Segments:

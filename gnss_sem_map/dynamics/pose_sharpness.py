@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,22 @@ LARGEST_MISS_SHARE = 0.03
 """With sharp poses, what stands is seen through in a smaller share of the scans."""
 
 
-def are_sharp(counts: Sequence[NDArray[np.int32]]) -> bool:
+def are_sharp(counts: Iterable[NDArray[np.int32]], scans: int) -> bool:
     """Whether poses blur what stands so little that what scans see through is free.
 
-    `counts` are hits and misses (2, v) of the voxels of each scan. The share of misses of nine voxels of ten that are
-    often hit is at most 0.014 with poses from LiDAR odometry (three simulated drives, KITTI 0005), 0.06 with the poses
-    of the unit of KITTI 0005, and 0.25 with GNSS and IMU alone. A drive in which nothing is often hit tells nothing:
-    its poses are not taken to be sharp.
+    `counts` are hits and misses (2, v) of the voxels of each of so many scans. The share of misses of nine voxels of
+    ten that are often hit is at most 0.014 with poses from LiDAR odometry (three simulated drives, KITTI 0005), 0.06
+    with the poses of the unit of KITTI 0005, and 0.25 with GNSS and IMU alone. A drive in which nothing is often hit
+    tells nothing: its poses are not taken to be sharp.
     """
-    hits, misses = np.concatenate(counts, axis=1)
-    stands = hits >= min(OFTEN_HIT, max(len(counts) // 2, 1))
-    if not stands.any():
+    often = min(OFTEN_HIT, max(scans // 2, 1))
+    share = np.concatenate([_miss_shares(*of_scan, often) for of_scan in counts])
+    if not len(share):
         return False
-    share = misses[stands] / (hits + misses)[stands]
-    return bool(np.quantile(share, STANDING_SHARE) < LARGEST_MISS_SHARE)
+    return bool(np.quantile(share, STANDING_SHARE, overwrite_input=True) < LARGEST_MISS_SHARE)
+
+
+def _miss_shares(hits: NDArray[np.int32], misses: NDArray[np.int32], often: int) -> NDArray[np.float64]:
+    """Shares of misses of the voxels (v,) that are often hit."""
+    stands = hits >= often
+    return np.asarray(misses[stands] / (hits + misses)[stands], np.float64)

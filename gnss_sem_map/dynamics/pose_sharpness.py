@@ -24,13 +24,14 @@ def are_sharp(counts: Iterable[NDArray[np.int32]], scans: int) -> bool:
     tells nothing: its poses are not taken to be sharp.
     """
     often = min(OFTEN_HIT, max(scans // 2, 1))
-    share = np.concatenate([_miss_shares(*of_scan, often) for of_scan in counts])
+    share = np.concatenate([_miss_shares(of_scan, often) for of_scan in counts])
     if not len(share):
         return False
     return bool(np.quantile(share, STANDING_SHARE, overwrite_input=True) < LARGEST_MISS_SHARE)
 
 
-def _miss_shares(hits: NDArray[np.int32], misses: NDArray[np.int32], often: int) -> NDArray[np.float64]:
-    """Shares of misses of the voxels (v,) that are often hit."""
+def _miss_shares(counts: NDArray[np.int32], often: int) -> NDArray[np.float64]:
+    """Shares of misses of the voxels of a scan (2, v) that are often hit."""
+    hits, misses = counts
     stands = hits >= often
     return np.asarray(misses[stands] / (hits + misses)[stands], np.float64)

@@ -146,11 +146,11 @@ class Segments:
 
     def outlines(self) -> list[NDArray[np.float32]]:
         """For every segment, its voxels by the means of their points (v, 2) m."""
-        inside = np.flatnonzero(self.number >= 0)
+        inside = np.flatnonzero(self.number >= 0)  # most voxels are in none
         order = inside[np.argsort(self.number[inside], kind="stable")]
         means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
         ends = np.cumsum(np.bincount(self.number[inside], minlength=len(self.truncated)))
-        return np.split(means, ends[:-1]) if len(ends) else []
+        return np.split(means, ends)[:-1]  # the last is empty
 
     def levels(self) -> list[tuple[float, float]]:
         """For every segment the lowest and the highest of its voxels, by the means of their points, m."""
@@ -281,7 +281,7 @@ def split_segments(
     not, the segment is clustered again with a smaller distance, and its clusters that were seen through become a new
     segment.
     """
-    points, number = segments.parts.points, segments.number.copy()
+    points, number = segments.parts.points, segments.number
     once_empty = misses > displaced_misses_per_hit * hits
     stood = (hits > 0) & (misses == 0)
     all_of, empty_of, stood_of = (
@@ -295,6 +295,7 @@ def split_segments(
         hit, missed = (np.bincount(clusters, points[part] * counts[part]) for counts in (hits, misses))
         moved = (missed > displaced_misses_per_hit * hit)[clusters]
         if min(points[part[moved]].sum(), points[part[~moved]].sum()) >= least[mixed]:
+            number = number.copy()
             number[part[moved]] = len(truncated)
             truncated = np.append(truncated, truncated[mixed])
     return replace(segments, number=number, truncated=truncated)

@@ -107,15 +107,22 @@ def decide(
     if not observations:
         return Decision([], [], (), False)
     places = _places(observations)
-    counts = _observations_by_others(observations, places, before, settings.farthest_m)
-    is_sharp = are_sharp(counts)
+    of_places = _observations_by_others(observations, places, before, settings.farthest_m)
+
+    def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
+        return (of_places[:, place] for place in places)
+
+    times = np.zeros(of_places.shape[1], np.intp)
+    for place in places:
+        times[place] += 1  # each voxel of a scan has a place of its own
+    is_sharp = are_sharp(of_places, times, len(observations))
     parted = [
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)
-        for seen, counted in zip(observations, counts, strict=True)
+        for seen, counted in zip(observations, counts(), strict=True)
     ]
     segments, free = [one[0] for one in parted], [one[1] for one in parted]
     hits, misses = np.concatenate(
-        [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts, strict=True)], axis=1
+        [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts(), strict=True)], axis=1
     )
     listed = _all_segments(observations, segments)
     objects = classify_motion(listed, hits, misses, settings, is_sharp)
@@ -125,12 +132,12 @@ def decide(
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
     moved_of = [one | by_itself for one, by_itself in zip(_of_voxels(gone, segments), free, strict=True)]
-    occupied = [is_occupied(*counted) for counted in counts]
+    occupied = [is_occupied(*counted) for counted in counts()]
     stood_of = [
-        2 * whole + ((of_scan.number < 0) & there)
+        np.int8(2) * whole + ((of_scan.number < 0) & there)
         for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
     ]
-    stays = standing(places, counts, moved_of, stood_of)
+    stays = standing(places, counts(), moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
     stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
     first_seen_here = tuple(
@@ -190,8 +197,8 @@ def _observations_by_others(
     places: Sequence[NDArray[np.int32]],
     before: Keyframes | None,
     farthest_m: float,
-) -> list[NDArray[np.int32]]:
-    """For each scan, hits and misses of every voxel of its segments by the other scans: (2, v)."""
+) -> NDArray[np.int32]:
+    """Hits and misses of every place (2, p) by the scans other than the one that found it."""
     count = 1 + max(int(place.max(initial=-1)) for place in places)
     points, centroids = np.zeros(count), np.zeros((count, 3))
     for seen, place in zip(observations, places, strict=True):  # side by side, all of a chunk take 60 MB
@@ -203,7 +210,7 @@ def _observations_by_others(
         counts += hits_and_misses(centroids, some, farthest_m)
     counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
-    return [counts[:, place] for place in places]
+    return counts
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ others, and what was never seen through and belongs to it stays.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ def is_occupied(hits: ArrayLike, misses: ArrayLike) -> NDArray[np.bool_]:
 
 def standing(
     places: Sequence[NDArray[np.int32]],
-    counts: Sequence[NDArray[np.int32]],
+    counts: Iterable[NDArray[np.int32]],
     moved: Sequence[NDArray[np.bool_]],
     stood: Sequence[NDArray[np.integer]],
 ) -> list[NDArray[np.bool_]]:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.semantic_map import Reason, State
 
 
 class CrumbSettings(StepSettings):
@@ -33,4 +33,4 @@ def apply(state: MapState, settings: CrumbSettings) -> MapState:
     gone, over = state.is_removed, over_ground(state)
     asked = over & ~gone & (state.voxels.hits <= settings.most_points)
     asked &= state.decided.states != State.SPLIT  # a kerb is ground
-    return state.without(more_goes_than_stands(state, asked, gone, over))
+    return state.without(more_goes_than_stands(state, asked, gone, over), Reason.CRUMB)

@@ -14,7 +14,7 @@ from gnss_sem_map.refinement.by_tile import refine, run_steps
 from gnss_sem_map.refinement.crumbs import CrumbSettings, apply
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.surroundings import points_around
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -116,6 +116,8 @@ def test_the_refined_map_holds_crumbs_as_removed_and_counts_them_as_such() -> No
     assert {step.name: step.changed for step in report.steps}["crumbs"] == len(CRUMBS)
     gone = refined.voxels.keys[refined.states == State.REMOVED]
     np.testing.assert_array_equal(gone, np.union1d(pack(CRUMBS), moved.keys))
+    for reason, keys in ((Reason.CRUMB, pack(CRUMBS)), (Reason.MOVED, moved.keys)):
+        np.testing.assert_array_equal(refined.voxels.keys[refined.told_reasons == reason], np.sort(keys))
     assert refined.removed_hits.sum() == moved.hits.sum() + 2 * len(CRUMBS)
     assert refined.voxels.hits.sum() == moved.hits.sum() + static.hits.sum()
 
@@ -129,4 +131,5 @@ def test_the_edge_of_a_tile_changes_nothing(cut_at: int) -> None:
     assert state.decided is not None
     gone = state.decided.voxels.keys[state.decided.states == State.REMOVED]
     np.testing.assert_array_equal(gone, np.union1d(pack(shifted(CRUMBS, shift)), moved.keys))
+    assert np.count_nonzero(state.decided.told_reasons == Reason.CRUMB) == len(CRUMBS)
     assert {step.name: step.changed for step in report.steps}["crumbs"] == len(CRUMBS)

@@ -111,7 +111,10 @@ def write_laz(exported: Exported, path: Path | str) -> None:
 
 
 def write_removed(exported: Exported, path: Path | str) -> None:
-    """Write the removed voxels, those of moving objects, as `write_laz` does; they are flagged `withheld` as well."""
+    """Write the removed voxels, those of moving objects, as `write_laz` does; they are flagged `withheld` as well.
+
+    `user_data` is the `Reason` of each.
+    """
     _write_points(exported, path, removed=True)
 
 
@@ -183,7 +186,7 @@ def las_points(
     points.number_of_returns[:] = 1
     unlabelled = np.where(states == State.UNOBSERVED, NEVER_CLASSIFIED, UNCLASSIFIED)
     points.classification = np.where(labels < 0, unlabelled, label_set.asprs_codes[labels])
-    points.withheld = states == State.REMOVED
+    points.withheld, points.user_data = states == State.REMOVED, piece.told_reasons
     points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
     points.confidence, points.hits, points.state = piece.confidence, piece.voxels.hits, states
     if attributes is not None:

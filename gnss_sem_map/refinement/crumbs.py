@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from gnss_sem_map.refinement.columns import passed_over_ground
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.semantic_map import Reason, State
 
 
 class CrumbSettings(StepSettings):
@@ -26,11 +27,12 @@ def reach_m(settings: CrumbSettings, voxel_size_m: float) -> float:
 
 
 def apply(state: MapState, settings: CrumbSettings) -> MapState:
-    """Remove voxels over the ground with few points, around which more moved than stands."""
+    """Remove voxels over the ground with few points: more moved than stands around them or in their column."""
     if state.beside.moved is None:
         raise NotApplicable("moving objects were not sought")
     assert state.decided is not None
     gone, over = state.is_removed, over_ground(state)
     asked = over & ~gone & (state.voxels.hits <= settings.most_points)
     asked &= state.decided.states != State.SPLIT  # a kerb is ground
-    return state.without(more_goes_than_stands(state, asked, gone, over))
+    crumbs = more_goes_than_stands(state, asked, gone, over) | passed_over_ground(state, asked, gone, over)
+    return state.without(crumbs, Reason.CRUMB)

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from gnss_sem_map.refinement.state import MapState, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State, entropy_of
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State, entropy_of
 from gnss_sem_map.voxels.voxel_map import softmax
 
 
@@ -46,4 +46,6 @@ def apply(state: MapState, settings: DecisionSettings) -> MapState:
     probabilities = doubted(softmax(scores / np.float32(temperature)), state.systematic_error)
     confidence = np.where(known, reduce(np.maximum, probabilities.T), np.float32(0))
     entropy = np.where(known, entropy_of(probabilities), np.log(scores.shape[1])).astype(np.float32)
-    return replace(state, decided=SemanticMap(voxels, labels, confidence, states, entropy))
+    reasons = np.where(state.removed, np.uint8(Reason.RULE), np.uint8(Reason.NONE))
+    decided = SemanticMap(voxels, labels, confidence, states, entropy, reasons=reasons)
+    return replace(state, decided=decided)

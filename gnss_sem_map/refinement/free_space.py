@@ -14,7 +14,7 @@ from pydantic import Field
 from gnss_sem_map.dynamics.visibility import Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.semantic_map import Reason, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 OVER_M = (0.4, 3.0)
@@ -50,7 +50,8 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
     removed = traversed(state.voxels, state.beside.keyframes, settings)
     removed &= state.decided.states != State.SPLIT  # a kerb is ground
     # rays graze the edges of roofs
-    return state.without(more_goes_than_stands(state, removed, removed, over_ground(state)))
+    free = more_goes_than_stands(state, removed, removed, over_ground(state))
+    return state.without(free, Reason.FREE_SPACE)
 
 
 def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSettings) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State, entropy_of
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State, entropy_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 
@@ -42,13 +42,15 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     vehicle = names.index("vehicle") if "vehicle" in names else UNLABELLED
     labels, confidence = np.full(len(voxels), vehicle, np.int8), np.zeros(len(voxels), np.float32)
     states = np.full(len(voxels), State.REMOVED, np.uint8)
+    reasons = np.full(len(voxels), Reason.MOVED, np.uint8)
     labels[kept], confidence[kept], states[kept] = static.labels, static.confidence, static.states
+    reasons[kept] = static.told_reasons
     confidence[added] = alone.probabilities[:, vehicle] if vehicle != UNLABELLED else 0.0
     entropy = None
     if static.entropy is not None:
         entropy = np.empty(len(voxels), np.float32)
         entropy[kept], entropy[added] = static.entropy, entropy_of(alone.probabilities)
-    refined = SemanticMap(voxels, labels, confidence, states, entropy)
+    refined = SemanticMap(voxels, labels, confidence, states, entropy, reasons=reasons)
     return refined if len(alone) == len(removed) else _with_hits(refined, static, removed)
 
 

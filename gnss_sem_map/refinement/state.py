@@ -17,7 +17,7 @@ from gnss_sem_map.refinement.figures import Figures
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, best_classes
 
 Scores = NDArray[np.float32]
@@ -140,11 +140,12 @@ class MapState:
         """Which voxels (v,) are part of something that moved."""
         return self.removed if self.decided is None else self.decided.states == State.REMOVED
 
-    def without(self, gone: NDArray[np.bool_]) -> MapState:
-        """The decided map with these voxels (v,) removed."""
+    def without(self, gone: NDArray[np.bool_], reason: Reason) -> MapState:
+        """The decided map with these voxels (v,) removed; of those that were, the reason stays."""
         assert self.decided is not None
         states = np.where(gone, np.uint8(State.REMOVED), self.decided.states)
-        return replace(self, decided=replace(self.decided, states=states))
+        reasons = np.where(gone & ~self.is_removed, np.uint8(reason), self.decided.told_reasons)
+        return replace(self, decided=replace(self.decided, states=states, reasons=reasons))
 
     @cached_property
     def observations(self) -> NDArray[np.float32]:

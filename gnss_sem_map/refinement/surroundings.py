@@ -18,13 +18,18 @@ OVER_M = 0.3
 INSIDE_M = 0.03
 """What is on the ground, in the next voxel over it, has its mean height so far over the bottom of its voxel: ground
 that touches two voxels does not."""
+STEP_M = 0.08
+"""Or it is so far over the mean height in the voxel under it: four standard deviations of a range. Ground that touches
+two voxels of 0.2 m would have to be steeper than 1 in 1.3."""
 
 
 def over_ground(state: MapState) -> NDArray[np.bool_]:
     """Which voxels (v,) are over the ground, and no part of it."""
     voxels = state.voxels
     inside = voxels.surface_heights - voxels.indices[:, 2] * voxels.voxel_size_m
-    on_ground = np.append(False, np.diff(voxels.keys) == 1)[: len(voxels)] & (inside > INSIDE_M)
+    has_under = np.append(False, np.diff(voxels.keys) == 1)[: len(voxels)]
+    step = np.diff(inside, prepend=0.0) + voxels.voxel_size_m
+    on_ground = has_under & ((inside > INSIDE_M) | (step > STEP_M))
     return np.asarray((state.heights > OVER_M) | on_ground)
 
 

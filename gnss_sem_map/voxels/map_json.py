@@ -11,7 +11,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.semantic_map import Reason, State
 from gnss_sem_map.voxels.tile_files import Tile
 
 MAP_JSON = "map.json"
@@ -50,6 +50,7 @@ def describe(
         "classes": list(label_set.names),
         "class_set": label_set.name,
         "states": {state.name.lower(): int(state) for state in State},
+        "reasons": {reason.name.lower(): int(reason) for reason in Reason},
         "origin": origin,
         "axes": "east, north, up at the origin, m" if frame else "x, y, z of the drive's own poses, m",
         "utm_epsg": None if frame is None else frame.utm_epsg,

@@ -30,6 +30,21 @@ class State(IntEnum):
     """Road meets sidewalk here: its points are classified one by one in `labels/`."""
 
 
+class Reason(IntEnum):
+    """Why a voxel was removed."""
+
+    NONE = 0
+    """It was not, or the map does not tell."""
+    MOVED = 1
+    """Its points are those of an object that moved."""
+    FREE_SPACE = 2
+    """Rays of other scans pass through it."""
+    CRUMB = 3
+    """It has few points, amid those of what moved."""
+    RULE = 4
+    """By the rule of the paper (eq. 12 and 13), where that is chosen."""
+
+
 @dataclass(frozen=True, eq=False)
 class SemanticMap:
     """A voxel map with the label, confidence and state of every voxel."""
@@ -45,6 +60,8 @@ class SemanticMap:
     """(v,) nat: entropy of the class distribution; None for a map that was read from disk."""
     hits_removed: NDArray[np.uint32] | None = None
     """(v,) hits of moving objects; None: the hits of the removed voxels, and no others."""
+    reasons: NDArray[np.uint8] | None = None
+    """(v,) of `Reason`: why voxels were removed; None for a map that was not refined."""
 
     def __post_init__(self) -> None:
         for name, values in (
@@ -53,6 +70,7 @@ class SemanticMap:
             ("states", self.states),
             ("entropy", self.entropy),
             ("hits_removed", self.hits_removed),
+            ("reasons", self.reasons),
         ):
             if values is not None and values.shape != (len(self.voxels),):
                 raise DataError(f"semantic map: found {values.shape} {name} for {len(self.voxels)} voxels")
@@ -81,12 +99,18 @@ class SemanticMap:
             self.states[chosen],
             None if self.entropy is None else self.entropy[chosen],
             None if self.hits_removed is None else self.hits_removed[chosen],
+            None if self.reasons is None else self.reasons[chosen],
         )
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:
         """(v,) mask of the labelled voxels without the removed ones."""
         return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
+
+    @property
+    def told_reasons(self) -> NDArray[np.uint8]:
+        """(v,) of `Reason`: NONE where the map does not tell."""
+        return np.zeros(len(self), np.uint8) if self.reasons is None else self.reasons
 
     @property
     def removed_hits(self) -> NDArray[np.uint32]:

@@ -3,7 +3,8 @@
 A tile holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512 y + 512): a local key (x 9 bits,
 y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, the sum of the points' heights over the bottom of the voxel
 where it is known, and the label, confidence and state of each voxel. A refined map counts all hits, and in
-`hits_removed` those of moving objects; log-likelihoods are of static objects only. Keys are sorted and delta-coded, so
+`hits_removed` those of moving objects; log-likelihoods are of static objects only. It says in `reason` why a voxel was
+removed. Keys are sorted and delta-coded, so
 a voxel takes about 14 bytes. Any Parquet reader opens it.
 """
 
@@ -20,7 +21,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.kernels import AXIS_BITS
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack, unpack
 
 TILE_BITS = 9
@@ -28,6 +29,8 @@ Z_BITS = 14
 Z_OFFSET = 1 << (Z_BITS - 1)
 HITS_REMOVED = "hits_removed"
 """Column of maps in which objects moved through static voxels."""
+REASON = "reason"
+"""Column of maps in which voxels were removed."""
 HEIGHTS = "heights"
 """Column of maps that know how high the surface in a voxel lies."""
 PACKING = 4
@@ -42,6 +45,8 @@ def encode(piece: SemanticMap) -> bytes:
     columns |= {"confidence": piece.confidence}
     if piece.hits_removed is not None:
         columns[HITS_REMOVED] = piece.hits_removed
+    if piece.reasons is not None and piece.reasons.any():
+        columns[REASON] = piece.reasons.astype(np.int32)
     return _as_parquet(columns)
 
 
@@ -58,14 +63,15 @@ def read(
     path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
 ) -> SemanticMap:
     """The tile that `encode` wrote, of so many `voxels` and with this `sha256`; raises DataError, with its name."""
-    columns = _read(path, about, label_set, ("label", "confidence", "state"), (HITS_REMOVED, HEIGHTS))
-    removed = columns.get(HITS_REMOVED)
+    columns = _read(path, about, label_set, ("label", "confidence", "state"), (HITS_REMOVED, HEIGHTS, REASON))
+    removed, reasons = columns.get(HITS_REMOVED), columns.get(REASON)
     return SemanticMap(
         voxels=_voxels_of(columns, tile, voxel_size_m, label_set),
         labels=columns["label"].astype(np.int8),
         confidence=columns["confidence"].astype(np.float32),
         states=columns["state"].astype(np.uint8),
         hits_removed=None if removed is None else removed.astype(np.uint32),
+        reasons=None if reasons is None else reasons.astype(np.uint8),
     )
 
 
@@ -107,6 +113,8 @@ def _check(columns: dict[str, NDArray[Any]], classes: int) -> None:
         raise ValueError("it has labels of no class")
     if "confidence" in columns and not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
         raise ValueError("it has confidences beyond 0..1")
+    if REASON in columns and not np.isin(columns[REASON], list(Reason)).all():
+        raise ValueError("it has reasons that are none")
 
 
 def encode_voxels(voxels: VoxelMap) -> bytes:

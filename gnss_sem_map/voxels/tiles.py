@@ -259,12 +259,14 @@ def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSe
         return np.concatenate([empty, *map(of, parts)])[order]
 
     are_told = any(part.hits_removed is not None for part in parts)
+    have_reasons = any(part.reasons is not None for part in parts)
     return SemanticMap(
         voxels=joined_voxels([part.voxels for part in parts], voxel_size_m, label_set),
         labels=column(lambda part: part.labels, np.empty(0, np.int8)),
         confidence=column(lambda part: part.confidence, np.empty(0, np.float32)),
         states=column(lambda part: part.states, np.empty(0, np.uint8)),
         hits_removed=column(lambda part: part.removed_hits, np.empty(0, np.uint32)) if are_told else None,
+        reasons=column(lambda part: part.told_reasons, np.empty(0, np.uint8)) if have_reasons else None,
     )
 
 

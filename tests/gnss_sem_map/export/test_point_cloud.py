@@ -1,6 +1,7 @@
 """PLY as plyfile reads it, LAZ as laspy reads it, coordinates as the textbook computes them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import copclib
@@ -89,6 +90,10 @@ def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
     karlsruhe: LocalFrame,
     tmp_path: Path,
 ) -> None:
+    gone = np.flatnonzero(street.states == State.REMOVED)
+    reasons = np.zeros(len(street), np.uint8)
+    reasons[gone] = 1 + np.arange(len(gone)) % 3
+    street = replace(street, reasons=reasons)
     write(Exported(in_memory(street, karlsruhe)), tmp_path / "map.laz")
     las = laspy.read(tmp_path / "map.laz")
     assert (str(las.header.version), las.header.point_format.id) == ("1.4", 7)
@@ -104,6 +109,7 @@ def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
     np.testing.assert_array_equal(las["confidence"], street.confidence[order])
     np.testing.assert_array_equal(las["hits"], street.voxels.hits[order])
     np.testing.assert_array_equal(las["state"], states)
+    np.testing.assert_array_equal(las.user_data, reasons[order])
     np.testing.assert_array_equal(np.asarray(las.withheld), states == State.REMOVED)
     np.testing.assert_array_equal(
         las.red[~unlabelled] >> 8, street.voxels.label_set.colours[labels[~unlabelled], 0]

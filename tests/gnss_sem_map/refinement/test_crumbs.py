@@ -11,10 +11,11 @@ from surfaces import with_heights
 
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.by_tile import refine, run_steps
+from gnss_sem_map.refinement.columns import points_between
 from gnss_sem_map.refinement.crumbs import CrumbSettings, apply
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.surroundings import points_around
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -71,12 +72,19 @@ def test_the_ground_under_a_mover_stays_however_seldom_it_is_seen() -> None:
     assert not removed(seldom, over).any()
 
 
-@pytest.mark.parametrize(("inside_m", "goes"), [(0.01, False), (0.1, True)])
-def test_ground_that_touches_two_voxels_stays_and_a_crumb_on_it_goes(inside_m: float, goes: bool) -> None:
-    """Ground under the mover, just at the edge of two voxels: few of its points are in the upper one."""
+@pytest.mark.parametrize(
+    ("ground_m", "inside_m", "goes"), [(0.19, 0.01, False), (0.19, 0.1, True), (0.1, 0.01, True)]
+)
+def test_ground_that_touches_two_voxels_stays_and_a_crumb_on_it_goes(
+    ground_m: float, inside_m: float, goes: bool
+) -> None:
+    """Ground under the mover, just at the edge of two voxels: few of its points are in the upper one.
+
+    What is there but far over the ground is none of it.
+    """
     upper = np.array([[15, 7, 1]])
     static, _ = street(upper)
-    z = static.centres[:, 2]
+    z = static.centres[:, 2] + ground_m - 0.1
     z[static.indices_of(pack(upper))] = 0.2 + inside_m
     over = voxel_map(MOVER - [0, 0, 1], np.full(len(MOVER), 50))
     removed_here = removed(with_heights(static, z), over)
@@ -88,6 +96,36 @@ def test_what_has_many_points_stays_and_so_does_what_is_far_from_the_mover() -> 
     assert not removed(static, moved, most_points=1).any()
     static, moved = street(np.array([[30, 8, 4]]))
     assert not removed(static, moved).any()
+
+
+def test_a_walker_before_a_wall_leaves_no_crumbs_and_the_wall_stays_where_it_is_seen_seldom() -> None:
+    """The wall has more points than moved around it, but not in the columns of the walker."""
+    walker, seldom = box((14, 17, 2), (17, 18, 9)), np.array([[13, 18, 12], [20, 18, 12]])
+    left = np.array([[15, 17, 4], [16, 17, 9]])
+    static, _ = street(left, seldom)
+    moved = voxel_map(walker, np.full(len(walker), 1))
+    np.testing.assert_array_equal(static.keys[removed(static, moved)], np.sort(pack(left)))
+
+
+def test_what_hangs_where_no_ground_is_seen_stays() -> None:
+    """A voxel of a wall that hides its own ground, however much passed there."""
+    part = np.array([[15, 30, 3]])
+    wall = box((10, 31, 0), (20, 32, 12))
+    solid = np.concatenate([ROAD, wall])
+    static = voxel_map(np.concatenate([solid, part]), np.r_[np.full(len(solid), MANY), 2])
+    moved = voxel_map(np.array([[15, 30, 4]]), np.array([9]))
+    assert not removed(static, moved).any()
+
+
+def test_points_between_two_heights_of_a_column_are_counted() -> None:
+    rng = np.random.default_rng(0)
+    indices = np.unique(rng.integers(-5, 5, (300, 3)), axis=0)
+    voxels = voxel_map(indices, rng.integers(1, 9, len(indices)))
+    off = voxels.indices[None] - voxels.indices[:, None]
+    inside = (off[..., :2] == 0).all(axis=2) & (off[..., 2] >= -3) & (off[..., 2] <= 1)
+    np.testing.assert_array_equal(
+        points_between(voxels.keys, voxels.keys, voxels.hits, -3, 1), inside @ voxels.hits
+    )
 
 
 def test_a_part_of_what_stands_beside_the_mover_stays() -> None:
@@ -116,6 +154,8 @@ def test_the_refined_map_holds_crumbs_as_removed_and_counts_them_as_such() -> No
     assert {step.name: step.changed for step in report.steps}["crumbs"] == len(CRUMBS)
     gone = refined.voxels.keys[refined.states == State.REMOVED]
     np.testing.assert_array_equal(gone, np.union1d(pack(CRUMBS), moved.keys))
+    for reason, keys in ((Reason.CRUMB, pack(CRUMBS)), (Reason.MOVED, moved.keys)):
+        np.testing.assert_array_equal(refined.voxels.keys[refined.told_reasons == reason], np.sort(keys))
     assert refined.removed_hits.sum() == moved.hits.sum() + 2 * len(CRUMBS)
     assert refined.voxels.hits.sum() == moved.hits.sum() + static.hits.sum()
 
@@ -129,4 +169,5 @@ def test_the_edge_of_a_tile_changes_nothing(cut_at: int) -> None:
     assert state.decided is not None
     gone = state.decided.voxels.keys[state.decided.states == State.REMOVED]
     np.testing.assert_array_equal(gone, np.union1d(pack(shifted(CRUMBS, shift)), moved.keys))
+    assert np.count_nonzero(state.decided.told_reasons == Reason.CRUMB) == len(CRUMBS)
     assert {step.name: step.changed for step in report.steps}["crumbs"] == len(CRUMBS)

@@ -15,7 +15,7 @@ from gnss_sem_map.refinement.by_tile import refine
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings, traversed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
-from gnss_sem_map.voxels.semantic_map import State
+from gnss_sem_map.voxels.semantic_map import Reason, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
 URBAN = open_label_set()
@@ -126,6 +126,7 @@ def test_the_refined_map_keeps_what_was_cleared_as_a_layer() -> None:
     witnesses = KeyframeScans.of([witness(x) for x in STREET])
     refined, report = refine(voxels, beside=Evidence(keyframes=witnesses))
     np.testing.assert_array_equal(refined.states == State.REMOVED, ghost)
+    np.testing.assert_array_equal(refined.told_reasons, np.where(ghost, Reason.FREE_SPACE, Reason.NONE))
     assert {step.name: step.changed for step in report.steps}["free_space"] == ghost.sum()
     for settings, asked in ((RefinementSettings(free_space={"enabled": False}), witnesses), (None, None)):
         refined, report = refine(voxels, settings, Evidence(keyframes=asked))

@@ -10,7 +10,7 @@ from gnss_sem_map.refinement.by_tile import refine
 from gnss_sem_map.refinement.removed_layer import with_removed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
-from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, pack
 
 OFF = {"enabled": False}
@@ -105,6 +105,7 @@ def test_the_papers_rule_removes_a_parked_car_that_stands_beside_the_road_and_ev
         voxels, RefinementSettings(vehicles={"method": "paper"}, geometric_prior=OFF, potts_mrf=OFF)
     )
     assert (paper.states[cars] == State.REMOVED).all()
+    assert (paper.told_reasons[cars] == Reason.RULE).all()
     assert (paper.labels[cars] == VEHICLE).all()
     assert not paper.shown[cars].any()
     assert {step.name: step.changes for step in report.steps}["vehicles"] == {

@@ -17,7 +17,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels import tile_files, tiles
 from gnss_sem_map.voxels.map_json import read_frame
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 URBAN, FRAME = open_label_set(), LocalFrame(49.0, 8.4, 110.0)
@@ -53,6 +53,23 @@ def test_hits_of_what_moved_come_back_from_every_tile(tmp_path: Path) -> None:
     low, high = written.voxels.centres.min(axis=0), written.voxels.centres.max(axis=0)
     inside = tiles.read(tmp_path / "map", URBAN, (low, (low + high) / 2))
     np.testing.assert_array_equal(inside.hits_removed, inside.voxels.hits // 2)
+
+
+def test_reasons_come_back_and_cost_little(tmp_path: Path) -> None:
+    written = random_map()
+    reasons = np.where(np.arange(len(written)) % 50 < 2, np.uint8(Reason.CRUMB), np.uint8(Reason.NONE))
+    told = replace(written, reasons=reasons)
+    tiles.write(told, tmp_path / "map", FRAME)
+    np.testing.assert_array_equal(tiles.read(tmp_path / "map", URBAN).reasons, reasons)
+    assert json.loads((tmp_path / "map/map.json").read_text())["reasons"]["crumb"] == Reason.CRUMB
+    assert len(tile_files.encode(told)) - len(tile_files.encode(written)) < 0.2 * len(written)
+
+
+def test_a_reason_that_is_none_is_damage(tmp_path: Path) -> None:
+    written = random_map()
+    tiles.write(replace(written, reasons=np.full(len(written), 9, np.uint8)), tmp_path / "map", FRAME)
+    with pytest.raises(DataError, match="reasons"):
+        tiles.read(tmp_path / "map", URBAN)
 
 
 def test_the_same_map_gives_the_same_bytes(tmp_path: Path) -> None:

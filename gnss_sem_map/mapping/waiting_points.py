@@ -71,5 +71,7 @@ class WaitingPoints:
         with path.open("rb") as file:
             rows, classes = (np.load(file, allow_pickle=False) for _ in range(2))
         path.unlink()
-        columns = [np.ascontiguousarray(rows[name]) for name in ROW.names or ()]
-        return cls(NearPoints(*columns[:4]), *columns[4:], classes)
+        *near, keys, heights, levels, moments_us, pixels = (
+            np.ascontiguousarray(rows[name]) for name in ROW.names or ()
+        )
+        return cls(NearPoints(*near), keys, heights, levels, moments_us, pixels, classes)

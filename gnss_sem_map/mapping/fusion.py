@@ -27,6 +27,7 @@ from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
+from gnss_sem_map.voxels.reuse import VERSION
 
 Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
 """Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
@@ -127,11 +128,11 @@ def _first_reason(stats: RunStats, what: str) -> str:
 
 
 def fingerprint(drive: Drive, labels_from: str) -> str:
-    """Digest of everything that decides the map: a run may resume another one with the same fingerprint."""
+    """Digest of everything that decides the map, this version too: a run may resume another one with the same."""
     log, settings = drive.log, drive.settings
     names = () if drive.segmenter is None else drive.segmenter.class_names
     said = [
-        log.name, labels_from, list(names), settings.classes,
+        VERSION, log.name, labels_from, list(names), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
         [(one.lidar, scan.name, scan.number, scan.stamp, state_of(scan)) for one in log.by_lidar for scan in one.scans],

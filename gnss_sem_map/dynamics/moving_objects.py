@@ -112,10 +112,7 @@ def decide(
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
 
-    times = np.zeros(of_places.shape[1], np.intp)
-    for place in places:
-        times[place] += 1  # each voxel of a scan has a place of its own
-    is_sharp = are_sharp(of_places, times, len(observations))
+    is_sharp = are_sharp(of_places, places)
     parted = [
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)
         for seen, counted in zip(observations, counts(), strict=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,17 +15,20 @@ LARGEST_MISS_SHARE = 0.03
 """With sharp poses, what stands is seen through in a smaller share of the scans."""
 
 
-def are_sharp(counts: NDArray[np.int32], times: NDArray[np.intp], scans: int) -> bool:
+def are_sharp(counts: NDArray[np.int32], places: Sequence[NDArray[np.int32]]) -> bool:
     """Whether poses blur what stands so little that what scans see through is free.
 
-    `counts` are hits and misses (2, v) of voxels, `times` (v,) how many of the `scans` have each of them. The share of
-    misses of nine voxels of ten that are often hit is at most 0.014 with poses from LiDAR odometry (three simulated
-    drives, KITTI 0005), 0.06 with the poses of the unit of KITTI 0005, and 0.25 with GNSS and IMU alone. A drive in
-    which nothing is often hit tells nothing: its poses are not taken to be sharp.
+    `counts` are hits and misses (2, v) of voxels, `places` the rows of those that each scan has, all different. The
+    share of misses of nine voxels of ten that are often hit is at most 0.014 with poses from LiDAR odometry (three
+    simulated drives, KITTI 0005), 0.06 with the poses of the unit of KITTI 0005, and 0.25 with GNSS and IMU alone. A
+    drive in which nothing is often hit tells nothing: its poses are not taken to be sharp.
     """
     hits, misses = counts
-    stands = hits >= min(OFTEN_HIT, max(scans // 2, 1))
-    share = np.repeat(misses[stands] / (hits + misses)[stands], times[stands])
+    scans = np.zeros(len(hits), np.intp)
+    for place in places:
+        scans[place] += 1
+    stands = hits >= min(OFTEN_HIT, max(len(places) // 2, 1))
+    share = np.repeat(misses[stands] / (hits + misses)[stands], scans[stands])
     if not len(share):
         return False
     return bool(np.quantile(share, STANDING_SHARE, overwrite_input=True) < LARGEST_MISS_SHARE)

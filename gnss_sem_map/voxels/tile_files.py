@@ -4,8 +4,7 @@ A tile holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512
 y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, the sum of the points' heights over the bottom of the voxel
 where it is known, and the label, confidence and state of each voxel. A refined map counts all hits, and in
 `hits_removed` those of moving objects; log-likelihoods are of static objects only. It says in `reason` why a voxel was
-removed. Keys are sorted and delta-coded, so
-a voxel takes about 14 bytes. Any Parquet reader opens it.
+removed. Keys are sorted and delta-coded, so a voxel takes about 14 bytes. Any Parquet reader opens it.
 """
 
 from __future__ import annotations

@@ -22,8 +22,9 @@ CERTAIN_MISSES_PER_HIT = 5.0
 """or if all together have more misses per hit than this: what is far away returns one ring or two. Of two simulated
 drives, 2 in 100,000 standing points are free by that, and 93 of 100 of people."""
 PERSON_M, CYCLIST_M, LENGTH_PER_HEIGHT = 1.2, 2.3, 1.5
-"""In an object, only a person or a cyclist is told from the rest, by length and height: through the windows of a car,
-some views show what is behind it."""
+"""In an object, only a person or a cyclist is told from the rest, by length and height,"""
+PERSON_MISSES_PER_HIT = 2.0
+"""and only with more misses per hit than this: through the windows of a car, some views show what is behind it."""
 
 
 def free_groups(
@@ -43,7 +44,7 @@ def free_groups(
     hit, missed = (np.bincount(group, points * counts[free]) for counts in (hits, misses))
     moved = (size[:, 2] > LEAST_HEIGHT_M) | (missed > CERTAIN_MISSES_PER_HIT * hit)
     longest = np.maximum(PERSON_M, np.minimum(LENGTH_PER_HEIGHT * size[:, 2], CYCLIST_M))
-    is_person = np.hypot(size[:, 0], size[:, 1]) < longest
+    is_person = (np.hypot(size[:, 0], size[:, 1]) < longest) & (missed > PERSON_MISSES_PER_HIT * hit)
     moved = moved[group] & ((segments.number[free] < 0) | is_person[group])
     groups[free[moved]] = group[moved]
     return groups

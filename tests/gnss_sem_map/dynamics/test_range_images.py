@@ -7,7 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.image_rows import CELL_DEG, LOWEST_DEG
-from gnss_sem_map.dynamics.visibility import CUBE_M, spatial_order
+from gnss_sem_map.dynamics.visibility import (
+    CUBE_M,
+    SHARP_MARGIN,
+    WIDE_MARGIN,
+    KeyframeScans,
+    hits_and_misses,
+    spatial_order,
+)
 
 WALL_M = 20.0
 
@@ -53,6 +60,16 @@ def test_before_the_wall_is_empty_in_the_wall_is_hit_and_behind_it_nothing_is_kn
     direction = np.array([np.cos(a), np.sin(a), -0.05])
     places = np.outer([10.0, 20.0, 30.0, 2.0], direction / np.linalg.norm(direction))
     np.testing.assert_array_equal(seen_at(wall_image(), places), [-1, 1, 0, 0])
+
+
+@pytest.mark.parametrize("margin", [SHARP_MARGIN, WIDE_MARGIN])
+def test_a_place_is_hit_up_to_the_margin_before_a_wall_and_free_before_that(margin):
+    before = np.array([0.0, -0.05, 0.05, 0.35, 0.55])
+    places = np.column_stack([WALL_M - before, np.zeros((len(before), 2))])
+    wall = KeyframeScans(wall_image()[None], np.eye(4)[None], DENSE)
+    hits, misses = hits_and_misses(places, wall, 40.0, margin)
+    np.testing.assert_array_equal(hits, before <= margin.m + margin.ratio * WALL_M)
+    np.testing.assert_array_equal(misses, 1 - hits)
 
 
 @pytest.mark.parametrize("hole", [None, 0.0, 90.0, 180.0])

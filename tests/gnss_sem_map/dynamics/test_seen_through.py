@@ -1,6 +1,7 @@
 """What other scans see through goes, if it is as high as an object; single returns from glass and edges stay."""
 
 import numpy as np
+import pytest
 
 from gnss_sem_map.dynamics.clusters import find_segments
 from gnss_sem_map.dynamics.seen_through import LEAST_MISSES, free_groups, with_free_groups
@@ -76,3 +77,14 @@ def test_of_a_car_a_person_beside_it_is_told_apart_and_a_window_is_not():
         is_other = np.arange(n) >= len(car)
         groups = free_groups(segments, *counts(voxel, is_other, 10, 30), EPS_M)
         np.testing.assert_array_equal(groups[voxel] >= 0, is_other & goes)
+
+
+@pytest.mark.parametrize(("misses", "goes"), [(15, False), (30, True)])
+def test_in_an_object_only_what_is_seldom_hit_goes_however_small(misses, goes):
+    """A window is as small as a person; some views show the car, others what is behind the window."""
+    car, part = block(0.0, 5.0, 4.5, 0.3, 1.5), block(2.0, 4.8, 0.5, 0.7, 1.4)
+    p_map, n = np.concatenate([car, part]), len(car) + len(part)
+    segments, voxel = find_segments(p_map, np.zeros(n, bool), np.zeros(n), np.ones(n), EPS_M)
+    is_part = np.arange(n) >= len(car)
+    groups = free_groups(segments, *counts(voxel, is_part, 10, misses), EPS_M)
+    np.testing.assert_array_equal(groups[voxel] >= 0, is_part & goes)

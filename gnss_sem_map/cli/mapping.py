@@ -29,6 +29,7 @@ from gnss_sem_map.cli.options import (
     open_log,
     settings_of,
 )
+from gnss_sem_map.memory import leave_pandas_out
 
 if TYPE_CHECKING:
     from factor_graphs.geodesy import LocalFrame
@@ -103,6 +104,7 @@ def run(
     from gnss_sem_map.runs.source import source_of
     from gnss_sem_map.segmentation import no_segmenter_message
 
+    leave_pandas_out()
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
@@ -180,6 +182,7 @@ def add(
     from gnss_sem_map.runs.many_drives import HowMapped, add_drive
     from gnss_sem_map.segmentation import no_segmenter_message
 
+    leave_pandas_out()
     Run.open(out)
     if segmenter is None:
         typer.echo(no_segmenter_message(str(drive)), err=True)

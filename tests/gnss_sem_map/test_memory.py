@@ -32,3 +32,21 @@ def test_all_threads_use_one_heap(chosen: dict[str, str], expected: list[str]) -
     environment = {name: value for name, value in os.environ.items() if name not in ours}
     said = subprocess.check_output([sys.executable, "-c", PROGRAM], text=True, env=environment | chosen)
     assert said.split() == expected
+
+
+ARROW = """
+import sys
+from gnss_sem_map.memory import leave_pandas_out
+leave_pandas_out()
+import pyarrow
+table = pyarrow.Table.from_pylist([{"number": 1}])
+print("pandas" in sys.modules)
+pandas = sys.modules.get("pandas") or __import__("pandas")
+print(table.to_pandas().number.sum() + pyarrow.array(pandas.Series([2]))[0].as_py())
+"""
+
+
+@pytest.mark.integration
+def test_arrow_does_not_import_pandas_but_works_with_it() -> None:
+    pytest.importorskip("pandas")
+    assert subprocess.check_output([sys.executable, "-c", ARROW], text=True).split() == ["False", "3"]

@@ -1,5 +1,9 @@
 """Errors of the map: what is wrong, where, what was found and expected, and what to do, in one line."""
 
+import shutil
+import sys
+from pathlib import Path
+
 
 class SemMapError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -31,3 +35,13 @@ class PointTimesError(DataError):
     def __init__(self, message: str, mistake: str) -> None:
         super().__init__(message)
         self.mistake = mistake
+
+
+def how_to_install(extra: str) -> str:
+    """What to type in a clone for an extra: it reaches the environment that runs, whether or not it is active."""
+    return f"in the clone: {sys.executable} -m pip install -c constraints.txt -e '.[{extra}]'"
+
+
+def program(name: str) -> str:
+    """How a program of this environment is called: by its name where the shell finds it, else by its path."""
+    return name if shutil.which(name) else str(Path(sys.executable).with_name(name))

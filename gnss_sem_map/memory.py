@@ -15,8 +15,9 @@ free at its end."""
 LARGE_BYTES, FREE_BYTES = 8 << 20, 64 << 20
 """Arrays of the first size, those of a whole tile or chunk, go back to the system when they are freed, and leave no
 holes: 20 MB less at the peak, at no cost in time. By default glibc raises that size to 32 MB."""
-NEAR_PEAK_BYTES = 16 << 20
-"""Memory is released from so much below the peak on."""
+NEAR_PEAK_BYTES = 64 << 20
+"""Memory is released from so much below the peak on: as much as is taken until it is asked for again. With less, holes
+are returned too late, and the peak rises a little from chunk to chunk though no more memory is in use."""
 NEW_OBJECTS = 20_000
 """So many more objects than before let Python look for reference cycles; its own default is 700."""
 
@@ -39,6 +40,15 @@ def share_one_heap() -> None:
         os.environ[name] = f"{value}"
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).mallopt(option, value)
+
+
+def use_huge_pages() -> None:
+    """Let torch take its arrays in pages of 2 MB; call it before torch is imported.
+
+    Every layer of a network writes new arrays of several MB, and the system hands out each page of 4 kB by itself. The
+    demo's network takes a fifth less time per image on a CPU, with the same result.
+    """
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 
 def collect_seldom() -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gnss_sem_map.errors import how_to_install
+
 
 def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
@@ -91,7 +93,7 @@ def demo_without_torch(*words: str | Path) -> subprocess.CompletedProcess[str]:
 def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path) -> None:
     done = demo_without_torch("-o", tmp_path / "demo", "--labels", "network")
     assert done.returncode == 1
-    assert "torch is not installed; in the clone: pip install -e '.[segmentation]'" in done.stderr
+    assert f"torch is not installed; {how_to_install('segmentation')}" in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,7 +1,11 @@
-"""The set-up of the Makefile: uv finds packages where pip is told to look."""
+"""The set-up of the Makefile: uv finds packages where pip is told to look, and wheels for each platform we name."""
 
+import os
 import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 OF_PIP = """:env:.find-links='/opt/wheels'
@@ -12,11 +16,16 @@ global.timeout='60'
 """
 
 
-def test_the_settings_of_pip_are_handed_to_uv() -> None:
+def settings_of_uv() -> str:
+    """The script of sed that makes them of those of pip."""
     shown = "show:\n\t@printf '%s' '$(SETTINGS)'"
-    script = subprocess.run(
+    return subprocess.run(
         ["make", "--silent", "--eval", shown, "show"], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout
+
+
+def test_the_settings_of_pip_are_handed_to_uv() -> None:
+    script = settings_of_uv()
     told = subprocess.run(
         ["sed", "-n", script], input=OF_PIP, check=True, capture_output=True, text=True
     ).stdout
@@ -26,3 +35,27 @@ def test_the_settings_of_pip_are_handed_to_uv() -> None:
         "export UV_INDEX='file:///first/simple file:///second/simple'",
         "export UV_DEFAULT_INDEX='https://index.example/simple'",
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("platform", "macos"),
+    [("x86_64-manylinux_2_28", ""), ("aarch64-manylinux_2_28", ""), ("aarch64-apple-darwin", "14.0")],
+)
+def test_every_dependency_has_a_wheel_for_the_platforms_of_the_readme(platform: str, macos: str) -> None:
+    uv = Path(sys.executable).with_name("uv")
+    if not uv.exists():
+        pytest.skip("needs uv, which make installs where it can")
+    extras = " ".join(f"--extra {name}" for name in ("segmentation", "hf", "onnx", "ros", "copc", "cluster"))
+    words = (
+        f"{uv} pip compile --quiet -c constraints.txt pyproject.toml {extras}"
+        f" --python-platform {platform} --only-binary :all: --python-version 3.11 --no-header -o /dev/null"
+    )
+    script = f"eval \"$({sys.executable} -m pip config list | sed -n '{settings_of_uv()}')\"; {words}"
+    environment = os.environ | {"UV_INDEX_STRATEGY": "unsafe-best-match"}
+    if macos:
+        environment["MACOSX_DEPLOYMENT_TARGET"] = macos
+    done = subprocess.run(
+        ["sh", "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

@@ -22,7 +22,7 @@ from gnss_sem_map.cli import (
     simulation,
 )
 from gnss_sem_map.cli.signals import Stopped, ignore_signals
-from gnss_sem_map.memory import collect_seldom, share_one_heap
+from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
     mapping.run,
@@ -99,6 +99,7 @@ def main() -> None:
     from gnss_sem_map.errors import SemMapError
 
     share_one_heap()
+    use_huge_pages()
     collect_seldom()
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # of other packages; ours are printed by the commands

@@ -97,12 +97,15 @@ def run(
     ] = False,
 ) -> None:
     """Make trajectory, semantic map, refined map and all exports of one drive, or one map of several."""
-    from gnss_sem_map.runs import finished_run
-    from gnss_sem_map.runs.many_drives import HowMapped
-    from gnss_sem_map.runs.run_folder import claimed_run, places_read
-    from gnss_sem_map.runs.source import source_of
-    from gnss_sem_map.segmentation import no_segmenter_message
+    with progress_bars() as progress:
+        progress("loading", 0, 1)  # of large packages, which takes a second
+        from gnss_sem_map.runs import finished_run
+        from gnss_sem_map.runs.many_drives import HowMapped
+        from gnss_sem_map.runs.run_folder import claimed_run, places_read
+        from gnss_sem_map.runs.source import source_of
+        from gnss_sem_map.segmentation import no_segmenter_message
 
+        progress("loading", 1, 1)
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")

@@ -8,6 +8,7 @@ once, and a node is written as soon as no tile is left that could add to it. Sou
 from __future__ import annotations
 
 import errno
+import io
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, how_to_install
 from gnss_sem_map.export.exported import NO_VOXELS, Exported
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.point_cloud import LAZ_SCALE_M, las_header, las_points
@@ -30,9 +31,15 @@ from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET, Tile
 if TYPE_CHECKING:
     import copclib
     import laspy
+    import lazrs
 
-NODE_CELLS = 128
-"""A node is as wide as so many cells of its level."""
+NODE_CELLS = 256
+"""A node is as wide as so many cells of its level; with half as many there are three times the nodes, and packing each
+anew takes 40 % more time."""
+OFFSET_BYTES = 8
+"""Before the first chunk of a LAZ: where its table of chunks is, which COPC has none of."""
+PLACE_BYTES = 12
+"""Of a point: its X, Y and Z."""
 Node = tuple[int, int, int, int]
 """Level, and place along each axis."""
 
@@ -45,21 +52,54 @@ def write_copc(exported: Exported, path: Path | str) -> None:
     """
     try:
         import copclib
+        import lazrs
     except ImportError:
-        raise ConfigError(
-            "COPC needs copclib; in a clone: pip install -c constraints.txt '.[copc]'"
-        ) from None
+        raise ConfigError(f"COPC needs copclib; {how_to_install('copc')}") from None
     georeference = exported.georeference
     if georeference is None:
         raise DataError(f"{exported.title}: COPC needs a georeference; this map is in its drive's own poses")
     octree = _Octree.over(exported, georeference)
     header = las_header(exported.map.label_set, georeference, has_times=exported.attributes is not None)
+    packing = lazrs.LazVlr.new_for_compression(
+        header.point_format.id, header.point_format.num_extra_bytes, True
+    )
     with replacing(path) as file:
         writer = copclib.FileWriter(file.name, _config(octree, georeference, header))
+        spans = []
         for node, records in _nodes(exported, georeference, octree, header):
-            writer.AddNode(copclib.VoxelKey(*node), copclib.VectorChar(records.ravel().view(np.int8)))
+            packed = copclib.VectorChar(np.frombuffer(_packed(records, packing), np.int8))
+            writer.AddNodeCompressed(copclib.VoxelKey(*node), packed, len(records))
+            places = records[:, :PLACE_BYTES].copy().view(np.int32)
+            spans.append((len(records), places.min(axis=0), places.max(axis=0)))
+        if spans:
+            _describe(writer.copc_config.las_header, spans, header)
         writer.Close()
         _refuse_cut(file.name)
+
+
+def _describe(
+    written: copclib.LasHeader,
+    spans: Sequence[tuple[int, NDArray[np.int32], NDArray[np.int32]]],
+    header: laspy.LasHeader,
+) -> None:
+    """Bounds and numbers of points, of the points, lowest and highest places of each node; copclib leaves them at 0."""
+    import copclib
+
+    counts, lows, highs = zip(*spans, strict=True)
+    ends = np.min(lows, axis=0), np.max(highs, axis=0)
+    written.min, written.max = (copclib.Vector3(*(header.offsets + LAZ_SCALE_M * end)) for end in ends)
+    written.points_by_return = [sum(counts)] + [0] * (len(written.points_by_return) - 1)
+
+
+def _packed(records: NDArray[np.uint8], packing: lazrs.LazVlr) -> bytes:
+    """The points of a node as a chunk of LAZ; copclib packs the same bytes in nearly twice the time."""
+    import lazrs
+
+    file = io.BytesIO()
+    compressor = lazrs.LasZipCompressor(file, packing)
+    compressor.compress_many(records.ravel())
+    compressor.finish_current_chunk()
+    return file.getvalue()[OFFSET_BYTES:]
 
 
 def _refuse_cut(name: str) -> None:

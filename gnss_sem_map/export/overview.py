@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.evaluation.metrics import LOOKS
+from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.tiles import TiledMap
 
 MOST_CELLS = 800
 """Cells along the longer side of all tiles."""
 AREA_CELL_M = 1.0
+NO_LABEL, NOTHING = (205, 209, 217), (255, 255, 255)
+"""Colours of pixels, RGB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,11 +25,15 @@ class Overview:
 
     cell_m: float
     hits: NDArray[np.int64]
-    """(rows, columns) LiDAR points of the shown voxels."""
+    """(rows, columns) LiDAR points of the voxels that were not removed."""
     labels: NDArray[np.int8]
-    """(rows, columns) the class of most shown voxels; -1: only unlabelled ones, -2: none."""
+    """(rows, columns) the class of most labelled voxels; -1: only unlabelled ones, -2: none."""
     area_m2: float
-    """Of the squares with a shown voxel, with edges of about `AREA_CELL_M`."""
+    """Of the squares with a voxel that was not removed, with edges of about `AREA_CELL_M`."""
+    not_looked_at: float
+    """Share of these LiDAR points in voxels that no labelled image shows."""
+    undecided: float
+    """Share of those in voxels that images show, but to which they give no class."""
     confidence: dict[str, tuple[int, float]]
     """Class: labelled voxels and their mean confidence."""
     colours: dict[str, str]
@@ -46,31 +53,36 @@ def overview_of(tiled: TiledMap) -> Overview | None:
     area_shift = max(0, round(np.log2(AREA_CELL_M / tiled.voxel_size_m)))
     names, colours = tiled.label_set.names, tiled.label_set.colours
     votes = np.zeros((len(names) + 1, rows * columns), np.int32)
-    hits, squares = np.zeros(rows * columns), 0
+    hits, squares, without = np.zeros(rows * columns), 0, np.zeros(2)
     classes, looks = np.zeros((len(names), 2)), np.zeros((len(LOOKS), 2))
     for piece in tiled:
-        shown = piece.shown
-        places, labels = piece.voxels.indices[shown, :2].astype(np.int64), piece.labels[shown]
+        stands = piece.states != State.REMOVED
+        places, labels = piece.voxels.indices[stands, :2].astype(np.int64), piece.labels[stands]
         cells = (places - low) >> shift
         flat = cells[:, 1] * columns + cells[:, 0]
-        weights = piece.voxels.hits[shown].astype(np.float64)
+        weights = piece.voxels.hits[stands].astype(np.float64)
         hits += np.bincount(flat, weights, len(hits))
         for label in range(-1, len(names)):
             votes[label + 1] += np.bincount(flat[labels == label], minlength=len(hits)).astype(np.int32)
         x, y = (places >> area_shift).T
         squares += len(np.unique(x << 32 | y & 0xFFFFFFFF))
-        known, sure = labels >= 0, piece.confidence[shown]
+        known, sure = labels >= 0, piece.confidence[stands]
+        was_seen = piece.states[stands] != State.UNOBSERVED
+        without += weights[~known & ~was_seen].sum(), weights[~known & was_seen].sum()
         classes += _sums(labels[known], sure[known], len(classes))
         groups = np.searchsorted(LOOKS, weights[known], side="right") - 1
         looks += _sums(groups, sure[known], len(looks))
     winners = votes[1:].argmax(axis=0)
     labels = np.where(votes[1:].any(axis=0), winners, np.where(votes[0] > 0, -1, -2)).astype(np.int8)
+    not_looked_at, undecided = (without / max(hits.sum(), 1.0)).tolist()
     grid = _filled(hits.reshape(rows, columns))
     return Overview(
         cell_m=tiled.voxel_size_m * (1 << shift),
         hits=hits.astype(np.int64).reshape(rows, columns)[grid][::-1],
         labels=labels.reshape(rows, columns)[grid][::-1],
         area_m2=squares * (tiled.voxel_size_m * (1 << area_shift)) ** 2,
+        not_looked_at=not_looked_at,
+        undecided=undecided,
         confidence=dict(zip(names, map(_mean, classes), strict=True)),
         colours={name: "#" + bytes(rgb).hex() for name, rgb in zip(names, colours, strict=True)},
         by_looks=dict(zip(LOOKS, map(_mean, looks), strict=True)),
@@ -88,9 +100,7 @@ def coverage_pixels(overview: Overview) -> NDArray[np.uint8]:
 def label_pixels(overview: Overview) -> NDArray[np.uint8]:
     """Pixels (rows, columns, 3) RGB in the colours of the classes; grey: no label, white: nothing."""
     colours = [bytes.fromhex(colour[1:]) for colour in overview.colours.values()]
-    table = np.array(
-        [*map(list, colours), [255, 255, 255], [205, 209, 217]], np.uint8
-    )  # -2 and -1 count from the end
+    table = np.array([*map(list, colours), NOTHING, NO_LABEL], np.uint8)  # -2 and -1 count from the end
     return table[overview.labels]
 
 

@@ -14,7 +14,7 @@ from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.export.charts import Chart, Curve, chart
 from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.export.movers import read_movers
-from gnss_sem_map.export.overview import Overview, coverage_pixels, label_pixels, overview_of
+from gnss_sem_map.export.overview import NO_LABEL, Overview, coverage_pixels, label_pixels, overview_of
 from gnss_sem_map.export.page import page, percent, png
 from gnss_sem_map.export.track import Track, read_track
 from gnss_sem_map.export.verdict import verdict_of
@@ -86,7 +86,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "pictures": {name: _picture(folder / name) for name in PICTURES},
         "captions": PICTURES,
         "overviews": list(_coarse_pictures(overviews)),
-        "legend": [] if refined is None else list(refined.colours.items()),
+        "legend": [] if refined is None else list(_legend(refined)),
         "warnings": [str(warning) for warning in run.get("warnings", ())],
         "map_figures": {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map},
         "calibration": _shares(metrics.get("calibration", {})),
@@ -96,7 +96,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "path": _path(tracks, moved),
         "band": _band(tracks),
         "trajectory": run.get("trajectory") or {},
-        "trajectory_scores": metrics.get("trajectory", {}),
+        "trajectory_scores": _with_percentages(metrics.get("trajectory", {})),
         "findings": run.get("preflight", {}).get("findings", ()),
         "counts": run.get("counts", {}),
         "files": list(_files(folder)),
@@ -157,6 +157,13 @@ def _coarse_pictures(overviews: Mapping[str, Overview]) -> Iterator[tuple[str, s
         yield coverage, "Coverage: the darker, the more laser points; white: not seen. North is up."
     for name, overview in overviews.items():
         yield png(label_pixels(overview)), f"Classes from above, {MAPS[name]}."
+
+
+def _legend(overview: Overview) -> Iterator[tuple[str, str]]:
+    """Name and colour, as CSS has it, of what is in the pictures of classes."""
+    yield from overview.colours.items()
+    if (overview.labels == -1).any():
+        yield "no class", "#" + bytes(NO_LABEL).hex()
 
 
 def _looks(overview: Overview) -> Iterator[tuple[str, int, str | None]]:
@@ -364,6 +371,14 @@ def _size(path: Path) -> str:
     if path.is_dir():
         return f"{sum(1 for _ in path.iterdir()):,} files"
     return f"{path.stat().st_size / 1e3:,.1f} kB"
+
+
+def _with_percentages(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Scores of a trajectory with its fractions as percentages."""
+    return {
+        name: f"{100 * value:.3g} %" if "inside" in name or name.endswith("_share") else value
+        for name, value in scores.items()
+    }
 
 
 def _shares(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -44,6 +44,7 @@ def verdict_of(
         _size(run, overview, tracks),
         *_accuracy(metrics, tracks),
         *_classes(metrics),
+        *_without_class(overview),
         *_passes(run),
         *_missing(run),
         _coordinates(run),
@@ -107,6 +108,19 @@ def _classes(metrics: Mapping[str, Any]) -> Iterator[str]:
         f" points are right (mean over the classes); {100 * (refined.get('coverage') or 0):.1f} % of"
         " all points have a label."
     )
+
+
+def _without_class(overview: Overview | None) -> Iterator[str]:
+    if overview is None:
+        return
+    reasons = (
+        (overview.not_looked_at, "no labelled image shows"),
+        (overview.undecided, "images give no clear class to"),
+    )
+    why = [f"{reason} {100 * share:.1f} %" for share, reason in reasons if share >= 0.0005]
+    if why:
+        share = 100 * (overview.not_looked_at + overview.undecided)
+        yield f"Without a class: {share:.1f} % of the laser points that stay in the map ({', '.join(why)})."
 
 
 def _passes(run: Mapping[str, Any]) -> Iterator[str]:

@@ -33,7 +33,7 @@ from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Scan
-from gnss_sem_map.voxels.attribute_table import WAITS, AttributeTable
+from gnss_sem_map.voxels.attribute_table import WAITS
 from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable
 
@@ -192,8 +192,6 @@ class _Chunk:
     def __init__(self, drive: Drive, number: int, first: int, folder: Path) -> None:
         self._drive, self._number, self._first, self._folder = drive, number, first, folder
         self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
-        self._seen = AttributeTable()
-        """Of the points that stay."""
         self.observations: list[Observation] = []
         self.last_images: WaitingImages | None = None
         """Of its last window of scans, once it is decided."""
@@ -206,8 +204,7 @@ class _Chunk:
         seen.levels[near.indices] = WAITS  # they are added when it is known whether they moved
 
     def add(self, seen: LabelledScan, observation: Observation | None) -> None:
-        self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights)
-        self._seen.add(seen.keys, seen.levels, seen.moments_us)
+        self._all.add(seen.keys, seen.pixels, seen.classes, seen.heights, (seen.levels, seen.moments_us))
         if observation is not None:
             self._keyframes.add(observation.stamp, observation.seen)
             self.observations.append(observation)
@@ -230,21 +227,25 @@ class _Chunk:
             moved, stands = decision.moved[place], decision.stands[place]
             return points, moved_points(points.near, moved, stands, settings.dynamics.grow_m)
 
-        removed, seen_removed, moving = new_table(settings), AttributeTable(), {}
+        removed, moving = new_table(settings), {}
         for place, (points, moved) in prefetch(taken, range(len(numbers)), THREADS):
-            removed.add(points.keys[moved], points.pixels[moved], points.classes, points.heights[moved])
-            for table, chosen in ((self._seen, ~moved), (seen_removed, moved)):
-                table.add(points.keys[chosen], points.levels[chosen], points.moments_us[chosen])
+            stays = ~moved
+            self._all.see(points.keys[stays], (points.levels[stays], points.moments_us[stays]))
+            removed.add(
+                points.keys[moved], points.pixels[moved], points.classes, points.heights[moved],
+                (points.levels[moved], points.moments_us[moved]),
+            )  # fmt: skip
             moving[numbers[place]] = points.near.indices[moved].astype(np.int64)
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None
-        static = self._all.to_map() - gone
+        static, seen = self._all.to_map() - gone, Attributes(*self._all.attributes())
+        del self._all  # 60 MB are free while the chunk is saved
         number, lidar = self._first + self._number, self._drive.log.lidar
         objects = tuple(replace(one, lidar=lidar, chunk=number) for one in decision.objects)
         return MappedChunk(
-            number, lidar, static, gone, self._seen.attributes(), seen_removed.attributes(), moving, objects,
-            keyframes, self.stats,
+            number, lidar, static, gone, seen, Attributes(*removed.attributes()), moving, objects, keyframes,
+            self.stats,
         )  # fmt: skip
 
     def _last_window(self) -> frozenset[int]:
@@ -265,4 +266,5 @@ def new_table(settings: Settings) -> VoxelTable:
         settings.labelling.probability_floor,
         None if calibration is None else calibration.log_likelihoods,
         settings.labelling.abstain,
+        with_attributes=True,
     )

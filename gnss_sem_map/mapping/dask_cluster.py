@@ -22,7 +22,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, how_to_install
 from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def _connected(address: str) -> Iterator[Client]:
         from distributed import Client
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"scheduler {address}: {error.name} is not installed; in the clone: pip install -e '.[cluster]'"
+            f"scheduler {address}: {error.name} is not installed; {how_to_install('cluster')}"
         ) from None
     try:
         place = urlsplit(address)

@@ -1,21 +1,17 @@
 """Many drives, one map: each drive is mapped into a folder of its own, in the frame of all, and the maps are added.
 
-Drives that pass the same places are bound first (`bound_drives`); then every drive is mapped.
-
-OUT/drives/NAME/    raw map, evidence, trajectory, run.json and report of one drive; its point labels, by the map of all
-OUT/map, ...        their sum, refined and exported as the map of one drive is
+Drives that pass the same places are bound first (`bound_drives`); then every drive is mapped, each as a task
+(`drive_tasks`), and the map of all is written (`written_drives`).
 
 Sums are exact. So adding a drive later, or taking one out, gives the same bytes as a run of the same drives at once:
 drives that it was bound to are mapped again, the others stay.
-Each drive is a task (`drive_tasks`).
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,43 +20,30 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
-from gnss_sem_map.export.changes import write_changes
 from gnss_sem_map.export.georeference import Georeference
-from gnss_sem_map.export.movers import join_movers
-from gnss_sem_map.files import ownership, work_folder
-from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import Claim, new_folder
+from gnss_sem_map.files import work_folder
+from gnss_sem_map.files.output_folder import Claim
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.execution import Executor, InProcess
-from gnss_sem_map.mapping.raw_map import MAP, write_sum
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.mapping.execution import InProcess
+from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.about import about_map
-from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
+from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.merged_run import write_merged
-from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
-from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
-from gnss_sem_map.voxels.attributes import ATTRIBUTES
+from gnss_sem_map.runs.written_drives import write_drives
 from gnss_sem_map.voxels.map_json import read_frame
 
 Array = NDArray[np.float64]
-
-OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
-"""Files of a drive beside its map, evidence and trajectory."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +116,8 @@ def run_drives(
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
         labelled = [source for source in sources if source.name in done and write_labels]
-        about = _write(
-            out, done, settings, frame, failed, claim, bound, executor, progress, labelled, align_to
+        about = write_drives(
+            out, done, settings, frame, failed, claim.work, bound, executor, progress, labelled, align_to
         )
     return ManyDrives(out, about)
 
@@ -201,8 +184,8 @@ def _changed(
     if failed:
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
     new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
-    return _write(
-        out, {**there, **new}, settings, frame, {}, claim, bound, InProcess(), progress,
+    return write_drives(
+        out, {**there, **new}, settings, frame, {}, claim.work, bound, InProcess(), progress,
         align_to=None if align_to is None else Path(align_to),
     )  # fmt: skip
 
@@ -246,94 +229,6 @@ def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
     file = claim.work / DRIVES / SETTINGS
     file.write_text(settings.to_yaml(), "utf-8")
     return file
-
-
-def _write(
-    out: Path,
-    drives: Mapping[str, Path],
-    settings: Settings,
-    frame: LocalFrame,
-    failed: Mapping[str, str],
-    claim: Claim,
-    bound: BoundDrives,
-    executor: Executor,
-    progress: Progress,
-    labelled: Sequence[Source] = (),
-    align_to: Path | None = None,
-) -> dict[str, Any]:
-    """Write the map of these drives, whose folders are linked into it, and the point labels of some."""
-    stats, label_set = RunStats(), open_label_set(settings.classes)
-    with new_folder(out) as folder:
-        parts = [folder / DRIVES / name for name in sorted(drives)]
-        for part in parts:
-            _link_all(drives[part.name], part)
-        with stats.stage("mapping"):
-            write_sum(parts, folder, frame, settings.classes, out, executor=executor, work=claim.work)
-        # tiles that are taken from an earlier map do not say which points of kerbs are which
-        earlier = None if labelled else out
-        refined = pipeline.refine(
-            folder, settings, stats, progress, earlier, executor=executor, work=claim.work
-        )
-        if labelled:
-            write_point_labels(
-                folder,
-                (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled),
-                refined.kerbs,
-                settings,
-            )
-        with stats.stage("changes"):
-            changes = changes_in(folder, parts, bound.passes, label_set)
-        if changes is not None:
-            write_changes(changes, Georeference.of(frame, settings.delivery), label_set, folder)
-        join_movers(parts, folder)
-        about = {
-            "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
-            "merged": [part.name for part in parts],
-            "drives": {part.name: _summary(part) for part in parts},
-            "failed": dict(failed),
-            "aligned_to": None if align_to is None else str(align_to.resolve()),
-            "warnings": list(bound.warnings),
-            "passes": [asdict(row) for row in bound.passes]
-            + [row for part in parts for row in read_run(part).get("passes", ())],
-            "local_frame": asdict(frame),
-            "changes": [change.about(label_set) for change in changes or ()],
-            "map": about_map(folder, refined.report),
-        }
-        write_merged(folder, settings, about, progress)
-    return about
-
-
-def _labelled(source: Source, folder: Path, settings: Settings) -> LabelledDrive:
-    log = source.open_log().in_our_conventions(settings.sensors)
-    return LabelledDrive(folder, log, Trajectory.load(folder / "trajectory.parquet"))
-
-
-def _summary(drive: Path) -> dict[str, Any]:
-    """What the list of drives says of one."""
-    about = read_run(drive)
-    steps = np.diff(tracks_of(drive)[0].positions, axis=0)
-    return {
-        "scans": about["counts"]["scans"],
-        "way_m": round(float(np.linalg.norm(steps, axis=1).sum()), 1),
-        "skips": about["skips"]["count"],
-        "warnings": len(about["warnings"]),
-    }
-
-
-def _link_all(drive: Path, part: Path) -> None:
-    """Link what belongs to one drive, out of its own folder or out of a run of this drive alone."""
-    part.mkdir(parents=True)
-    for name in (MAP, ATTRIBUTES, evidence.FOLDER):
-        if not is_folder(drive / name):
-            continue  # older versions knew no attributes
-        ignore = shutil.ignore_patterns(ownership.MARKER)
-        shutil.copytree(drive / name, part / name, copy_function=link_or_copy, ignore=ignore)
-    for file in (
-        *drive.glob("trajectory*"),
-        *drive.glob("objects.*"),
-        *(drive / name for name in OF_ONE_DRIVE),
-    ):
-        link_or_copy(file, part / file.name)
 
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import parse_qsl
@@ -15,7 +16,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, how_to_install, program
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.sensor_log import Image
 
@@ -62,6 +63,8 @@ DEMO_CALIBRATION = DEMO_NETWORK.with_name("calibration.yaml")
 def no_segmenter_message(drive: str) -> str:
     """Help text for a drive without labels: three networks for real streets, how to get them, their licences."""
     lines = [f"{drive}: no segmenter given and no labels found; the map needs one of, for instance:"]
+    if find_spec("transformers") is None:
+        lines.append(f"  (once before, {how_to_install('hf')})")
     for model, about in (
         ("tue-mps/cityscapes_semantic_eomt_large_1024", "EoMT, best, needs a GPU; MIT licence"),
         (
@@ -74,7 +77,8 @@ def no_segmenter_message(drive: str) -> str:
         ),
     ):
         lines.append(
-            f"  hf download {model} && gnss-sem-map run {drive} --segmenter hf:{model} ...   ({about})"
+            f"  {program('hf')} download {model} && {program('gnss-sem-map')} run {drive} --segmenter hf:{model} ..."
+            f"   ({about})"
         )
     lines.append(
         "For existing labels: --segmenter labels:FOLDER; for the geometry alone: --segmenter none. For several runs,"
@@ -153,7 +157,7 @@ def _needs(extra: str, spec: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"segmenter {spec!r}: {error.name} is not installed; in the clone: pip install -e '.[{extra}]'"
+            f"segmenter {spec!r}: {error.name} is not installed; {how_to_install(extra)}"
         ) from None
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.kitti_calibration import quaternion_of
 from gnss_sem_map.datasets.ros.decoding import typestore
 from gnss_sem_map.datasets.ros.static_tf import TOPIC as TF_STATIC
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.sensor_log.cameras import Distortion
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ class BagWriter:
 
     def __init__(self, folder: Path, is_ros1: bool) -> None:
         if find_spec("rosbags") is None:
-            raise DataError("a bag needs the extra [ros]: pip install -c constraints.txt -e '.[ros]'")
+            raise DataError(f"a bag needs rosbags; {how_to_install('ros')}")
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2

@@ -4,8 +4,9 @@ All are module-level functions (numba caches only those), release the GIL, and a
 do not depend on order, so any order of scans and any number of threads give the same bits. The tests hold a numpy
 version of each.
 
-A voxel is one row of a hash table: int64 key, c int32 log-likelihood sums, uint32 hits, and in the last word the int64
-sum of heights (40 bytes for five classes), found by open addressing with linear probing. Key 0 marks an empty row.
+A voxel is one row of a hash table: int64 key, c int32 log-likelihood sums, uint32 hits, and in a word the int64 sum of
+heights (40 bytes for five classes), found by open addressing with linear probing. Key 0 marks an empty row. Attributes
+may follow (`attribute_table`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from llvmlite import ir
 from numba import int64, njit, types, uint64
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from gnss_sem_map.voxels.attribute_table import note
 
 AXIS_BITS = 21
 AXIS_OFFSET = 1 << 20
@@ -115,15 +118,18 @@ def unpack_keys(keys, indices):
 
 
 @njit(cache=True, nogil=True)
-def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations, classes):
+def fuse(
+    rows, ints, bytes_, count, capacity, start, keys, pixels, heights, observations, levels, moments_us, classes
+):  # fmt: skip
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table holds `capacity`.
 
     `pixels[i]` is the row of `observations` (p, c) of point i, or -1 without a pixel; `classes` are the columns, as a
     tuple, so that their number is known at compile time; `heights` (n,) are those of the points in 1 / HEIGHT_UNITS of
-    a voxel's edge. Returns the number of voxels and the first point that is not
-    added yet, or -1 - i for a point i whose voxel overflows.
+    a voxel's edge. Attributes are noted if there are `levels` and `moments_us` (n,). Returns the number of voxels and
+    the first point that is not added yet, or -1 - i for a point i whose voxel overflows.
     """
     hits = FIRST_SUM + len(classes)
+    height_at = hits // 2 + 1
     starts, observed = run_starts(keys, start), np.flatnonzero(pixels >= 0)
     runs, next_observed = len(starts) - 1, np.searchsorted(observed, start)
     for run in range(runs):
@@ -142,7 +148,9 @@ def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations
         height = int64(0)
         for i in range(first, end):
             height += heights[i]
-        rows[slot, -1] += height
+        rows[slot, height_at] += height
+        if len(levels) > 0:
+            note(rows, ints, bytes_, slot, levels, moments_us, first, end)
         while next_observed < len(observed) and observed[next_observed] < end:
             pixel, lowest = pixels[observed[next_observed]], int64(0)
             for c in range(len(classes)):
@@ -152,6 +160,18 @@ def fuse(rows, ints, count, capacity, start, keys, pixels, heights, observations
                 return count, -1 - observed[next_observed]
             next_observed += 1
     return count, len(keys)
+
+
+@njit(cache=True, nogil=True)
+def see(rows, ints, bytes_, keys, levels, moments_us):
+    """Note attributes of points whose voxels are in the table."""
+    starts = run_starts(keys, 0)
+    runs = len(starts) - 1
+    for run in range(runs):
+        if run + PREFETCH_AHEAD < runs:
+            prefetch_row(rows, home(keys[starts[run + PREFETCH_AHEAD]], len(rows)))
+        first, end = starts[run], starts[run + 1]
+        note(rows, ints, bytes_, find_or_insert(rows, keys[first]), levels, moments_us, first, end)
 
 
 @njit(cache=True, nogil=True)

@@ -4,7 +4,7 @@ A tile holds the voxels whose index lies in [512 x, 512 x + 512) and [512 y, 512
 y 9 bits, z 14 bits), the sums of log-likelihoods, the hits, the sum of the points' heights over the bottom of the voxel
 where it is known, and the label, confidence and state of each voxel. A refined map counts all hits, and in
 `hits_removed` those of moving objects; log-likelihoods are of static objects only. It says in `reason` why a voxel was
-removed. Keys are sorted and delta-coded, so a voxel takes about 14 bytes. Any Parquet reader opens it.
+removed. Keys are sorted and delta-coded, so a voxel takes about 11 bytes. Any Parquet reader opens it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ REASON = "reason"
 """Column of maps in which voxels were removed."""
 HEIGHTS = "heights"
 """Column of maps that know how high the surface in a voxel lies."""
+BY_DIFFERENCE = ("key", "hits", HEIGHTS, "label", "state", HITS_REMOVED, REASON)
+"""Columns that are stored as differences. Sums and confidences are the same in many voxels, and their bytes as they are
+pack better: without this a tile takes 20 % more."""
 PACKING = 4
 """Level of compression: 2 % smaller than with 1, in a third more time (0.05 s of a drive of 30 s)."""
 Tile = tuple[int, int]
@@ -143,14 +146,12 @@ def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    whole = [name for name in columns if name != "confidence"]
     table = pa.table({name: arrow_column(values) for name, values in columns.items()})
     sink = pa.BufferOutputStream()
     pq.write_table(
         table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
         write_statistics=False, store_schema=False,
-        column_encoding=dict.fromkeys(whole, "DELTA_BINARY_PACKED")
-        | {name: "BYTE_STREAM_SPLIT" for name in columns if name == "confidence"},
+        column_encoding={name: "DELTA_BINARY_PACKED" for name in columns if name in BY_DIFFERENCE},
     )  # fmt: skip
     return bytes(sink.getvalue())
 

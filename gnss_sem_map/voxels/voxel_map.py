@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
-from gnss_sem_map.voxels import kernels
+from gnss_sem_map.voxels import attribute_table, kernels
 from gnss_sem_map.voxels.kernels import (
     AXIS_BITS,
     AXIS_OFFSET,
@@ -26,10 +26,10 @@ from gnss_sem_map.voxels.kernels import (
     UNITS_PER_NAT,
 )
 
-SMALLEST_TABLE = 1 << 18
+SMALLEST_TABLE = 1 << 16
 LARGE_TABLE = 1 << 20
-"""Rows (40 MB for five classes) up to which a table doubles. A larger table grows by a twelfth, to stay under 63 bytes
-per voxel; growing is cheap, for it reads and writes memory in order."""
+"""Rows (40 MB for five classes) up to which a table grows by half. A larger one grows by a twelfth, to stay under 63
+bytes per voxel; growing is cheap, for it reads and writes memory in order."""
 HIGHEST_LOAD = 0.7
 ANSWER_SHARE = 0.5
 """With a confusion model, an observation is half the likelihood of the predicted class and half the probabilities of
@@ -194,6 +194,11 @@ class VoxelMap:
         return found
 
 
+Seen = tuple[NDArray[np.int16], NDArray[np.int64]]
+"""Intensities (n,) of points, WAITS for one that is seen later, and when each was measured; see `attribute_table`."""
+NONE_SEEN: Seen = (np.empty(0, np.int16), np.empty(0, np.int64))
+
+
 class VoxelTable:
     """Hash table of voxels that scans are added to; it grows as needed."""
 
@@ -204,17 +209,20 @@ class VoxelTable:
         probability_floor: float = 0.05,
         answers: NDArray[np.float64] | None = None,
         abstain: bool = False,
+        *,
+        with_attributes: bool = False,
     ) -> None:
         """`probability_floor`: least probability of a class in one observation, in whole percent (real data: 0.05).
 
         `answers` (c + 1, c) nat: the confusion model's log-likelihoods of the true classes for each predicted class;
-        see ANSWER_SHARE. `abstain`: pixels with the predicted class `other` are ignored.
+        see ANSWER_SHARE. `abstain`: pixels with the predicted class `other` are ignored. `with_attributes`: scans tell
+        them, too.
         """
         if not voxel_size_m > 0:
             raise ConfigError(f"voxel size: found {voxel_size_m} m, expected more than 0")
         self.voxel_size_m, self.label_set = voxel_size_m, label_set
         self._floor_percent = round(100 * probability_floor)
-        self._words = VoxelMap.words(label_set)
+        self._words = VoxelMap.words(label_set) + (attribute_table.WORDS if with_attributes else 0)
         self._columns = tuple(range(len(label_set.names)))
         self._count, self._knows_heights = 0, True
         self._rows = np.zeros((SMALLEST_TABLE, self._words), np.int64)
@@ -225,7 +233,7 @@ class VoxelTable:
 
     def _grow(self) -> None:
         size = len(self._rows)
-        larger = np.zeros((2 * size if size < LARGE_TABLE else size + size // 12, self._words), np.int64)
+        larger = np.zeros((size + size // (2 if size < LARGE_TABLE else 12), self._words), np.int64)
         kernels.rehash(self._rows, larger)
         self._rows = larger
 
@@ -238,12 +246,14 @@ class VoxelTable:
         pixels: NDArray[np.int32] | None = None,
         classes: NDArray[np.uint8] | None = None,
         heights: NDArray[np.uint8] | None = None,
+        seen: Seen = NONE_SEEN,
     ) -> None:
         """Add the points of one scan: their voxel keys (n,) and their class probabilities (eq. 6).
 
         `pixels` (n,) is the row in `classes` of each point, -1 for none; `classes` (p, c + 1) are uint8 probabilities,
         `other` last. `heights` (n,) are those of the points in their voxels, see `heights_in_voxels`; if they are not
-        given, the map has no heights. Raises DataError when a voxel's evidence would overflow.
+        given, the map has no heights. `seen` is for a table with attributes. Raises DataError when a voxel's evidence
+        would overflow.
         """
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
@@ -258,8 +268,8 @@ class VoxelTable:
         done = 0
         while done < len(keys):
             self._count, done = kernels.fuse(
-                self._rows, self._rows.view(np.int32), self._count, int(HIGHEST_LOAD * len(self._rows)), done,
-                keys, pixels, heights, observations, self._columns,
+                *self._views, self._count, int(HIGHEST_LOAD * len(self._rows)), done,
+                keys, pixels, heights, observations, *seen, self._columns,
             )  # fmt: skip
             if done < 0:
                 voxel = unpack(keys[[-1 - done]])[0]
@@ -269,6 +279,14 @@ class VoxelTable:
                 )
             if done < len(keys):
                 self._grow()
+
+    def see(self, keys: NDArray[np.int64], seen: Seen) -> None:
+        """Add attributes of points (n,) that were added without."""
+        kernels.see(*self._views, keys, *seen)
+
+    @property
+    def _views(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint8]]:
+        return self._rows, self._rows.view(np.int32), self._rows.view(np.uint8)
 
     @property
     def nbytes(self) -> int:
@@ -286,8 +304,12 @@ class VoxelTable:
             keys=self._rows[order, 0],
             evidence=ints[order, FIRST_SUM:end],
             hits=ints[order, end].astype(np.uint32),
-            heights=self._rows[order, -1] if self._knows_heights else None,
+            heights=self._rows[order, end // 2 + 1] if self._knows_heights else None,
         )
+
+    def attributes(self) -> tuple[NDArray[Any], ...]:
+        """Those of the voxels so far, as the columns of `Attributes`."""
+        return attribute_table.columns_of(self._rows)
 
 
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:

@@ -127,6 +127,23 @@ def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
     assert program("-q", "-v", *words).returncode == 2
 
 
+def test_the_first_progress_comes_before_large_packages_are_loaded(tmp_path: Path) -> None:
+    seen = (
+        "import logging, sys\n"
+        "from gnss_sem_map.cli import logs\n"
+        "class First(logging.Handler):\n"
+        "    def emit(self, record):\n"
+        "        print(record.getMessage(), sorted({'numba', 'scipy', 'gtsam', 'numpy'} & set(sys.modules)))\n"
+        "        sys.exit()\n"
+        "logs.STAGES.addHandler(First())\n"
+        "from gnss_sem_map.cli import main\n"
+        "main()\n"
+    )
+    words = [sys.executable, "-c", seen, "run", str(tmp_path), "-o", str(tmp_path / "out")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.stdout == "loading: begins, 1 steps []\n", done.stderr
+
+
 @pytest.mark.parametrize("after_s", [0.08, 0.12, 0.2, 0.5, 2.0])
 def test_ctrl_c_is_one_line_from_the_first_import_on(
     after_s: float, small_drive: Street, tmp_path: Path

@@ -317,7 +317,7 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
 ) -> None:
     out, calls = shutil.copytree(made["ab"], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
     with monkeypatch.context() as patch:
-        patch.setattr(many_drives, "_write", stopped)
+        patch.setattr(many_drives, "write_drives", stopped)
         with pytest.raises(KeyboardInterrupt):
             add_drive(out, drives.by_name["c"], how)
     assert products(out) == products(made["ab"])
@@ -330,7 +330,7 @@ def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
     drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = calls_of_the_pipeline(monkeypatch)
-    monkeypatch.setattr(many_drives, "_write", stopped)
+    monkeypatch.setattr(many_drives, "write_drives", stopped)
     coarse = Settings.model_validate({"mapping": {"voxel_size_m": 0.4}})
     elsewhere = LocalFrame(49.01, 8.42, 100.0)
     for settings, origin, again, times in (

@@ -14,7 +14,7 @@ import numpy as np
 
 from gnss_sem_map.datasets.gnss_files.positions import Positions
 from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, nearest
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.files.untrusted import read_lines, shown
 from gnss_sem_map.sensor_log import Skip
 
@@ -28,9 +28,7 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none."""
     del accuracy, has_stddevs
     if find_spec("pynmeagps") is None:
-        raise DataError(
-            f"{shown(path)}: NMEA needs the extra [ros]: pip install -c constraints.txt -e '.[ros]'"
-        )
+        raise DataError(f"{shown(path)}: NMEA needs pynmeagps; {how_to_install('ros')}")
     now: int | None = None  # by the last sentence with a date
     deviations: dict[int, tuple[float, float, float]] = {}
     fixes: list[tuple[int, bool, list[float]]] = []

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.ros.mcap_file import McapFile
 from gnss_sem_map.datasets.ros.ros1_file import Ros1File
 from gnss_sem_map.datasets.ros.sqlite_file import SqliteFile
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
 
@@ -59,9 +59,7 @@ class Bag:
                 f"{shown(path)}: found files of {' and '.join(suffixes)} in one folder, expected the parts of one bag"
             )
         if find_spec("rosbags") is None:
-            raise DataError(
-                f"{shown(path)}: ROS bags need the extra [ros]: pip install -c constraints.txt -e '.[ros]'"
-            )
+            raise DataError(f"{shown(path)}: ROS bags need rosbags; {how_to_install('ros')}")
         self.is_ros1 = suffixes == [".bag"]
         codec = "" if self.is_ros1 else _message_codec(path)
         self._files: list[BagFile] = [_opened(name, codec) for name in names]

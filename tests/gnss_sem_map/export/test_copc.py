@@ -1,7 +1,8 @@
-"""COPC as laspy reads it, which does not write it: every voxel once, coarse levels first."""
+"""COPC as laspy and copclib read it, which do not pack it: every voxel once, coarse levels first."""
 
 from pathlib import Path
 
+import copclib
 import laspy
 import numpy as np
 import pytest
@@ -37,9 +38,27 @@ def test_the_octree_holds_the_points_of_the_laz_and_a_coarser_picture_of_them(
         coarse = reader.query(resolution=4 * 0.2)
         assert 0 < len(coarse) < len(plain.points) / 4
         seen = np.column_stack([coarse.x, coarse.y, coarse.z])
+    with laspy.open(tmp_path / "map.copc.laz") as file:
+        np.testing.assert_allclose(file.header.mins, plain.header.mins, atol=1e-9)
+        np.testing.assert_allclose(file.header.maxs, plain.header.maxs, atol=1e-9)
+        assert file.header.point_count == len(plain.points)
+        assert file.header.number_of_points_by_return.tolist() == [len(plain.points), *[0] * 14]
     assert cKDTree(seen).query(whole)[0].max() < 3.2  # no part of the map is left out
     with laspy.open(tmp_path / "map.copc.laz") as file:
         assert file.header.parse_crs().to_epsg() == 32632
+
+
+def test_another_unpacker_finds_the_same_bytes(
+    town: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    write_copc(Exported(in_memory(town, karlsruhe)), tmp_path / "map.copc.laz")
+    reader = copclib.FileReader(str(tmp_path / "map.copc.laz"))
+    packed_once_more = copclib.FileWriter(str(tmp_path / "again.copc.laz"), reader.copc_config)
+    for node in reader.GetAllNodes():
+        packed_once_more.AddNode(node.key, reader.GetPointData(node))
+    packed_once_more.Close()
+    ours, theirs = laspy.read(tmp_path / "map.copc.laz"), laspy.read(tmp_path / "again.copc.laz")
+    np.testing.assert_array_equal(np.sort(ours.points.array), np.sort(theirs.points.array))
 
 
 def test_an_empty_map_is_refused(street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
-"""The overview of a map counts every shown voxel once and has north on top."""
+"""The overview of a map counts every voxel that stands once and has north on top."""
 
 import numpy as np
+import pytest
 
 from gnss_sem_map.export.overview import coverage_pixels, label_pixels, overview_of
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -43,3 +44,17 @@ def test_an_overview_of_a_plane_over_four_tiles() -> None:
     assert overview.confidence["road"][0] == 5000
     assert (coverage_pixels(overview)[0, 0] > coverage_pixels(overview)[0, -1]).all()
     assert (label_pixels(overview)[0, 0] == URBAN.colours[building]).all()
+
+
+def test_what_stands_without_a_class_is_covered_and_told_apart_by_its_reason(street: SemanticMap) -> None:
+    overview = overview_of(in_memory(street))
+    assert overview is not None
+    hits, stands = street.voxels.hits, street.states != State.REMOVED
+    unseen = hits[street.states == State.UNOBSERVED].sum()
+    assert overview.hits.sum() == hits[stands].sum()
+    assert overview.not_looked_at == pytest.approx(unseen / hits[stands].sum())
+    assert overview.undecided == 0
+    assert (overview.labels == -1).any()
+    without_labels = overview_of(in_memory(SemanticMap.of(street.voxels)))
+    assert without_labels is not None
+    assert overview.area_m2 == without_labels.area_m2

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.report import write_report
 from gnss_sem_map.voxels import tiles
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 RUN: dict[str, Any] = {
     "name": "drive 5",
@@ -50,7 +51,7 @@ SCORES = {
 METRICS: dict[str, Any] = {
     "semantics": {"raw": SCORES, "refined": SCORES | {"mean_iou": 0.8567}},
     "dynamic": {"SA": 0.991, "DA": None},
-    "trajectory": {"ate_m": 0.123456},
+    "trajectory": {"ate_m": 0.123456, "position_inside_90": 0.9123},
     "calibration": {"ece": 0.031},
 }
 PNG = base64.b64decode(
@@ -118,6 +119,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
         ["squared residuals divided by their variances (chi2 per degree of freedom)", "1.031"],
         ["antenna: ahead, left, above of the IMU (m)", "0, -0.32, 0.5"],
         ["absolute trajectory error (m)", "0.1235"],
+        ["position: errors inside the ellipsoid that should hold 90 %", "91.2 %"],
         ["static points kept (SA)", "99.1 %"],
         ["expected calibration error (ECE)", "3.1 %"],
         ["evaluated points that the raw map labels", "75.0 %"],
@@ -163,7 +165,22 @@ def test_the_report_shows_the_map_of_its_folder(street: SemanticMap, tmp_path: P
     page = report(tmp_path, {"name": "x"}, {})
     assert len(page.images) == 2  # coverage, and classes after refinement
     assert "m² of ground plan are mapped" in page.verdict
+    assert re.search(r"Without a class: (.*) %.* \(no labelled image shows \1 %\)", page.verdict)
     assert page.headings == ["Classes and confidence", "Files"]
+
+
+def test_a_map_without_labels_has_an_area_and_says_why_it_has_no_classes(
+    street: SemanticMap, tmp_path: Path
+) -> None:
+    unlabelled = replace(
+        street,
+        labels=np.full_like(street.labels, -1),
+        states=np.full_like(street.states, State.UNOBSERVED),
+    )
+    tiles.write(unlabelled, tmp_path / "refined", None)
+    verdict = report(tmp_path, {"name": "x"}, {}).verdict
+    assert int(re.findall(r"([\d,]+) m² of ground", verdict)[0]) > 700  # 60 m of 12 m
+    assert "Without a class: 100.0 %" in verdict
 
 
 def test_a_section_without_data_does_not_appear(tmp_path: Path) -> None:

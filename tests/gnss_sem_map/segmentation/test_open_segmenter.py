@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.errors import ConfigError, how_to_install, program
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import SCHEMES, no_segmenter_message, open_segmenter
 
@@ -43,7 +43,7 @@ def test_nothing_heavy_is_imported_before_it_is_needed_and_a_missing_extra_is_na
 ) -> None:
     code = WITHOUT.format(spec=spec, absent=absent)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert f"{absent[0]} is not installed; in the clone: pip install -e '.[{extra}]'" in done.stdout
+    assert f"{absent[0]} is not installed; {how_to_install(extra)}" in done.stdout
 
 
 def test_an_unknown_kind_is_answered_with_all_there_are() -> None:
@@ -58,5 +58,7 @@ def test_a_drive_without_labels_is_answered_with_three_networks_their_commands_a
     assert len(offers) == 3
     for offer in offers:
         model = offer.split("hf:")[1].split()[0]
-        assert offer.strip().startswith(f"hf download {model} && gnss-sem-map run my_drive ")
+        assert offer.strip().startswith(
+            f"{program('hf')} download {model} && {program('gnss-sem-map')} run my_drive "
+        )
         assert any(word in offer for word in ("licence", "not for commerce"))

@@ -10,7 +10,7 @@ import pytest
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.voxels.attribute_table import SAMPLE, SMALLEST_TABLE, WAITS, AttributeTable, seen_of
+from gnss_sem_map.voxels.attribute_table import SAMPLE, WAITS, seen_of
 from gnss_sem_map.voxels.attributes import (
     ATTRIBUTES,
     NOTHING,
@@ -21,7 +21,7 @@ from gnss_sem_map.voxels.attributes import (
 )
 from gnss_sem_map.voxels.map_json import describe, name_of
 from gnss_sem_map.voxels.tiles import indices_by_tile
-from gnss_sem_map.voxels.voxel_map import pack
+from gnss_sem_map.voxels.voxel_map import SMALLEST_TABLE, VoxelTable, pack
 
 Points = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -40,10 +40,10 @@ def points_of(seed: int, each: int, voxels: int = 300) -> Points:
 
 
 def in_table(*scans: Points) -> Attributes:
-    table = AttributeTable()
-    for scan in scans:
-        table.add(*scan)
-    return table.attributes()
+    table = VoxelTable(0.2, open_label_set(), with_attributes=True)
+    for keys, *seen in scans:
+        table.add(keys, seen=(seen[0], seen[1]))
+    return Attributes(*table.attributes())
 
 
 def assert_same(one: Attributes, other: Attributes) -> None:
@@ -73,6 +73,16 @@ def test_of_many_points_the_median_is_that_of_a_regular_sample() -> None:
             stride *= 2
         assert found.intensity[0] == np.percentile(levels[::stride], 50, method="lower")
         assert (found.points[0], found.last_us[0]) == (count, count - 1)
+
+
+def test_points_may_be_seen_after_they_were_added() -> None:
+    keys, levels, moments_us = points_of(5, 20)
+    waits = np.random.default_rng(5).random(len(keys)) < 0.5
+    table = VoxelTable(0.2, open_label_set(), with_attributes=True)
+    table.add(keys, seen=(np.where(waits, np.int16(WAITS), levels), moments_us))
+    table.see(keys[waits], (levels[waits], moments_us[waits]))
+    order = np.argsort(waits, kind="stable")
+    assert_same(Attributes(*table.attributes()), in_table((keys[order], levels[order], moments_us[order])))
 
 
 def test_a_table_grows() -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
-from gnss_sem_map.dynamics.visibility import WIDE_MARGIN, hits_and_misses
+from gnss_sem_map.dynamics.visibility import WIDE_RATIO, hits_and_misses
 from gnss_sem_map.evaluation.changes import ChangeSettings
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files.run_json import read_run
@@ -109,7 +109,7 @@ def _seen_through(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> 
     counts = np.zeros((2, len(places)), np.int32)
     keyframes = gone.evidence.keyframes_near(places, SETTINGS.farthest_m)
     for part in keyframes.parts() if keyframes is not None else ():
-        counts += hits_and_misses(places, part, SETTINGS.farthest_m, WIDE_MARGIN)
+        counts += hits_and_misses(places, part, SETTINGS.farthest_m, WIDE_RATIO)
     through = int(
         ((counts[1] >= SETTINGS.least_misses) & (counts[1] > SETTINGS.misses_per_hit * counts[0])).sum()
     )

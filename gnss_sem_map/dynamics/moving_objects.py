@@ -33,11 +33,10 @@ from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.tracking import Segment
 from gnss_sem_map.dynamics.visibility import (
     SCANS_PER_PART,
-    SHARP_MARGIN,
-    WIDE_MARGIN,
+    SHARP_RATIO,
+    WIDE_RATIO,
     Keyframes,
     KeyframeScans,
-    Margin,
     RangeImage,
     hits_and_misses,
     spatial_order,
@@ -110,10 +109,10 @@ def decide(
     if not observations:
         return Decision([], [], (), False)
     places = _places(observations)
-    of_places = _observations_by_others(observations, places, before, settings.farthest_m, SHARP_MARGIN)
+    of_places = _observations_by_others(observations, places, before, settings.farthest_m, SHARP_RATIO)
     is_sharp = are_sharp(of_places, places)
     if not is_sharp:
-        of_places = _observations_by_others(observations, places, before, settings.farthest_m, WIDE_MARGIN)
+        of_places = _observations_by_others(observations, places, before, settings.farthest_m, WIDE_RATIO)
 
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
@@ -199,7 +198,7 @@ def _observations_by_others(
     places: Sequence[NDArray[np.int32]],
     before: Keyframes | None,
     farthest_m: float,
-    margin: Margin,
+    margin_ratio: float,
 ) -> NDArray[np.int32]:
     """Hits and misses of every place (2, p) by the scans other than the one that found it."""
     count = 1 + max(int(place.max(initial=-1)) for place in places)
@@ -210,7 +209,7 @@ def _observations_by_others(
     order = spatial_order(centroids)
     centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
     for some in chain(() if before is None else before.parts(), _parts(observations)):
-        counts += hits_and_misses(centroids, some, farthest_m, margin)
+        counts += hits_and_misses(centroids, some, farthest_m, margin_ratio)
     counts[:, order] = counts.copy()
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
     return counts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +30,12 @@ ASKED_M, BEFORE, ASKED_EVERY = (5.0, 40.0), 0.8, 16
 """A scan is asked about the places at this share of the range of some of its returns: those in a range of so many m."""
 
 
-class Margin(NamedTuple):
-    """A return so near to a position hits it: noise of ranges and poses."""
-
-    m: float
-    ratio: float
-    """This share of the range more."""
-
-
-SHARP_MARGIN = Margin(0.2, 0.005)
-"""With sharp poses, of a place on a surface. A wider one takes the wall for a walker in front of it."""
-WIDE_MARGIN = Margin(0.3, 0.01)
-"""With poses that blur what stands, and for the centre of a voxel: half a voxel of 0.2 m beside its surface, or more
-along a grazing ray."""
+MARGIN_M = 0.3
+"""A range within this, plus a share of the range, of a position is a hit: noise of ranges and poses."""
+SHARP_RATIO = 0.005
+"""That share of a place on a surface, with sharp poses. A larger one takes a wall for the walker in front of it."""
+WIDE_RATIO = 0.01
+"""That share with poses that blur what stands, and of the centre of a voxel, which a grazing ray passes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +139,17 @@ def share_seen_through(scans: Sequence[NDArray[np.floating]], rows: Rows) -> flo
         ranges = np.linalg.norm(p_lidar, axis=1)
         some = BEFORE * p_lidar[(ranges > ASKED_M[0]) & (ranges < ASKED_M[1])][::ASKED_EVERY]
         seen = KeyframeScans.of([RangeImage.of(p_lidar, np.eye(4), rows)])
-        misses += int(hits_and_misses(some, seen, ASKED_M[1], SHARP_MARGIN)[1].sum())
+        misses += int(hits_and_misses(some, seen, ASKED_M[1], SHARP_RATIO)[1].sum())
         asked += len(some)
     return misses / asked if asked else 1.0
 
 
 def hits_and_misses(
-    positions: NDArray[np.float64], keyframes: KeyframeScans, farthest_m: float, margin: Margin
+    positions: NDArray[np.float64], keyframes: KeyframeScans, farthest_m: float, margin_ratio: float
 ) -> NDArray[np.int32]:
     """Count the scans that hit each position (v, 3) m, and those that saw through it: (2, v) hits and misses.
 
-    Scans farther than `farthest_m` are no evidence. `margin` is SHARP_MARGIN or WIDE_MARGIN.
+    Scans farther than `farthest_m` are no evidence. `margin_ratio` is SHARP_RATIO or WIDE_RATIO.
     See `range_images.count_hits_and_misses`, which does the visibility test.
     """
     counts = np.zeros((2, len(positions)), np.int32)
@@ -165,7 +158,7 @@ def hits_and_misses(
         close = np.flatnonzero(are_near(keyframes.T_lidar_map, positions[part], farthest_m))
         range_images.count_hits_and_misses(
             positions[part], keyframes.images, keyframes.T_lidar_map, keyframes.rows.around, close,
-            NEAREST_M, farthest_m, *margin, *counts[:, part],
+            NEAREST_M, farthest_m, MARGIN_M, margin_ratio, *counts[:, part],
         )  # fmt: skip
 
     starts = range(0, len(positions), POINTS_PER_BLOCK)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from gnss_sem_map.dynamics.visibility import WIDE_MARGIN, hits_and_misses
+from gnss_sem_map.dynamics.visibility import WIDE_RATIO, hits_and_misses
 from gnss_sem_map.mapping.raw_map import RawMap
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.tiles import joined_voxels
@@ -127,7 +127,7 @@ def _counted(places: Array, session: RawMap, settings: ChangeSettings) -> NDArra
         return counts
     keyframes = session.evidence.keyframes_near(places, settings.farthest_m)
     for part in keyframes.parts() if keyframes is not None else ():
-        counts += hits_and_misses(places, part, settings.farthest_m, WIDE_MARGIN)
+        counts += hits_and_misses(places, part, settings.farthest_m, WIDE_RATIO)
     return counts
 
 

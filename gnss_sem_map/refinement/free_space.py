@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.dynamics.visibility import WIDE_MARGIN, Keyframes, hits_and_misses, spatial_order
+from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
 from gnss_sem_map.voxels.semantic_map import Reason, State
@@ -69,7 +69,7 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     undecided, places = undecided[order], places[order]
     counts = np.zeros((2, len(undecided)), np.int32)
     for part in keyframes.parts():
-        counts += hits_and_misses(places, part, settings.farthest_m, WIDE_MARGIN)
+        counts += hits_and_misses(places, part, settings.farthest_m, WIDE_RATIO)
         left -= len(part)
         hits, most_misses = counts[0], counts[1] + left
         may_be_free = most_misses >= settings.least_misses

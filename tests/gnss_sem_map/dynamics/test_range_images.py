@@ -9,8 +9,9 @@ from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.image_rows import CELL_DEG, LOWEST_DEG
 from gnss_sem_map.dynamics.visibility import (
     CUBE_M,
-    SHARP_MARGIN,
-    WIDE_MARGIN,
+    MARGIN_M,
+    SHARP_RATIO,
+    WIDE_RATIO,
     KeyframeScans,
     hits_and_misses,
     spatial_order,
@@ -62,13 +63,13 @@ def test_before_the_wall_is_empty_in_the_wall_is_hit_and_behind_it_nothing_is_kn
     np.testing.assert_array_equal(seen_at(wall_image(), places), [-1, 1, 0, 0])
 
 
-@pytest.mark.parametrize("margin", [SHARP_MARGIN, WIDE_MARGIN])
-def test_a_place_is_hit_up_to_the_margin_before_a_wall_and_free_before_that(margin):
-    before = np.array([0.0, -0.05, 0.05, 0.35, 0.55])
+@pytest.mark.parametrize("ratio", [SHARP_RATIO, WIDE_RATIO])
+def test_a_place_is_hit_up_to_the_margin_before_a_wall_and_free_before_that(ratio):
+    before = np.array([0.0, -0.05, 0.05, 0.35, 0.45, 0.55])
     places = np.column_stack([WALL_M - before, np.zeros((len(before), 2))])
     wall = KeyframeScans(wall_image()[None], np.eye(4)[None], DENSE)
-    hits, misses = hits_and_misses(places, wall, 40.0, margin)
-    np.testing.assert_array_equal(hits, before <= margin.m + margin.ratio * WALL_M)
+    hits, misses = hits_and_misses(places, wall, 40.0, ratio)
+    np.testing.assert_array_equal(hits, before <= MARGIN_M + ratio * WALL_M)
     np.testing.assert_array_equal(misses, 1 - hits)
 
 

@@ -110,11 +110,11 @@ def test_only_near_witnesses_are_asked_and_none_is_missed(reach_m: float) -> Non
     places = rng.uniform([0, -8, 0], [2000, 8, 3], (POINTS_PER_BLOCK + 5000, 3))
     places = places[np.argsort(places[:, 0])]
     assert visibility.are_near(witnesses.T_lidar_map, places[:1000], reach_m).sum() < len(far) / 5
-    looks = visibility.hits_and_misses(places, witnesses, reach_m, visibility.WIDE_MARGIN)
+    looks = visibility.hits_and_misses(places, witnesses, reach_m, visibility.WIDE_RATIO)
     hits, misses = np.zeros((2, len(places)), np.int32)
     range_images.count_hits_and_misses(
         places, witnesses.images, witnesses.T_lidar_map, DENSE.around, np.arange(len(far)), visibility.NEAREST_M,
-        reach_m, *visibility.WIDE_MARGIN, hits, misses,
+        reach_m, visibility.MARGIN_M, visibility.WIDE_RATIO, hits, misses,
     )  # fmt: skip
     np.testing.assert_array_equal(looks, [hits, misses])
     assert looks.any(axis=1).all()

@@ -100,7 +100,6 @@ def demo(
     ] = None,
 ) -> None:
     """Simulate a drive, map it, score it against the exact truth, and list the pictures."""
-    from gnss_sem_map.cli.compile_ahead import compiled_ahead
     from gnss_sem_map.cli.demo import LABELS, demonstrate
 
     if labels is None:
@@ -109,7 +108,7 @@ def demo(
             warn(
                 ["torch and safetensors are not installed: the demo takes corrupted true labels, no network"]
             )
-    with progress_bars() as progress, compiled_ahead():
+    with progress_bars() as progress:
         done = demonstrate(out, seconds, seed, labels, progress)
     warn(done.about["warnings"])
     print_run(done.about, out, as_json=False)

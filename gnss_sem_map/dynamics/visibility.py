@@ -25,17 +25,15 @@ NEAREST_M = 3.0
 """A scan nearer to a position than this is no evidence: the vehicle itself is in the way."""
 SCANS_PER_PART = 64
 """Scans of a part: 8 MB of range images."""
-
-ASKED_M, BEFORE, ASKED_EVERY = (5.0, 40.0), 0.8, 16
-"""A scan is asked about the places at this share of the range of some of its returns: those in a range of so many m."""
-
-
 MARGIN_M = 0.3
 """A range within this, plus a share of the range, of a position is a hit: noise of ranges and poses."""
 SHARP_RATIO = 0.005
 """That share of a place on a surface, with sharp poses. A larger one takes a wall for the walker in front of it."""
 WIDE_RATIO = 0.01
 """That share with poses that blur what stands, and of the centre of a voxel, which a grazing ray passes."""
+
+ASKED_M, BEFORE, ASKED_EVERY = (5.0, 40.0), 0.8, 16
+"""A scan is asked about the places at this share of the range of some of its returns: those in a range of so many m."""
 
 
 @dataclass(frozen=True, eq=False)

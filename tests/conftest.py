@@ -40,6 +40,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/evaluation/preflight",
         "gnss_sem_map/export/test_every_writer.py",
         "gnss_sem_map/export/test_pictures.py",
+        "gnss_sem_map/many_drives",
         "gnss_sem_map/scans/test_lidar_odometry.py",
         "gnss_sem_map/segmentation/test_checkpoints.py",
         "gnss_sem_map/segmentation/test_demo_network.py",
@@ -52,7 +53,6 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/simulation/test_town.py",
         "gnss_sem_map/test_attributes.py",
         "gnss_sem_map/test_finished_run.py",
-        "gnss_sem_map/test_many_drives.py",
         "gnss_sem_map/test_run_again.py",
     )
 )

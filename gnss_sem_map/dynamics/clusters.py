@@ -185,7 +185,7 @@ def _enclosing_clusters(low, high):
     for i in range(len(low)):  # a containing cluster may itself be a part of another
         while owners[owners[i]] != owners[i]:
             owners[i] = owners[owners[i]]
-    return np.searchsorted(np.unique(owners), owners)
+    return owners
 
 
 def find_segments(
@@ -263,8 +263,8 @@ def _object_clusters(
     is_used = np.bincount(clusters) > 0
     of_used = (np.cumsum(is_used) - 1)[clusters]
     boxes = voxels.merged(of_used, int(is_used.sum()))
-    owners = _enclosing_clusters(boxes.lowest, boxes.highest)
-    return owners[of_used], int(owners.max(initial=-1)) + 1
+    kept, owners = np.unique(_enclosing_clusters(boxes.lowest, boxes.highest), return_inverse=True)
+    return owners[of_used], len(kept)
 
 
 def split_segments(

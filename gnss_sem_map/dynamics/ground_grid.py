@@ -41,7 +41,7 @@ def closer_than(
     """Mask (n,) of the `asked` points (n, 2 or 3) m whose distance to a marked point is less than `reach_m`."""
     found = np.zeros(len(points), np.bool_)
     if reach_m > 0 and marked.any():
-        _closer_than(points, marked, asked, reach_m, found)
+        _closer_than(np.ascontiguousarray(points), marked, asked, reach_m, found)
     return found
 
 

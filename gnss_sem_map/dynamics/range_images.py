@@ -73,7 +73,8 @@ def draw(p_map, T_lidar_map, row_of, image):
             row = row_of[cells[i]]
             pixel = row * WIDTH + columns[i] + 1
             drawn[pixel] = min(drawn[pixel], depths[i] if row > 0 else EMPTY)
-    image[:, 0], image[:, -1] = image[:, -2], image[:, 1]
+    for row in range(len(image)):
+        image[row, 0], image[row, -1] = image[row, -2], image[row, 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

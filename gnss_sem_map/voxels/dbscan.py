@@ -65,7 +65,7 @@ def _dbscan_sorted(
     voxels: NDArray[np.int64], positions: NDArray[np.int64], stencil: NDArray[np.int64], min_samples: int
 ) -> NDArray[np.int32]:
     """Clusters of sorted voxels, numbered in the order of `positions`: where the input's voxels now are."""
-    x, y, z = (voxels + AXIS_OFFSET).T
+    x, y, z = np.ascontiguousarray((voxels + AXIS_OFFSET).T)
     columns = ((x + _MARGIN) << _Y_BITS | (y + _MARGIN)) << _BLOCK_BITS
     keys, masks, first, own, bits = _words(columns, z)
     parents = np.arange(len(voxels))

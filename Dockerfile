@@ -1,9 +1,10 @@
 # The package on a CPU; without a command it runs the demo into /data/demo:
 #   docker build -t gnss-sem-map . && docker run --rm -v "$PWD:/data" gnss-sem-map
-# --build-arg EXTRAS='[segmentation]' adds torch: its CPU build where pip is told to take that one.
+# --build-arg EXTRAS='[segmentation]' adds torch; --build-arg PIP_EXTRA_INDEX_URL=... names the index of its CPU builds, which pip then prefers.
 FROM python:3.11-slim
 # --build-arg VERSION=1.2.3 names the version, which is otherwise the fallback: .git is not copied.
 ARG EXTRAS=""
+ARG PIP_EXTRA_INDEX_URL
 ARG VERSION=""
 # GDAL in the wheel of rasterio needs it, and slim images may lack it
 RUN apt-get update && apt-get install --yes --no-install-recommends libexpat1 && rm -rf /var/lib/apt/lists/*

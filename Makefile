@@ -11,13 +11,14 @@ TOOLS := $(VENV)/.tools
 unexport PYTHONDONTWRITEBYTECODE
 
 # uv installs in seconds what takes pip a minute. It does not read the settings of pip, so it is told them; where it
-# cannot be had, or fails, pip does it.
+# cannot be had, or fails, pip does it. Not with UV_TORCH_BACKEND, which pip does not know: it would take a build with CUDA.
 SETTINGS := s/^[^=]*\.index-url=/export UV_DEFAULT_INDEX=/p; s/^[^=]*\.extra-index-url=/export UV_INDEX=/p; \
   s/^[^=]*\.cert=/export SSL_CERT_FILE=/p; s/^[^=]*\.find-links=/export UV_FIND_LINKS=/p
 define install
 	eval "$$($(BIN)/pip config list | sed -n '$(SETTINGS)')"; \
 	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(1)' || \
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'
+	{ test -z "$$UV_TORCH_BACKEND" && \
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'; }
 endef
 
 .PHONY: test test-unit test-slow test-demo test-faults check demo notebooks docs package clean

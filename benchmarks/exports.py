@@ -11,8 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import os
-import platform
 import resource
 import time
 from collections.abc import Iterator
@@ -22,6 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from results_file import keep
 
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS
@@ -58,14 +57,10 @@ def main() -> None:
         attributes=None if attributes is None else RepeatedAttributes.over(attributes, small, source),
     )
     voxels = copies * sum(map(len, small))
-    results: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        "map": {"million_voxels": round(voxels / 1e6, 1), "tiles": len(exported.map.tiles)},
-    }
+    about = {"million_voxels": round(voxels / 1e6, 1), "tiles": len(exported.map.tiles)}
     for name, figures in costs(exported, voxels, arguments.formats.split(",")):
-        results.setdefault("formats", {})[name] = figures
+        keep(arguments.out, {name: about | figures}, "laspy", "rasterio")
         print(name, json.dumps(figures), flush=True)
-    arguments.out.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
 
 
 def places(small: TiledMap, copies: int) -> dict[Tile, Tile]:

@@ -12,7 +12,6 @@ demo's network, which has learnt from seeds 1 to 100 and was chosen and calibrat
 """
 
 import argparse
-import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from results_file import keep
 
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
@@ -227,17 +227,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[103, 104])
     parser.add_argument("--out", type=Path, default=here / "results" / "fusion.json")
     asked = parser.parse_args()
-    results = json.loads(asked.out.read_text("utf-8")) if asked.out.is_file() else {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         real = list(semantic_kitti(asked.data))
         if real:
-            results["semantic_kitti"] = report("SemanticKITTI", compare(real, folder))
+            keep(asked.out, {"semantic_kitti": report("SemanticKITTI", compare(real, folder))})
         towns = list(simulated(folder, asked.seeds, asked.seconds))
         if towns:
-            results["simulated"] = report("simulated", compare(towns, folder))
-    asked.out.parent.mkdir(exist_ok=True)
-    asked.out.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+            keep(asked.out, {"simulated": report("simulated", compare(towns, folder))}, "torch")
 
 
 if __name__ == "__main__":

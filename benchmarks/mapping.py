@@ -13,14 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +29,7 @@ import numpy_chain
 from mapping_peers import duckdb_groups, kiss_icp_map, open3d_hash, pandas_groups, polars_groups
 from numba import njit
 from numpy.typing import NDArray
+from results_file import keep
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
@@ -353,33 +352,22 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=240)
     parser.add_argument("--large", action="store_true")
     given = parser.parse_args()
-    results: Figures = {
-        "machine": platform.processor() or platform.machine(), "python": platform.python_version(),
-        "versions": {name: version(name) for name in ("numpy", "numba", "pyarrow")}, "drives": {},
-    }  # fmt: skip
-    missing: list[str] = []
+    drives: Figures = {}
     for drive, spec in zip(given.drives[::2], given.drives[1::2], strict=True):
-        results["drives"][Path(drive).name], missing = measure(Path(drive), spec, given.scans)
-        results["not installed"] = missing
-        write(results)
+        drives[Path(drive).name], missing = measure(Path(drive), spec, given.scans)
+        write({"drives": drives, "not installed": missing})
     short, long = _child("peak_of(277)"), _child("peak_of(2769)")
-    results["peak memory"] = {
-        "277 scans": short, "2769 scans": long, "ratio": long["peak_mb"] / short["peak_mb"]
-    }  # fmt: skip
-    write(results)
+    peaks = {"277 scans": short, "2769 scans": long, "ratio": long["peak_mb"] / short["peak_mb"]}
+    write({"peak memory": peaks})
     if given.large:
         job = open_job(Path(given.drives[0]), given.drives[1], 20)
-        results["floor, 5e7 voxels"] = over_the_floor(seen_of(job), 50_000_000)
-        write(results)
+        write({"floor, 5e7 voxels": over_the_floor(seen_of(job), 50_000_000)})
 
 
 def write(results: Figures) -> None:
-    """Print and keep what was measured so far."""
-    text = json.dumps(results, indent=1, default=float)
-    print(text, flush=True)
-    folder = Path(__file__).parent / "results"
-    folder.mkdir(exist_ok=True)
-    (folder / "mapping.json").write_text(text + "\n", "utf-8")
+    """Print and keep some results."""
+    print(json.dumps(results, indent=1, default=float), flush=True)
+    keep(Path(__file__).parent / "results" / "mapping.json", results, "numpy", "numba", "pyarrow")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from refinement import mapped, perfectly_seen, what_they_do
+from results_file import keep
 from scipy.interpolate import CubicSpline
 
 from gnss_sem_map.dynamics.movers import Mover, movers_of
@@ -56,8 +57,7 @@ def main() -> None:
         figures = scored(movers_of(objects, ("vehicle",)), true_objects(folder))
         name = f"{folder.name}{', without labels' if options.without_labels else ''}"
         print(json.dumps({name: figures}, indent=1), flush=True)
-        known = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
-        RESULTS.write_text(json.dumps(known | {name: figures}, indent=1) + "\n", "utf-8")
+        keep(RESULTS, {name: figures})
 
 
 def true_objects(folder: Path) -> list[TrueObject]:

@@ -31,6 +31,7 @@ import tracklets
 from chunks import build_maps
 from numpy.typing import NDArray
 from refinement_kernels import clocked, count_grid_beside_bincount, dbscan_beside_sklearn, tile_by_tile
+from results_file import keep
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
@@ -89,27 +90,26 @@ def main() -> None:
     if unknown := set(parts) - set(PARTS):
         parser.error(f"found parts {sorted(unknown)}, expected some of {PARTS}")
     if options.run is not None:
-        keep(f"tiles, {options.run.name}", tile_by_tile(options.run))
+        report(f"tiles, {options.run.name}", tile_by_tile(options.run))
     if "kernels" in parts:
-        keep("dbscan", dbscan_beside_sklearn(options.large))
-        keep("count_grid", count_grid_beside_bincount(options.large))
+        report("dbscan", dbscan_beside_sklearn(options.large))
+        report("count_grid", count_grid_beside_bincount(options.large))
     if "raw" in parts and (options.data / RAW_0005).is_dir():
-        keep("removal, raw drive 0005, excerpt", on_raw_drive(options.data))
+        report("removal, raw drive 0005, excerpt", on_raw_drive(options.data))
     if "semantics" in parts and (options.data / RAW_0005).is_dir():
-        keep("semantics, SemanticKITTI 00 and 08", on_semantic_kitti(options.data))
+        report("semantics, SemanticKITTI 00 and 08", on_semantic_kitti(options.data))
     with tempfile.TemporaryDirectory() as folder:
         drives = [*options.simulated, *simulated(Path(folder), options.seeds, options.seconds)]
         for drive in drives if "simulated" in parts else []:
-            keep(f"removal, simulated, {drive.name}", on_simulated_drive(drive))
+            report(f"removal, simulated, {drive.name}", on_simulated_drive(drive))
         for drive in drives if "semantics" in parts else []:
-            keep(f"semantics, simulated, {drive.name}", semantics_of_simulated_drive(drive))
+            report(f"semantics, simulated, {drive.name}", semantics_of_simulated_drive(drive))
 
 
-def keep(name: str, figures: Figures) -> None:
+def report(name: str, figures: Figures) -> None:
     """Print them, and write them among those of the parts that were measured before."""
     print(json.dumps({name: figures}, indent=1), flush=True)
-    known = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
-    RESULTS.write_text(json.dumps(known | {name: figures}, indent=1) + "\n", "utf-8")
+    keep(RESULTS, {name: figures}, "numpy", "scikit-learn")
 
 
 def by_the_paper(drive: Drive) -> Points:

@@ -17,6 +17,7 @@ from typing import Any
 
 import bags
 import numpy as np
+from results_file import keep
 
 from gnss_sem_map import open_drive, run
 from gnss_sem_map.evaluation.score_run import score_run
@@ -46,15 +47,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102, 103])
     parser.add_argument("--out", type=Path, default=RESULTS)
     chosen = parser.parse_args()
-    found = json.loads(chosen.out.read_text()) if chosen.out.exists() else {}
     for case in CASES if chosen.only is None else (chosen.only,):
-        found[case] = (
+        found = (
             surround(chosen.folder) if case == "surround"
             else rings(chosen.folder, chosen.seeds) if case == "rings"
             else bags.figures(chosen.folder)
         )  # fmt: skip
-        chosen.out.write_text(json.dumps(found, indent=1) + "\n")
-    print(json.dumps(found, indent=1))
+        keep(chosen.out, {case: found})
+        print(json.dumps({case: found}, indent=1))
 
 
 def simulated(simulation: Simulation, folder: Path, seed: int) -> tuple[Path, Path]:

@@ -14,7 +14,6 @@ import argparse
 import hashlib
 import json
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -22,12 +21,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from cut_drive import cut_all
+from results_file import keep
 
 RESULTS = Path(__file__).parent / "results" / "scale.json"
 COUNT_READS = """
@@ -308,20 +307,14 @@ def main() -> None:
     parser.add_argument("--work", type=Path)
     parser.add_argument("--only", nargs="*", choices=sorted(CASES), default=sorted(CASES))
     given = parser.parse_args()
-    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     with tempfile.TemporaryDirectory() as temporary:
         work = given.work or Path(temporary)
         drives = Drives(given.drive.resolve(), given.probabilities.resolve(), work)
         for name in given.only:
             with tempfile.TemporaryDirectory(dir=work) as out:
-                known[name] = CASES[name](drives, Path(out))
-            print(name, json.dumps(known[name], indent=1), flush=True)
-            known["machine"] = {
-                "cores": os.cpu_count(),
-                "python": platform.python_version(),
-                "gnss-sem-map": version("gnss-sem-map"),
-            }
-            RESULTS.write_text(json.dumps(known, indent=1) + "\n")
+                found = CASES[name](drives, Path(out))
+            print(name, json.dumps(found, indent=1), flush=True)
+            keep(RESULTS, {name: found})
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from results_file import keep
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from sessions_changes import score_changes
@@ -314,7 +314,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS)
     parser.add_argument("--only", nargs="*", choices=CASES, default=CASES)
     words = parser.parse_args()
-    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         work = words.work or Path(folder)
         for case in words.only:
@@ -324,12 +323,10 @@ def main() -> None:
             else:
                 found = real() if case == "real" else simulated(case, words.seeds, work)
             if found is not None:
-                known[case] = found
+                keep(RESULTS, {case: found})
                 print(
                     json.dumps({name: figure for name, figure in found.items() if name != "seeds"}, indent=1)
                 )
-    known["machine"] = {"cores": os.cpu_count(), "processor": platform.processor() or platform.machine()}
-    RESULTS.write_text(json.dumps(known, indent=1) + "\n")
 
 
 if __name__ == "__main__":

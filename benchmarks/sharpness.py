@@ -9,21 +9,19 @@ prints the tables and writes benchmarks/results/sharpness.json. The real excerpt
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import tempfile
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from results_file import keep
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors
@@ -371,17 +369,10 @@ def main() -> None:
         "-o", "--output", type=Path, default=Path(__file__).parent / "results" / "sharpness.json"
     )
     arguments = parser.parse_args()
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    results = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
-    results["machine"] = (
-        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()},"
-        f" small_gicp {version('small_gicp')}, gtsam {version('gtsam')}"
-    )
     for part in arguments.only:
         found = PARTS[part](arguments.seconds)
         if found is not None:
-            results[part] = found
-        arguments.output.write_text(json.dumps(results, indent=1) + "\n")
+            keep(arguments.output, {part: found}, "small_gicp", "gtsam")
     print(f"\nwritten to {arguments.output}")
 
 

@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from results_file import keep
+
 from gnss_sem_map.simulation import prepare
 
 RESULTS = Path(__file__).parent / "results" / "simulation.json"
@@ -35,7 +37,7 @@ def main() -> None:
         "scans": rate(simulation.scan, range(0, 300, 2), cores),
         "images": rate(simulation.image, range(0, 300, 6), cores),
     }
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
+    keep(arguments.out, result)
     print(json.dumps(result, indent=1))
 
 

@@ -6,17 +6,15 @@ prints the tables and writes benchmarks/results/trajectory.json. Times are CPU s
 """
 
 import argparse
-import json
-import platform
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from results_file import keep
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import anees_band, coverage, errors, nees, pose_nees, state_error
@@ -350,12 +348,9 @@ def main() -> None:
         "-o", "--output", type=Path, default=Path(__file__).parent / "results" / "trajectory.json"
     )
     arguments = parser.parse_args()
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    results = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
-    results["machine"] = f"{platform.machine()}, Python {platform.python_version()}, gtsam {version('gtsam')}"
     for part in arguments.only:
-        results[part] = {"seeds": arguments.seeds} | PARTS[part](arguments.seeds)
-        arguments.output.write_text(json.dumps(results, indent=1) + "\n")
+        found = {"seeds": arguments.seeds} | PARTS[part](arguments.seeds)
+        keep(arguments.output, {part: found}, "gtsam")
     print(f"\nwritten to {arguments.output}")
 
 

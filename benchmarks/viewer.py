@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from results_file import keep
 
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.labels.label_set import open_label_set
@@ -40,12 +41,11 @@ def main() -> None:
     parser.add_argument("--tiles", type=int, nargs="+", default=[4, 15], help="along the edge of the town")
     parser.add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    results = []
     for edge in arguments.tiles:
         with multiprocessing.get_context("spawn").Pool(1) as fresh:  # a peak of its own
-            results.append(fresh.apply(cost, (edge,)))
-        print(json.dumps(results[-1]))
-    arguments.out.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+            found = fresh.apply(cost, (edge,))
+        print(json.dumps(found))
+        keep(arguments.out, {f"{edge} x {edge} tiles": found})
 
 
 def cost(edge: int) -> dict[str, Any]:

@@ -7,13 +7,11 @@ prints a table and writes benchmarks/results/wheels.json. The wheels are those o
 """
 
 import argparse
-import json
-import platform
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from results_file import keep
 from trajectory import FRAME, LEVER, OUTAGES, judge, mounted, simulate
 
 from factor_graphs.measurements import WheelSpeeds
@@ -94,13 +92,8 @@ def main() -> None:
         "-o", "--output", type=Path, default=Path(__file__).parent / "results" / "wheels.json"
     )
     arguments = parser.parse_args()
-    results = {
-        "machine": f"{platform.machine()}, Python {platform.python_version()}, gtsam {version('gtsam')}",
-        "seeds": arguments.seeds,
-        "drives": compare(arguments.seeds),
-    }
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(results, indent=1) + "\n")
+    results = {"seeds": arguments.seeds, "drives": compare(arguments.seeds)}
+    keep(arguments.output, results, "gtsam")
     print(f"\nwritten to {arguments.output}")
 
 

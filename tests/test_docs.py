@@ -204,5 +204,5 @@ def test_every_benchmark_has_its_figures_its_command_and_its_commit() -> None:
     for file in (ROOT / "benchmarks" / "results").glob("*.json"):
         section = page.split(f"\n## {file.stem}\n")[1].split("\n## ")[0]
         assert f"python benchmarks/{file.stem}.py" in section
-        assert "Commit: " in section
+        assert "Measured on:" in section
         assert "| figure |" in section

@@ -37,6 +37,26 @@ def test_the_settings_of_pip_are_handed_to_uv() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("backend", "asked"), [({}, ["uv", "pip"]), ({"UV_TORCH_BACKEND": "cpu"}, ["uv"])], ids=["none", "cpu"]
+)
+def test_pip_takes_the_place_of_uv_unless_a_build_of_torch_is_asked_for(
+    backend: dict[str, str], asked: list[str], tmp_path: Path
+) -> None:
+    """pip does not know of it, and would take another build."""
+    for name, code in (("uv", 1), ("pip", 0)):
+        program = tmp_path / name
+        program.write_text(
+            f'#!/bin/sh\nfor word; do test "$word" = install && echo {name}; done\nexit {code}\n'
+        )
+        program.chmod(0o755)
+    words = ["make", "--silent", f"BIN={tmp_path}", "--eval", "try:\n\t$(call install,.)", "try"]
+    environment = {name: value for name, value in os.environ.items() if name != "UV_TORCH_BACKEND"} | backend
+    done = subprocess.run(words, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == asked
+    assert (done.returncode == 0) == (not backend)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("platform", "macos"),

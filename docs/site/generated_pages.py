@@ -211,24 +211,35 @@ def api_page() -> str:
 
 
 def benchmarks_page() -> str:
-    """All figures of benchmarks/results/, with command, machine and the commit that wrote them."""
+    """All figures of benchmarks/results/, with command, machine and commit, as far as they are recorded."""
     parts = [
-        "# Benchmarks\n\nAll figures that the benchmarks wrote, as they are in `benchmarks/results/`, with the commit "
-        "that wrote them. What they mean: [results](results.md), [scale](scale.md), [sessions](sessions.md). "
+        "# Benchmarks\n\nAll figures that the benchmarks wrote, as they are in `benchmarks/results/`, with the machine "
+        "and the commit that they were measured with, and the last commit that changed the file. "
+        "What they mean: [results](results.md), [scale](scale.md), [sessions](sessions.md). "
         "Names carry the units; a share is between 0 and 1. Compare ratios between machines, not times.\n"
     ]
     for file in sorted((BENCHMARKS / "results").glob("*.json")):
         figures = json.loads(file.read_text("utf-8"))
         about = ast.get_docstring(ast.parse((BENCHMARKS / f"{file.stem}.py").read_text("utf-8"))) or ""
         command = re.search(r"python benchmarks/.*(?:\n +[\[-].*)*", about)
-        machine = figures.pop("machine", None) if isinstance(figures, dict) else None
+        made_by = _made_by(figures)
         parts.append(f"\n## {file.stem}\n\n{about.splitlines()[0]}\n\n")
         parts.append(f"```text\n{command[0] if command else ''}\n```\n\n")
-        parts.append(
-            f"Machine: {_in_words(machine) or 'not recorded in the file'}. Commit: {_commit(file)}.\n"
-        )
+        parts.append(f"{made_by}\n\nLast change of the file: {_commit(file)}.\n")
         parts += _figures(figures, "")
     return "".join(parts)
+
+
+def _made_by(figures: dict[str, Any]) -> str:
+    """Machine and commit of every part of some results, which are taken out of them; old results name but a machine."""
+    made, machine = figures.pop("made by", {}), figures.pop("machine", None)
+    old = f"{_in_words(machine) or 'machine not recorded'}, commit not recorded"
+    parts: dict[str, list[str]] = {}
+    for name in figures:
+        parts.setdefault(made.get(name, old), []).append(_escaped(name))
+    if len(parts) == 1:
+        return f"Measured on: {next(iter(parts))}."
+    return "Measured on:\n\n" + "\n".join(f"- {', '.join(names)}: {by}" for by, names in parts.items())
 
 
 def _commit(file: Path) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import os
 import sys
 import warnings
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn, cast
 
 import typer
 
@@ -21,7 +23,7 @@ from gnss_sem_map.cli import (
     settings,
     simulation,
 )
-from gnss_sem_map.cli.signals import Stopped, ignore_signals
+from gnss_sem_map.cli.signals import Stopped, caused_by_signal, ignore_signals
 from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
@@ -103,14 +105,16 @@ def main() -> None:
     collect_seldom()
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # of other packages; ours are printed by the commands
+    stopped_by = 0
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names that are no UTF-8
     try:
-        code = app(prog_name="gnss-sem-map", standalone_mode=False)
+        code = _called()
         sys.stdout.flush()
     except Stopped as stopped:
-        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped.number)
+        stopped_by = stopped.number
+        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped_by)
     except typer.TyperException as error:
         code = _wrong_usage(error)
     except (SemMapError, FactorGraphError) as error:
@@ -125,7 +129,26 @@ def main() -> None:
     except (UnicodeError, RecursionError) as error:
         code = _say(f"{type(error).__name__} {error}", 1)
     logs.PROGRAM.info("exit code %s", code or 0)
+    if stopped_by:
+        _end_now(128 + stopped_by)
     sys.exit(code)
+
+
+def _called() -> int | None:
+    try:
+        return cast("int | None", app(prog_name="gnss-sem-map", standalone_mode=False))
+    except Exception as error:
+        if stopped := caused_by_signal(error):
+            raise stopped from error
+        raise
+
+
+def _end_now(code: int) -> NoReturn:
+    """End the process without waiting for its threads: what a network computes there is not needed."""
+    atexit._run_exitfuncs()
+    with suppress(OSError):
+        sys.stdout.flush()
+    os._exit(code)
 
 
 def _say(message: str, code: int) -> int:

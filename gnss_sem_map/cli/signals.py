@@ -8,10 +8,19 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
-LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset")
-"""Modules whose functions take locks: one that is left between taking a lock and giving it back blocks all threads."""
-IMPORTING = ("importlib._bootstrap", "_frozen_importlib")
-"""Modules that import others: one of their functions is below whatever an import runs."""
+LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset", "contextlib")
+"""Modules whose functions take locks, or enter and leave blocks that do: one that is left between taking a lock and
+giving it back blocks all threads."""
+WHOLE = (
+    "importlib._bootstrap",
+    "_frozen_importlib",
+    "tempfile",
+    "gnss_sem_map.files.output_folder",
+    "gnss_sem_map.files.work_folder",
+    "gnss_sem_map.files.atomic",
+)
+"""Modules whose functions are finished with all that they call: an import, and what makes, replaces or removes results.
+A block in which such a folder is claimed is not below them."""
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
 
@@ -22,6 +31,10 @@ class Stopped(BaseException):
     def __init__(self, number: int) -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}")
         self.number = number
+
+
+_arrived: list[int] = []
+"""Signals that arrived."""
 
 
 def stop_on_signals() -> None:
@@ -35,6 +48,16 @@ def stop_on_signals() -> None:
             signal.signal(number, _stop)
 
 
+def caused_by_signal(error: Exception) -> Stopped | None:
+    """Compiled code may turn Stopped into an error of its own: what fails after a signal was stopped by it."""
+    if not _arrived:
+        return None
+    stopped = Stopped(_arrived[0])
+    for note in getattr(error, "__notes__", []):
+        stopped.add_note(note)
+    return stopped
+
+
 def ignore_signals() -> None:
     """Ignore signals while the program ends."""
     signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -43,6 +66,7 @@ def ignore_signals() -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
+    _arrived.append(number)
     if not _must_go_on(frame):
         raise Stopped(number)
     _stop_later(number, frame)
@@ -62,17 +86,17 @@ def _stop_later(number: int, seen: FrameType | None = None) -> None:
 
 
 def _must_go_on(frame: FrameType | None) -> bool:
-    """Whether a function that takes locks is on top, or a module is being imported.
+    """Whether a function that takes locks is on top, or one that must be finished is below.
 
-    An import that is left may crash in compiled code, and some modules drop every exception of what they import.
+    An import that is left may crash in compiled code, and some modules drop every exception of what they import. A
+    folder that is claimed or given back is otherwise left with its lock, or half removed.
     """
-    if frame is None:
-        return False
-    if _module_of(frame).startswith(LOCKING):
+    if frame is not None and _module_of(frame).startswith(LOCKING):
         return True
-    while (frame := frame.f_back) is not None:
-        if _module_of(frame).startswith(IMPORTING):
+    while frame is not None:
+        if _module_of(frame).startswith(WHOLE):
             return True
+        frame = frame.f_back
     return False
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.prefetch import thread_pool
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def write_exports(exported: Exported, folder: Path, progress: Progress = silent)
         each for each in FORMATS if not each.on_demand and (is_georeferenced or not each.needs_georeference)
     ]
     _ = exported.extent  # once, before both threads ask for it
-    with ThreadPoolExecutor(2 if exported.extent.count < SMALL else 1) as pool:
+    with thread_pool(2 if exported.extent.count < SMALL else 1) as pool:
         # the last takes longest, so it begins
         writing = [pool.submit(write, one) for one in reversed(possible)]
         for done, each in enumerate(as_completed(writing), 1):

@@ -232,7 +232,8 @@ def measure_tiles(
 
 def _measure(tile: Tile, inputs: _Inputs, around: str, made_in: Path) -> dict[str, int]:
     around_tile = inputs.raw.around(tile, inputs.sums_halo)
-    sums = sums_of(tile, around_tile, Evidence(sensor_model=inputs.model), inputs.steps).to_json()
+    beside = Evidence(inputs.raw.evidence.moved.around(tile, 0), inputs.model)
+    sums = sums_of(tile, around_tile, beside, inputs.steps).to_json()
     write_record({"around": around, "sums": sums}, _sums_file(tile, made_in))
     return sums
 

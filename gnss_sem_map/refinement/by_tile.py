@@ -24,6 +24,7 @@ from gnss_sem_map.refinement import (
     geometric_prior,
     height_above_ground,
     kerb_points,
+    removed_layer,
     systematic_error,
     vehicles,
 )
@@ -54,7 +55,7 @@ def sums_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
 
 
 def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
-    """What a tile adds to the figures of the whole map, from the voxels of the tile and its halo."""
+    """What a tile adds to the figures of the map, from the voxels of the tile and its halo, and what moved there."""
     size = around.voxel_size_m
     around = around[places_around(around, tile, sums_halo_m(settings, size))]
     heights = height_above_ground.height_over_ground(around.centres)
@@ -64,6 +65,7 @@ def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: Refinement
     images = state.scores
     state, _ = do(STEPS[1], state, settings)
     own, sums = _inside(state.voxels, tile), Sums()
+    moved = None if beside.moved is None else beside.moved[places_around(beside.moved, tile, 0)]
     measured = (
         (
             settings.systematic_error,
@@ -71,6 +73,7 @@ def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: Refinement
         ),
         (settings.count_grid, lambda: count_grid.measure(state, settings.count_grid, own)),
         (settings.vehicles, lambda: vehicles.measure(state, settings.vehicles, own)),
+        (settings.removed_layer, lambda: removed_layer.measure(moved)),
     )
     for section, measure in measured:
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Literal
 
@@ -16,6 +15,7 @@ from scipy.special import gammaln
 
 from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
 from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of
+from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
@@ -130,7 +130,7 @@ def count_grid(
     if len(slabs) == 1:
         count(slabs[0])
         return counts
-    with ThreadPoolExecutor(THREADS) as pool:
+    with thread_pool(THREADS) as pool:
         list(pool.map(count, slabs))  # a list: raises what a slab raised
     return counts
 

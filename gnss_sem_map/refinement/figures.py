@@ -19,7 +19,7 @@ MOST_SYSTEMATIC = 0.5
 PSEUDO_COUNTS = 3.0
 """Overdispersion: a column's share of right labels is Beta with so many pseudo-counts, since views err as a whole."""
 LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
-"""Limits of the error rate that is estimated from the map: self-agreement is not accuracy."""
+"""Limits of an error rate that is estimated from the map: self-agreement is not accuracy."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,10 @@ class Sums:
     """Voxels called building,"""
     vegetation: int = 0
     roads: int = 0
+    moved: int = 0
+    """Points of moving objects in voxels that some image shows,"""
+    moved_otherwise: int = 0
+    """and of these, the ones in voxels that the images call something else than vehicle."""
 
     def __add__(self, other: Sums) -> Sums:
         return Sums(**{name: value + getattr(other, name) for name, value in asdict(self).items()})
@@ -74,6 +78,8 @@ class Figures:
     building_log_odds: float = 0.0
     """Of building against vegetation, before anything is seen."""
     has_road: bool = True
+    moved_otherwise: float = 1.0
+    """Share of the points of moving objects that are of no vehicle, by the images; 1 where no image shows any."""
 
 
 def figures_of(sums: Sums) -> Figures:
@@ -84,6 +90,7 @@ def figures_of(sums: Sums) -> Figures:
         _rounded(column_error_rate(sums)),
         _rounded(float(odds), 10 * STEP),
         sums.roads > 0,
+        _rounded(moved_otherwise(sums)),
     )
 
 
@@ -113,6 +120,11 @@ def column_error_rate(sums: Sums) -> float:
     product = disagreement * (PSEUDO_COUNTS + 1) / (2 * PSEUDO_COUNTS)
     rate = (1 - np.sqrt(max(1 - 4 * product, 0.0))) / 2
     return float(np.clip(rate, LEAST_ERROR_RATE, MOST_ERROR_RATE))
+
+
+def moved_otherwise(sums: Sums) -> float:
+    """Share of the points of moving objects that are of no vehicle, by what the images say of those that they show."""
+    return max(sums.moved_otherwise / sums.moved, LEAST_ERROR_RATE) if sums.moved else 1.0
 
 
 def _rounded(value: float, step: float = STEP) -> float:

@@ -1,15 +1,22 @@
-"""Removed is a layer, not a loss: what moved comes back into the map as voxels that are not shown."""
+"""Removed is a layer, not a loss: what moved comes back into the map as voxels that are not shown.
+
+They are called vehicles because they moved, not because of what an image says. How often that is true is read off
+those that images show, and holds for the others as well: most movers are beside or behind the car, in no image.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gnss_sem_map.labels.label_set import UNLABELLED
+from gnss_sem_map.refinement.figures import Sums
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
 from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State, entropy_of
-from gnss_sem_map.voxels.voxel_map import VoxelMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, softmax
 
 
 class RemovedLayerSettings(StepSettings):
@@ -26,14 +33,46 @@ def apply(state: MapState, settings: RemovedLayerSettings) -> MapState:
     if state.beside.moved is None:
         raise NotApplicable("moving objects were not sought")
     assert state.decided is not None
-    return replace(state, decided=with_removed(state.decided, state.beside.moved))
+    return replace(
+        state, decided=with_removed(state.decided, state.beside.moved, state.figures.moved_otherwise)
+    )
 
 
-def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
+def measure(moved: VoxelMap | None) -> Sums:
+    """How many points of moving objects images show, and of these, how many they call no vehicle.
+
+    Points, not voxels: the more points a voxel has, the surer is what the images say of it.
+    """
+    if moved is None or "vehicle" not in moved.label_set.names:
+        return Sums()
+    otherwise = moved.observed & (moved.labels != moved.label_set.index("vehicle"))
+    return Sums(
+        moved=int(moved.hits[moved.observed].sum(dtype=np.int64)),
+        moved_otherwise=int(moved.hits[otherwise].sum(dtype=np.int64)),
+    )
+
+
+def probabilities_of(moved: VoxelMap, otherwise: float) -> NDArray[np.float32]:
+    """Class probabilities (v, c) of moving objects, a share of which is `otherwise` than vehicle.
+
+    Bayes' rule: the share is the prior, divided alike among the other classes, and the images are the evidence. The
+    prior of a vehicle is at least that of any class, so a share of 1 says nothing.
+    """
+    if "vehicle" not in moved.label_set.names:
+        return moved.probabilities
+    count = len(moved.label_set.names)
+    vehicle = max(1 - otherwise, 1 / count)
+    scores = moved.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT)
+    scores[:, moved.label_set.index("vehicle")] += np.float32(np.log(vehicle * (count - 1) / (1 - vehicle)))
+    return softmax(scores)
+
+
+def with_removed(static: SemanticMap, removed: VoxelMap, otherwise: float = 1.0) -> SemanticMap:
     """The map with a layer of REMOVED voxels, of class vehicle, wherever nothing of the static map stands.
 
-    Where something stands, its evidence and its decision stay, and the hits of what moved through are counted beside
-    its own, in `hits_removed`: no point is lost. Raises DataError for another voxel size or class set.
+    A share of what moved is `otherwise` than vehicle, see `probabilities_of`. Where something stands, its evidence and
+    its decision stay, and the hits of what moved through are counted beside its own, in `hits_removed`: no point is
+    lost. Raises DataError for another voxel size or class set.
     """
     alone = removed[static.voxels.indices_of(removed.keys) < 0]
     voxels = static.voxels + alone
@@ -45,11 +84,12 @@ def with_removed(static: SemanticMap, removed: VoxelMap) -> SemanticMap:
     reasons = np.full(len(voxels), Reason.MOVED, np.uint8)
     labels[kept], confidence[kept], states[kept] = static.labels, static.confidence, static.states
     reasons[kept] = static.told_reasons
-    confidence[added] = alone.probabilities[:, vehicle] if vehicle != UNLABELLED else 0.0
+    probabilities = probabilities_of(alone, otherwise)
+    confidence[added] = probabilities[:, vehicle] if vehicle != UNLABELLED else 0.0
     entropy = None
     if static.entropy is not None:
         entropy = np.empty(len(voxels), np.float32)
-        entropy[kept], entropy[added] = static.entropy, entropy_of(alone.probabilities)
+        entropy[kept], entropy[added] = static.entropy, entropy_of(probabilities)
     refined = SemanticMap(voxels, labels, confidence, states, entropy, reasons=reasons)
     return refined if len(alone) == len(removed) else _with_hits(refined, static, removed)
 

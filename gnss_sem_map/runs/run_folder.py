@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ from gnss_sem_map.runs.about import (
 )
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.source import Source, source_of
+from gnss_sem_map.scans.prefetch import leaving_all
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
@@ -67,9 +68,11 @@ def is_run_file(name: str) -> bool:
     return RUN_FILES.fullmatch(name) is not None
 
 
-def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> AbstractContextManager[Claim]:
+@contextmanager
+def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> Iterator[Claim]:
     """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
-    return claimed(out, inputs, is_run_file)
+    with claimed(out, inputs, is_run_file) as claim, leaving_all():
+        yield claim
 
 
 def places_read(

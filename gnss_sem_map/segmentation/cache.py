@@ -21,7 +21,7 @@ from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.scans.prefetch import leaving_all, prefetch, unless_left
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
 
@@ -143,14 +143,14 @@ def _segment(
     """Segment a batch at once if the segmenter can; one by one if it cannot, or if one image is damaged."""
     if isinstance(segmenter, BatchSegmenter) and len(batch) > 1:
         try:
-            yield from zip(batch, segmenter.segment_many(batch), strict=True)
+            yield from zip(batch, unless_left(segmenter.segment_many, batch), strict=True)
             return
         except DataError:
             pass  # some image is damaged: the loop below finds out which
     ask = segmenter.on_one_core if on_one_core and isinstance(segmenter, ThreadedSegmenter) else segmenter
     for image in batch:
         try:
-            yield image, ask(image)
+            yield image, unless_left(ask, image)
         except MissingLabels as error:
             skips.append(Skip("labels", f"frame {image.frame}", str(error)))
         except DataError as error:
@@ -165,7 +165,7 @@ def _for_us_alone(folder: Path) -> Iterator[None]:
         real.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"cache {folder}: cannot be written ({error.strerror})") from None
-    with locked(real):
+    with locked(real), leaving_all():
         yield
 
 

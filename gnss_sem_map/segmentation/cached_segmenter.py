@@ -14,6 +14,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
+from gnss_sem_map.scans.prefetch import unless_left
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cache import write_probabilities
@@ -45,8 +46,9 @@ class CachedSegmenter:
             return np.asarray(read_probabilities(file)[0], np.uint8)
         except DataError:
             pass  # not saved yet, or damaged
+        answer = unless_left(self.segmenter, image)
         seen = class_image(
-            self.segmenter(image), self.segmenter.class_names, self.label_set, self.image_sizes[image.camera],
+            answer, self.segmenter.class_names, self.label_set, self.image_sizes[image.camera],
             f"labels of image {image.frame}",
         )  # fmt: skip
         write_probabilities(file, seen.probabilities, self.class_names)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,
@@ -217,7 +218,7 @@ class _Run:
 
     def _batches(self) -> Iterator[tuple[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]]]:
         steps = range(self._done + 1, self.settings.steps + 1)
-        with ThreadPoolExecutor(1) as thread:
+        with thread_pool(1) as thread:
             ahead: list[Future[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = []
             for step in steps:
                 while len(ahead) < 3 and step + len(ahead) in steps:

@@ -7,7 +7,6 @@ so neighbouring frames err together, as those of a real network do.
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Singles, kernel
 from gnss_sem_map.simulation.noise import value_noise
 
@@ -120,7 +120,7 @@ def write_corrupted_labels(
     def write(path: Path) -> None:
         _write_corrupted(path, targets[path.parent], keys[path.parent])
 
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with thread_pool(workers or os.cpu_count() or 1) as pool:
         for done, _ in enumerate(pool.map(write, paths), 1):
             if progress is not None:
                 progress(done, len(paths))

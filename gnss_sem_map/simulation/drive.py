@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.files.ownership import MARKER, read_list, write_list
+from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
@@ -250,7 +250,7 @@ def simulate(
         _write_still(simulation, partial)
         frames = len(simulation.sweeps)
         seen: list[npt.NDArray[np.uint16]] = []
-        with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+        with thread_pool(workers or os.cpu_count() or 1) as pool:
             for done, instances in enumerate(
                 pool.map(lambda k: _write_frame(simulation, k, partial / "sync"), range(frames)), 1
             ):

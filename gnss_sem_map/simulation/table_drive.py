@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +14,7 @@ import numpy as np
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
 
@@ -67,7 +67,7 @@ def render_frames(
 ) -> None:
     """Write all frames on some threads (None: one per core)."""
     frames = len(simulation.sweeps)
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with thread_pool(workers or os.cpu_count() or 1) as pool:
         for done, _ in enumerate(pool.map(write, range(frames)), 1):
             if progress is not None:
                 progress(done, frames)

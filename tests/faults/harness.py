@@ -14,6 +14,7 @@ import time
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 PRELOAD = [
@@ -88,8 +89,8 @@ def gnss_sem_map(
 ) -> Outcome:
     """Run a command; `folder` is where its output and its TMPDIR go, a new one for each trial.
 
-    `memory_mb` limits its address space, `file_mb` every file that it writes (as if the disk were full there); after
-    the seconds of `interrupt` it and all that it started get that signal; `user` is whose rights it has.
+    `memory_mb` limits its address space, `file_mb` every file that it writes (as if the disk were full there); the
+    seconds of `interrupt` after it begins, it and all that it started get that signal; `user` is whose rights it has.
     """
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / "tmp"
@@ -97,12 +98,15 @@ def gnss_sem_map(
     words = tuple(map(str, arguments))
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOAD)
+    ready = context.Event()
     start = time.perf_counter()
     process = context.Process(
-        target=_child, args=(words, folder, temporary, memory_mb, cwd, file_mb, user, stdout)
+        target=_child, args=(words, folder, temporary, memory_mb, cwd, file_mb, user, stdout, ready)
     )
     process.start()
-    if interrupt is not None:
+    if interrupt is not None and ready.wait(
+        timeout_s
+    ):  # before, there is no group of processes, and nothing to stop
         process.join(interrupt[0])
         if process.exitcode is None:
             os.killpg(process.pid or 0, interrupt[1])
@@ -146,6 +150,7 @@ def _child(
     file_mb: float | None,
     user: int | None,
     stdout: Path | None,
+    ready: Event,
 ) -> None:
     os.setsid()
     (folder / "out").touch()
@@ -169,7 +174,10 @@ def _child(
     code: int | str | None = 0
     try:
         from gnss_sem_map.cli import main
+        from gnss_sem_map.cli.signals import stop_on_signals
 
+        stop_on_signals()
+        ready.set()
         main()
     except SystemExit as end:
         code = end.code

@@ -13,10 +13,10 @@ from street import Street
 
 
 def stop(
-    street: Street, number: signal.Signals, after_s: float, folder: Path, *more: str
+    street: Street, number: signal.Signals, after_s: float, folder: Path, *more: str, segmenter: str = ""
 ) -> tuple[list[str], object]:
     """Stop a run after some seconds; what is wrong with its end, and how it ended."""
-    labels = f"labels:{street.labels}"
+    labels = segmenter or f"labels:{street.labels}"
     words = ("run", street.drive, "--segmenter", labels, "--set", "dynamics.window_scans=1", *more)
     outcome = gnss_sem_map(*words, "-o", folder / "out", folder=folder / "trial", interrupt=(after_s, number))
     faults = list(outcome.faults)
@@ -44,6 +44,21 @@ def test_a_signal_is_one_line(small_drive: Street, number, after_s: float, trial
 
 def test_a_signal_to_all_workers_is_one_line(small_drive: Street, trial, tmp_path: Path) -> None:
     trial("signals", *stop(small_drive, signal.SIGINT, 5.0, tmp_path, "--workers", "2"))
+
+
+@pytest.mark.parametrize(("command", "after_s"), [("segment", 2.0), ("run", 6.0)])
+def test_a_signal_ends_a_network_that_never_answers(
+    small_drive: Street, command: str, after_s: float, trial, tmp_path: Path
+) -> None:
+    """Threads wait for the network, and cannot be stopped: nothing waits for them."""
+    network = "python:faults.slow_network:never"
+    if command == "run":
+        trial("signals", *stop(small_drive, signal.SIGINT, after_s, tmp_path, segmenter=network))
+        return
+    words = (command, small_drive.drive, "--segmenter", network, "-o", tmp_path / "out")
+    outcome = gnss_sem_map(*words, folder=tmp_path / "trial", interrupt=(after_s, signal.SIGINT))
+    faults = [*outcome.faults, *[f"code {outcome.code}"] * (outcome.code != 128 + signal.SIGINT)]
+    trial("signals", [*faults, *["locked"] * (tmp_path / ".out.lock").exists()], outcome)
 
 
 @pytest.mark.faults

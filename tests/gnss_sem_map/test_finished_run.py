@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
+from html import unescape
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -18,9 +22,11 @@ from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.semantic_map import State
 
 MADE_ANEW = {"run.json", "report.html", ".gnss-sem-map.json"}
 """They say how long it took."""
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +38,44 @@ def finished(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> R
 def files(folder: Path) -> dict[str, bytes]:
     found = (path for path in folder.rglob("*") if path.is_file() and path.name not in MADE_ANEW)
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def rows_of(page: str) -> dict[str, list[str]]:
+    """First cell of every row of a report -> the others."""
+    rows = (
+        re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.S) for row in re.findall(r"<tr.*?</tr>", page, re.S)
+    )
+    return {unescape(name): [unescape(cell) for cell in others] for name, *others in filter(None, rows)}
+
+
+def printed_by(
+    notebook: str, words: str, known: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> list[str]:
+    """What a cell of a notebook prints, from the line on that has these words."""
+    cells = json.loads((EXAMPLES / notebook).read_text("utf-8"))["cells"]
+    [code] = [text for text in ("".join(cell["source"]) for cell in cells) if words in text]
+    exec(code[code.index(words) :], known)
+    return capsys.readouterr().out.splitlines()
+
+
+def test_notebooks_say_the_same_figures_as_the_report(
+    finished: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    all_moved = with_refinement(finished.settings, vehicles={"method": "paper", "largest_parked_voxels": 1})
+    finished = finished.refine(all_moved, tmp_path / "out")
+    assert (finished.map().states == State.REMOVED).sum() > 10, "which is what may be counted by mistake"
+    rows = rows_of((finished.folder / "report.html").read_text("utf-8"))
+    known = {"finished": finished, "urban": finished.label_set}
+    counts = printed_by("02_build_a_semantic_map.ipynb", "refined = finished.map()", known, capsys)
+    assert len(counts) == len(finished.label_set.names)
+    for name, count, _ in map(str.split, counts):
+        assert rows[name.rstrip(":")][1] == f"{int(count):,}", "voxels, refined"
+    words, known = 'for step in runs["evidence"]', {"runs": {"evidence": finished}}
+    lines = printed_by("03_refine_and_evaluate.ipynb", words, known, capsys)
+    steps = dict(re.findall(r"^(\w+): (\d+) voxels", "\n".join(lines), re.M))
+    assert len(steps) == 13
+    for name, changed in steps.items():
+        assert rows[name][0] == f"{int(changed):,}"
 
 
 def with_refinement(settings: Settings, **sections: dict[str, object]) -> Settings:

@@ -76,3 +76,85 @@ def test_an_import_is_finished_first(tmp_path: Path) -> None:
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.split() == [str(int(signal.SIGTERM)), "100000"]
+
+
+CLAIM = """
+import os, signal, sys, time
+from pathlib import Path
+from gnss_sem_map.cli.signals import Stopped, stop_on_signals
+from gnss_sem_map.files import output_folder
+
+OURS = {output_folder.__file__, output_folder.work_folder.__file__}
+out = Path(sys.argv[1]) / "out"
+
+def claim(last):
+    # and signal at some line of it; returns the number of its lines
+    lines = 0
+
+    def count(frame, event, argument):
+        nonlocal lines
+        if frame.f_code.co_filename not in OURS:
+            return None
+        lines += 1
+        if lines == last:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return count
+
+    sys.settrace(count)
+    try:
+        with output_folder.new_folder(out) as folder:
+            (folder / "result").touch()
+            time.sleep(0.02)  # a signal that came while it was claimed is raised here
+        time.sleep(0.02)
+    finally:
+        sys.settrace(None)
+    return lines
+
+claim(0)
+lines = claim(0)  # it replaces an earlier result
+stop_on_signals()
+for line in range(1, lines + 1):
+    try:
+        claim(line)
+    except Stopped:
+        pass
+    else:
+        raise AssertionError(f"the signal at line {line} was lost")
+    beside = {path.name for path in out.parent.iterdir()} - {"out"}
+    assert not beside, (line, beside)
+"""
+
+
+def test_a_signal_at_any_line_of_claiming_a_folder_leaves_no_lock_and_no_work_folder(tmp_path: Path) -> None:
+    program = [sys.executable, "-c", CLAIM, str(tmp_path)]
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "out/result").is_file()
+
+
+SWALLOWED = """
+import os, signal, sys
+from gnss_sem_map.cli import commands, main
+from gnss_sem_map.errors import DataError
+
+def compiled(**words):
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        for _ in range(1_000_000):
+            pass
+    except BaseException:  # as compiled code does that knows no exceptions of Python
+        error = DataError("tensors: cannot be read")
+        error.add_note("what was done is kept")
+        raise error from None
+
+commands.app = compiled
+sys.argv = ["gnss-sem-map"]
+main()
+"""
+
+
+def test_an_error_that_a_signal_caused_is_that_signal() -> None:
+    program = [sys.executable, "-c", SWALLOWED]
+    ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=60)
+    assert ended.returncode == 128 + signal.SIGTERM
+    assert ended.stderr == "gnss-sem-map: stopped by SIGTERM; what was done is kept\n"

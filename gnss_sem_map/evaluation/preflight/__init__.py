@@ -8,12 +8,12 @@ corrects it.
 from __future__ import annotations
 
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.evaluation.preflight import camera, inertial, lidar_pair, positions, sweeps, wheels
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.scans.prefetch import thread_pool, unless_left
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -29,7 +29,7 @@ def check(
     sample = Sample(log.in_our_conventions(settings.sensors), settings, segmenter)
     groups = (inertial, positions, wheels, sweeps, lidar_pair, *((camera,) if with_camera else ()))
     _ = sample.trajectory  # most checks need it: known before they run side by side
-    with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda group: tuple(group.check(sample)), groups))
+    with thread_pool(2) as pool:
+        found = list(pool.map(lambda group: unless_left(lambda: tuple(group.check(sample))), groups))
     findings = tuple(finding for some in found for finding in some)
     return Preflight(findings, time.perf_counter() - start, sample.whole_solution)

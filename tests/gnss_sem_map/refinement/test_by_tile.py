@@ -61,6 +61,7 @@ def test_a_tile_needs_no_more_of_the_map_than_its_halo(settings: RefinementSetti
     sums = sums_of(tile, VOXELS, BESIDE, settings)
     assert sums == sums_of(tile, part, beside, settings)
     assert sums.roads > 0
+    assert sums.moved > sums.moved_otherwise > 0
     whole, report = refine_tile(tile, VOXELS, BESIDE, settings, figures_of(sums))
     cut, of_cut = refine_tile(tile, part, beside, settings, figures_of(sums))
     assert_same(cut, whole)
@@ -120,8 +121,10 @@ def test_sums_that_are_none_are_refused(change: dict[str, object]) -> None:
 
 
 def test_a_little_more_of_the_same_changes_no_figure() -> None:
-    sums = Sums(100_000, 300_000_000, 9_100_000, 6_000_000, 1_200_000, 10**6, 200 * 10**6, 50_000, 30_000, 9)
-    more = Sums(900, 2_800_000, 80_000, 60_000, 11_000, 10**4, 2 * 10**6, 480, 310, 5)
+    sums = Sums(
+        100_000, 300_000_000, 9_100_000, 6_000_000, 1_200_000, 10**6, 200 * 10**6, 50_000, 30_000, 9, 10**6, 81_000,
+    )  # fmt: skip
+    more = Sums(900, 2_800_000, 80_000, 60_000, 11_000, 10**4, 2 * 10**6, 480, 310, 5, 10**4, 900)
     assert figures_of(sums) == figures_of(sums + more)
     assert figures_of(sums) != figures_of(sums + reduce(add, [replace(more, by_both=0)] * 50))
     assert figures_of(Sums()) == Figures(has_road=False)

@@ -67,7 +67,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is no unit test by where it stands and what it uses; single tests carry the mark themselves."""
+    """Mark what is no unit test by where it stands and what it uses; single tests carry the mark themselves.
+
+    Files with such tests run first: they take longest, and one that began last would keep one core waiting.
+    """
     lost = [str(path) for path in INTEGRATION_FILES if not path.exists()]
     if lost:
         raise pytest.UsageError(f"tests/conftest.py: found no {', '.join(lost)}; change INTEGRATION_FILES")
@@ -75,6 +78,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         is_listed = item.path.parent == TESTS or any(map(item.path.is_relative_to, INTEGRATION_FILES))
         if is_listed or INTEGRATION_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.integration)
+    long = {item.path for item in items if item.get_closest_marker("integration")}
+    items.sort(key=lambda item: item.path not in long)
 
 
 @pytest.hookimpl(wrapper=True)

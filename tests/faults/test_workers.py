@@ -52,7 +52,7 @@ def start(script: str, street: Street, folder: Path) -> subprocess.Popen[str]:
 def test_a_script_without_a_guard_gets_an_error_and_does_not_hang(small_drive, trial, tmp_path: Path) -> None:
     process = start(UNGUARDED, small_drive, tmp_path)
     try:
-        _, err = process.communicate(timeout=100)
+        _, err = process.communicate(timeout=600)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         trial("workers", ["hang"])
@@ -68,7 +68,7 @@ def test_workers_end_when_their_parent_is_killed(
     with start(GUARDED, small_drive, tmp_path) as process:
         begun = wait_until(lambda: len(group(process.pid)) > 2)
         process.send_signal(number)
-    orphans = not wait_until(lambda: not group(process.pid), 10.0)
+    orphans = not wait_until(lambda: not group(process.pid), 120.0)
     trial("workers", ["never began"] * (not begun) + ["orphans"] * orphans)
 
 

@@ -46,9 +46,10 @@ def products(out: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def days(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The same street on two days; read only."""
+    """The same street on two days; read only. No image is looked at, so they are small."""
     folder = tmp_path_factory.mktemp("days")
-    return [simulate(folder, SECONDS, SEED, session=session) for session in (0, 1)]
+    camera = Camera(62, 18, 36.0, 30.5, 8.6)
+    return [simulate(folder, SECONDS, SEED, camera=camera, session=session) for session in (0, 1)]
 
 
 @pytest.fixture(scope="module")

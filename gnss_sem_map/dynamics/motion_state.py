@@ -138,7 +138,10 @@ def classify_motion(
         whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere)
         if not (is_shown or is_sharp or whole.displaced):
             continue
-        if whole.motion in GONE and (beside := _beside(members, segments, hits, misses)):
+        beside = _beside(members, segments, hits, misses)
+        if not whole.displaced:  # else it may have come to stand there
+            beside += [n for n in members if n not in beside and is_occupied(hits[n], misses[n])]
+        if whole.motion in GONE and beside:
             objects.append(
                 _tracked_object(beside, segments, Motion.PARKED, 0.0, "beside something that moved")
             )

@@ -27,6 +27,7 @@ from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.presence import near_movers, presence
 from gnss_sem_map.dynamics.seen_through import free_groups, with_free_groups
 from gnss_sem_map.dynamics.standing import is_occupied, standing
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
@@ -132,19 +133,24 @@ def decide(
         gone[list(one.segments)] = one.motion in GONE
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
-    moved_of = [one | by_itself for one, by_itself in zip(_of_voxels(gone, segments), free, strict=True)]
+    moved_of = _either(_of_voxels(gone, segments), free)
     occupied = [is_occupied(*counted) for counted in counts()]
     stood_of = [
         np.int8(2) * whole + ((of_scan.number < 0) & there)
         for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
     ]
     stays = standing(places, counts(), moved_of, stood_of)
-    moved = [is_gone & ~stay for is_gone, stay in zip(moved_of[:count], stays[:count], strict=True)]
+    moved = [is_gone & ~stay for is_gone, stay in zip(moved_of, stays, strict=True)]
     stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
+    if is_sharp:
+        stamps = np.array([seen.stamp for seen in observations])
+        near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
+        of_mover, without = presence(places, of_places, near)
+        moved, stands = _either(moved, of_mover), _either(stands, without)
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
-    return Decision(moved, stands[:count], first_seen_here, is_sharp)
+    return Decision(moved[:count], stands[:count], first_seen_here, is_sharp)
 
 
 def _parted(
@@ -168,6 +174,13 @@ def _with_track(one: TrackedObject, listed: Sequence[Segment]) -> TrackedObject:
     if one.motion not in GONE:
         return one
     return replace(one, track=track_of([listed[n] for n in one.segments], BODY_HEIGHT_M))
+
+
+def _either(
+    some: Sequence[NDArray[np.bool_]], others: Sequence[NDArray[np.bool_]]
+) -> list[NDArray[np.bool_]]:
+    """For each scan, the voxels (v,) that are in one of two sets."""
+    return [one | other for one, other in zip(some, others, strict=True)]
 
 
 def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> list[NDArray[np.bool_]]:

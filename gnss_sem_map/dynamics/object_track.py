@@ -85,7 +85,7 @@ def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | 
     scans = np.array([one.stamp for one in segments])
     outline = _Outline.of(segments)
     stamps = scans + outline.delay
-    outline = outline.at_one_moment(_velocities(scans, centroids))
+    outline = outline.at_one_moment(velocities(scans, centroids))
     along = courses(centroids)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     lidar = np.array([one.seen_from for one in segments]) - centroids
@@ -135,7 +135,7 @@ def _longest_way(places: Array) -> Array:
     return way if way.any() else np.array([1.0, 0.0])
 
 
-def _velocities(stamps: Array, places: Array) -> Array:
+def velocities(stamps: Array, places: Array) -> Array:
     """Velocities (k, 2) m/s of places (k, 2) m over some scans before and after."""
     k = np.arange(len(stamps))
     after, before = np.minimum(k + VELOCITY_SCANS, k[-1]), np.maximum(k - VELOCITY_SCANS, 0)

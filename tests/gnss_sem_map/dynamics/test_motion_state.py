@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gnss_sem_map.dynamics.motion_state import Motion, MotionSettings, classify_motion
+from gnss_sem_map.dynamics.motion_state import GONE, Motion, MotionSettings, classify_motion
 from gnss_sem_map.dynamics.tracking import Segment
 
 
@@ -32,3 +32,14 @@ def test_a_car_that_waits_and_drives_on_is_one_object():
     (one,) = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
     assert one.motion == Motion.MOVING
     assert one.segments == tuple(range(24))
+
+
+def test_a_wall_that_is_never_seen_through_leaves_the_track_of_a_walker():
+    """An image calls parts of the wall a person; the walker comes from behind it, and the track goes over to him."""
+    wall = [segment(scan, 0.1 * scan, 2.5) for scan in range(8)]
+    walker = [segment(scan, 1.0, 0.5) for scan in range(8, 13)]
+    hits, misses = np.array([600.0] * 8 + [1300.0] * 5), np.array([0.0] * 8 + [2500.0] * 5)
+    objects = classify_motion(wall + walker, hits, misses, MotionSettings(), is_sharp=True)
+    motions = {n: one.motion for one in objects for n in one.segments}
+    assert all(motions[n] == Motion.PARKED for n in range(8))
+    assert all(motions[n] in GONE for n in range(8, 13))

@@ -73,7 +73,8 @@ def test_the_ground_under_a_mover_stays_however_seldom_it_is_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ground_m", "inside_m", "goes"), [(0.19, 0.01, False), (0.19, 0.1, True), (0.1, 0.01, True)]
+    ("ground_m", "inside_m", "goes"),
+    [(0.19, 0.01, False), (0.19, 0.1, True), (0.16, 0.01, True), (0.1, 0.01, True)],
 )
 def test_ground_that_touches_two_voxels_stays_and_a_crumb_on_it_goes(
     ground_m: float, inside_m: float, goes: bool

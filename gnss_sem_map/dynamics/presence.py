@@ -1,0 +1,114 @@
+"""What is there only while a mover is: a walker close to a wall is found now as himself, now as a part of the wall.
+
+A track tells where its object is in scans that show no segment of it, and a little before and after all of them. What
+stands there is found there at other times too; what is found only while the object is there, though other scans looked,
+is of the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnss_sem_map.dynamics.clusters import Segments
+from gnss_sem_map.dynamics.ground_grid import closer_than
+from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
+from gnss_sem_map.dynamics.object_track import velocities
+from gnss_sem_map.dynamics.tracking import Segment
+
+Array = NDArray[np.float64]
+Masks = list[NDArray[np.bool_]]
+Prediction = tuple[int, int, Array]
+"""A segment, by its scan and its number there, and how far its object went since then, (3,) m."""
+
+PREDICTED_S = 1.0
+"""A track tells where its object is so long before and after each of its segments: a walker is then known to 0.2 m."""
+LEAST_SCANS = 3
+"""A track of fewer scans tells no velocity."""
+WITH_MOVER_SHARE = 0.9
+"""A place is of a mover if one is near in so large a share of the scans that find something there, and no fewer scans
+looked there while none was near."""
+LEAST_FOUND = 3
+"""A place that so many scans find, and more without a mover than with one, stands."""
+
+
+def presence(
+    places: Sequence[NDArray[np.int32]], counts: NDArray[np.int32], near: Sequence[NDArray[np.bool_]]
+) -> tuple[Masks, Masks]:
+    """For each scan, the voxels (v,) that are there only with a mover, and those that are there mostly without one.
+
+    `places` (v,) number the voxels of each scan, the same in all scans; `counts` (2, p) are the hits and misses of
+    all places; `near` (v,) tells which voxels have a mover near them.
+    """
+    found, with_mover, first, last = np.zeros((4, counts.shape[1]), np.int32)
+    first[:] = len(places)
+    for scan, (place, is_near) in enumerate(zip(places, near, strict=True)):
+        found[place] += 1
+        with_mover[place] += is_near
+        near_one = place[is_near]
+        first[near_one] = np.minimum(first[near_one], scan)
+        last[near_one] = scan
+    looks_without = counts.sum(axis=0) - (last - first + 1)
+    comes_and_goes = (with_mover >= WITH_MOVER_SHARE * found) & (looks_without >= found)
+    stands = (found >= LEAST_FOUND) & (2 * with_mover < found)
+    of_mover = [comes_and_goes[place] & is_near for place, is_near in zip(places, near, strict=True)]
+    return of_mover, [stands[place] for place in places]
+
+
+def near_movers(
+    objects: Sequence[TrackedObject],
+    listed: Sequence[Segment],
+    segments: Sequence[Segments],
+    stamps: Array,
+    reach_m: float,
+) -> Masks:
+    """For each scan, the voxels (v,) closer than `reach_m` to where a track says that its object is.
+
+    `listed` are the segments of all scans, in the order of the scans; `stamps` (k,) s are those of the scans.
+    """
+    predicted: list[list[Prediction]] = [[] for _ in segments]
+    first = np.append(0, np.cumsum([len(of_scan.truncated) for of_scan in segments]))
+    for one in objects:
+        if one.motion in GONE and len(one.segments) >= LEAST_SCANS:
+            scans = np.array([listed[n].scan for n in one.segments])
+            numbers = np.array(one.segments) - first[scans]
+            for scan, k, way in _course(stamps, scans, one.path):
+                predicted[scan].append((scans[k], numbers[k], way))
+    return [
+        _closer(of_scan, [_points(segments, *one) for one in there], reach_m)
+        for of_scan, there in zip(segments, predicted, strict=True)
+    ]
+
+
+def _course(stamps: Array, scans: NDArray[np.int64], centroids: Array) -> Iterator[tuple[int, int, Array]]:
+    """Scans; for each, which segment of a track is the nearest in time, and the way (3,) m of the object since then.
+
+    `scans` (s,) and `centroids` (s, 2) m are those of its segments.
+    """
+    seen = stamps[scans]
+    speed = velocities(seen, centroids)
+    start, end = np.searchsorted(stamps, (seen[0] - PREDICTED_S, seen[-1] + PREDICTED_S)).tolist()
+    nearest = np.searchsorted((seen[1:] + seen[:-1]) / 2, stamps[start:end])
+    late = stamps[start:end] - seen[nearest]
+    for scan in np.flatnonzero(abs(late) <= PREDICTED_S).tolist():
+        k = int(nearest[scan])
+        yield start + scan, k, late[scan] * np.append(speed[k], 0.0)
+
+
+def _points(segments: Sequence[Segments], scan: int, number: int, way: Array) -> Array:
+    """The voxels of a segment (p, 3) m, by the means of their points, moved on."""
+    mine = np.flatnonzero(segments[scan].number == number)
+    parts = segments[scan].parts
+    return np.asarray(parts.sums[mine] / parts.points[mine, None] + way)
+
+
+def _closer(of_scan: Segments, predicted: Sequence[Array], reach_m: float) -> NDArray[np.bool_]:
+    """Which voxels (v,) of a scan are closer than `reach_m` to predicted points."""
+    if not predicted:
+        return np.zeros(len(of_scan.keys), np.bool_)
+    means = of_scan.parts.sums / of_scan.parts.points[:, None]
+    points = np.concatenate([*predicted, means])
+    is_voxel = np.arange(len(points)) >= len(points) - len(means)
+    return closer_than(points, ~is_voxel, is_voxel, reach_m)[is_voxel]

@@ -26,9 +26,18 @@ THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
 LOOK_S = 0.05
 """So often a thread looks whether it was left."""
 
-_pools: dict[ThreadPoolExecutor, threading.Event] = {}
-"""Pools that are open, each with an event that is set when it is left."""
-_of_thread = threading.local()
+
+class _OfThread(threading.local):
+    """What one thread has: the pools that it opened, each with an event that is set when it is left; the event of the
+    pool that it works for; and a thread for calls that may be left."""
+
+    def __init__(self) -> None:
+        self.pools: dict[ThreadPoolExecutor, threading.Event] = {}
+        self.left: threading.Event | None = None
+        self.helper: ThreadPoolExecutor | None = None
+
+
+_of_thread = _OfThread()
 
 
 def threads() -> int:
@@ -40,9 +49,9 @@ def threads() -> int:
 @contextmanager
 def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
     """Threads that are waited for at the end; after an exception, for what they have under way only."""
-    left = threading.Event()
+    left, opened = threading.Event(), _of_thread.pools
     pool = ThreadPoolExecutor(threads, initializer=setattr, initargs=(_of_thread, "left", left))
-    _pools[pool] = left
+    opened[pool] = left
     try:
         yield pool
     except BaseException:
@@ -50,19 +59,19 @@ def thread_pool(threads: int) -> Iterator[ThreadPoolExecutor]:
         raise
     finally:
         pool.shutdown(cancel_futures=left.is_set())
-        _pools.pop(pool, None)
+        opened.pop(pool, None)  # a generator may be closed by another thread
 
 
 @contextmanager
 def leaving_all() -> Iterator[None]:
-    """After an exception, wait for what the threads of all pools have under way, and no more.
+    """After an exception, wait for what the threads of all pools of this thread have under way, and no more.
 
     A generator that prefetches may be closed late, but no thread may write into a folder that is being removed.
     """
     try:
         yield
     except BaseException:
-        for pool, left in list(_pools.items()):
+        for pool, left in list(_of_thread.pools.items()):
             left.set()
             pool.shutdown(cancel_futures=True)
         raise
@@ -73,10 +82,8 @@ def unless_left(call: Callable[Given, Made], *args: Given.args, **kwargs: Given.
 
     The call itself goes on in another thread, and its result is dropped: it should write nothing.
     """
-    if not hasattr(_of_thread, "helper"):
-        _of_thread.helper = ThreadPoolExecutor(1)
-    left: threading.Event | None = getattr(_of_thread, "left", None)
-    answer: Future[Made] = _of_thread.helper.submit(call, *args, **kwargs)
+    _of_thread.helper = _of_thread.helper or ThreadPoolExecutor(1)
+    left, answer = _of_thread.left, _of_thread.helper.submit(call, *args, **kwargs)
     while not answer.done():
         if left is not None and left.is_set():
             raise CancelledError

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import pytest
 
@@ -93,6 +93,16 @@ def test_a_call_that_never_ends_is_left_and_what_would_follow_is_not_done() -> N
         interrupted()
     assert followed == []
     goes_on.set()
+
+
+def test_what_fails_in_one_thread_leaves_nothing_of_another() -> None:
+    def fail() -> None:
+        with leaving_all():
+            raise KeyError
+
+    with ThreadPoolExecutor(1) as other, thread_pool(1) as mine:
+        assert isinstance(other.submit(fail).exception(), KeyError)
+        assert mine.submit(unless_left, int, "5").result() == 5
 
 
 @pytest.mark.parametrize("inside", [False, True])

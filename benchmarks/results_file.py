@@ -36,15 +36,14 @@ def made_by(*packages: str) -> str:
 
 
 def _commit() -> str:
-    """The commit that is checked out, and whether files were changed since."""
-    asked = [
-        "git",
-        "-C",
-        str(Path(__file__).parent),
-        "describe",
-        "--always",
-        "--exclude=*",
-        "--dirty= with changes",
-    ]
-    done = subprocess.run(asked, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "not known"
+    """The commit that is checked out, and whether files other than results were changed since."""
+    commit = _git("rev-parse", "--short", "HEAD")
+    changed = _git(
+        "status", "--porcelain", "--untracked-files=no", "--", ":/", ":(exclude,top)benchmarks/results"
+    )
+    return f"{commit} with changes" if commit and changed else commit or "not known"
+
+
+def _git(*words: str) -> str:
+    asked = ["git", "-C", str(Path(__file__).parent), *words]
+    return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()

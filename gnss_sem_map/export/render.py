@@ -91,9 +91,11 @@ def _draw(centres, h, numbers, middle, reach_m, axes, focal, depth, cube, face):
     """Ray against box (slabs) for all pixels that a cube may cover; rays have forward component 1."""
     height, width = depth.shape
     # half the extent of a cube to the right, down and forward
-    half_right, half_down, half_forward = h * np.abs(axes).sum(axis=1)
+    half_right = h * (abs(axes[0, 0]) + abs(axes[0, 1]) + abs(axes[0, 2]))
+    half_down = h * (abs(axes[1, 0]) + abs(axes[1, 1]) + abs(axes[1, 2]))
+    half_forward = h * (abs(axes[2, 0]) + abs(axes[2, 1]) + abs(axes[2, 2]))
     for i in range(len(centres)):
-        cx, cy, cz = centres[i]
+        cx, cy, cz = centres[i, 0], centres[i, 1], centres[i, 2]
         forward = axes[2, 0] * cx + axes[2, 1] * cy + axes[2, 2] * cz
         near, far = forward - half_forward, forward + half_forward
         if near < NEAREST_M:

@@ -42,10 +42,10 @@ test: $(TOOLS)
 test-unit: $(TOOLS)
 	$(PYTEST) -m 'not slow and not demo and not faults and not integration'
 
-# Executed in build/notebooks, where the site finds them with their pictures.
+# Executed in build/notebooks, where the site finds them with their pictures; the last one takes longest and begins first.
 notebooks: $(TOOLS)
 	rm -rf build/notebooks && mkdir -p build/notebooks && cp examples/*.ipynb build/notebooks
-	$(PYTEST) --nbmake --nbmake-timeout=600 --overwrite build/notebooks
+	$(PYTEST) --nbmake --nbmake-timeout=600 --overwrite $$(ls -r build/notebooks/*.ipynb)
 
 # The documentation site, in build/site; a link that leads nowhere is an error.
 docs: $(TOOLS)

@@ -69,7 +69,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is no unit test by where it stands and what it uses; single tests carry the mark themselves.
 
-    Files with such tests run first: they take longest, and one that began last would keep one core waiting.
+    Files with such tests run first, and of these the ones that run commands: they take longest, and one that began last
+    would keep one core waiting.
     """
     lost = [str(path) for path in INTEGRATION_FILES if not path.exists()]
     if lost:
@@ -79,7 +80,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if is_listed or INTEGRATION_FIXTURES.intersection(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.integration)
     long = {item.path for item in items if item.get_closest_marker("integration")}
-    items.sort(key=lambda item: item.path not in long)
+    items.sort(key=lambda item: (item.path not in long, item.path.parent != TESTS))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -24,6 +24,7 @@ from gnss_sem_map.cli import (
     simulation,
 )
 from gnss_sem_map.cli.signals import Stopped, caused_by_signal, ignore_signals
+from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
@@ -98,7 +99,6 @@ def main() -> None:
     A signal ends it with one line too, and with 128 plus its number; they are caught from `cli.main` on.
     """
     from factor_graphs.errors import FactorGraphError
-    from gnss_sem_map.errors import SemMapError
 
     share_one_heap()
     use_huge_pages()
@@ -137,7 +137,7 @@ def main() -> None:
 def _called() -> int | None:
     try:
         return cast("int | None", app(prog_name="gnss-sem-map", standalone_mode=False))
-    except Exception as error:
+    except SemMapError as error:
         if stopped := caused_by_signal(error):
             raise stopped from error
         raise

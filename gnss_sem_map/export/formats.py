@@ -17,7 +17,7 @@ from gnss_sem_map.export.raster import write_topview_geotiff
 from gnss_sem_map.export.viewer import write_viewer
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 
 
 @dataclass(frozen=True)

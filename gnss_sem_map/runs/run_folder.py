@@ -50,8 +50,8 @@ from gnss_sem_map.runs.about import (
 )
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.source import Source, source_of
-from gnss_sem_map.scans.prefetch import leaving_all
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.thread_pools import leaving_all
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
 

@@ -21,9 +21,10 @@ from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import leaving_all, prefetch, unless_left
+from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.segmentation import MissingLabels, Segmenter
 from gnss_sem_map.sensor_log import Image, Skip
+from gnss_sem_map.thread_pools import leaving_all, unless_left
 
 ABOUT = "about.json"
 """File with the segmenter of a cache; frames of two segmenters are not mixed."""

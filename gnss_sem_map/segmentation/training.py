@@ -27,7 +27,6 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.run_stats import Progress, silent
-from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,
@@ -46,6 +45,7 @@ from gnss_sem_map.segmentation.training_data import (
     class_weights,
     labelled_images,
 )
+from gnss_sem_map.thread_pools import thread_pool
 
 NETWORK, STATE, LOG = "network.safetensors", "state.pt", "log.csv"
 """Files in the folder of a training: the best weights so far, the state for resuming, and one row per validation."""

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Singles, kernel
 from gnss_sem_map.simulation.noise import value_noise
+from gnss_sem_map.thread_pools import thread_pool
 
 CLASS_NAMES: Final = ("road", "sidewalk", "vehicle", "building", "vegetation", "other")
 _ROAD, _SIDEWALK, _VEHICLE, _BUILDING, _VEGETATION, _OTHER = range(6)

@@ -14,9 +14,9 @@ import numpy as np
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.scans.prefetch import thread_pool
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
+from gnss_sem_map.thread_pools import thread_pool
 
 UNFILTERED: Final = (
     cv2.IMWRITE_PNG_FILTER,

@@ -13,9 +13,9 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.evaluation.preflight import camera, inertial, lidar_pair, positions, sweeps, wheels
 from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.evaluation.preflight.sample import Sample
-from gnss_sem_map.scans.prefetch import thread_pool, unless_left
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.thread_pools import thread_pool, unless_left
 
 
 def check(

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     import laspy
     import lazrs
 
-NODE_CELLS = 256
-"""A node is as wide as so many cells of its level; with half as many there are three times the nodes, and packing each
-anew takes 40 % more time."""
+NODE_CELLS = 512
+"""A node is as wide as so many cells of its level: in a street it has 10,000 voxels on average, 100,000 at most. With half
+as many there are three times the nodes, each is packed anew, and the file is 3 % larger."""
 OFFSET_BYTES = 8
 """Before the first chunk of a LAZ: where its table of chunks is, which COPC has none of."""
 PLACE_BYTES = 12
@@ -247,11 +247,10 @@ def _largest_cubes(piece: SemanticMap) -> NDArray[np.int64]:
 
 
 def _spread(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers of up to 14 bits with two zeros between their bits."""
-    spread = np.zeros_like(numbers)
-    for bit in range(14):
-        spread |= (numbers >> bit & 1) << 3 * bit
-    return spread
+    """Numbers of up to 16 bits with two zeros between their bits: halves move apart, then quarters and so on."""
+    for step, kept in ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249)):
+        numbers = (numbers | numbers << step) & kept
+    return numbers
 
 
 def _config(octree: _Octree, georeference: Georeference, header: laspy.LasHeader) -> copclib.CopcConfigWriter:

@@ -175,8 +175,10 @@ def _child(
     code: int | str | None = 0
     try:
         from gnss_sem_map.cli import main
-        from gnss_sem_map.cli.signals import stop_on_signals
+        from gnss_sem_map.cli.signals import SIGNALS, stop_on_signals
 
+        for number in SIGNALS:  # where the tests run in the background, or under `nohup`, they are ignored
+            signal.signal(number, signal.SIG_DFL)
         stop_on_signals()
         ready.set()
         main()

@@ -99,47 +99,52 @@ def start(small_drive: Street, work: Path) -> subprocess.Popen[bytes]:
     return process
 
 
-def kill_at_random(small_drive: Street, work: Path, times: int, seed: int) -> list[int]:
-    """Start mapping, kill -9 at a random moment, start again ...; how many chunks were there after each kill."""
-    chance, done = random.Random(seed), []
-    with start(small_drive, work.with_name(f"whole{seed}")) as process:
+def seconds_of_mapping(small_drive: Street, work: Path) -> float:
+    """How long a process maps when nothing kills it."""
+    with start(small_drive, work) as process:
         begun = time.monotonic()
         assert process.stdout is not None
         assert process.stdout.readline() == b"done\n"
-        whole_s = time.monotonic() - begun
+        return time.monotonic() - begun
+
+
+def kill_at_random(small_drive: Street, work: Path, times: int, within_s: float, seed: int) -> list[int]:
+    """Start mapping, kill -9 at a random moment, start again ...; how many chunks were there after each kill."""
+    chance, done = random.Random(seed), []
     for _ in range(times):
         with start(small_drive, work) as process:
-            time.sleep(chance.uniform(0.0, whole_s))
+            time.sleep(chance.uniform(0.0, within_s))
             process.send_signal(signal.SIGKILL)
         done.append(sum(path.name.isdecimal() for path in work.iterdir()) if work.is_dir() else 0)
     return done
 
 
-def resumed_after_kills(
-    drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], work: Path, times: int, seed: int
-) -> list[int]:
-    done = kill_at_random(small_drive, work, times, seed)
+def assert_resumed(drive: Drive, at_once: tuple[Maps, RunStats], work: Path) -> None:
+    """Fail where what killed processes left does not become the map of a drive mapped at once."""
     stats = RunStats()
     store = map_scans(by_chunks(drive, 1), work, stats, resume=True)
     assert_same_as(at_once, store, stats)
     assert [path.name for path in work.glob(".*.*.*")] == [], "what the killed processes left stays"
-    return done
 
 
 @pytest.mark.integration
 def test_a_killed_run_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
-    resumed_after_kills(drive, small_drive, at_once, tmp_path / "work", 2, 1)
+    whole_s = seconds_of_mapping(small_drive, tmp_path / "whole")
+    kill_at_random(small_drive, tmp_path / "work", 2, whole_s, 1)
+    assert_resumed(drive, at_once, tmp_path / "work")
 
 
 @pytest.mark.slow
 def test_a_run_killed_many_times_goes_on_to_the_same_map(
     drive: Drive, small_drive: Street, at_once: tuple[Maps, RunStats], tmp_path: Path
 ) -> None:
-    partly = 0
-    for seed in range(8):
-        done = resumed_after_kills(drive, small_drive, at_once, tmp_path / f"work{seed}", 4, seed)
+    partly, whole_s = 0, seconds_of_mapping(small_drive, tmp_path / "whole")
+    for seed in range(5):
+        work = tmp_path / f"work{seed}"
+        done = kill_at_random(small_drive, work, 4, whole_s, seed)
+        assert_resumed(drive, at_once, work)
         partly += sum(0 < n < len(drive.log.scans) // 2 for n in done)
     assert partly > 0, "no kill fell into the mapping: this test showed nothing"
 

@@ -3,9 +3,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# As many processes as there are cores; the tests of one file share what they made. Files are taken in the order of
-# tests/conftest.py: the longest first.
-PYTEST := $(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
+# One process more than there are cores: some tests wait for others. The tests of one file share what they made. Files
+# are taken in the order of tests/conftest.py: the longest first.
+PYTEST := $(BIN)/pytest -n $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)') --dist loadfile --no-loadscope-reorder
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
 # What is imported is compiled once, also where the environment says that nothing is to be kept.

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     import lazrs
 
 NODE_CELLS = 512
-"""A node is as wide as so many cells of its level: in a street it has 10,000 voxels on average, 100,000 at most. With half
-as many there are three times the nodes, each is packed anew, and the file is 3 % larger."""
+"""A node is as wide as so many cells of its level; in a street it has 10,000 voxels on average, 100,000 at most. With
+half as many there are three times the nodes, each is packed anew, and the file is 3 % larger."""
 OFFSET_BYTES = 8
 """Before the first chunk of a LAZ: where its table of chunks is, which COPC has none of."""
 PLACE_BYTES = 12

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.errors import MeasurementError
+from factor_graphs.filled_gaps import filled_in
 
 Array = NDArray[np.float64]
 
@@ -134,11 +135,12 @@ class Repairs:
     far_off: int = 0
     gaps: Array = field(default_factory=lambda: np.empty((0, 2)))
     absurd: int = 0
+    filled_in: int = 0
 
     @property
     def dropped(self) -> int:
         """Number of rows that are not in the cleaned data."""
-        return self.not_finite + self.repeated + self.far_off + self.absurd
+        return self.not_finite + self.repeated + self.far_off + self.absurd + self.filled_in
 
     def __str__(self) -> str:
         parts = [
@@ -146,6 +148,7 @@ class Repairs:
             (self.repeated, "repeated, dropped"),
             (self.far_off, "with a stamp far off all others, dropped"),
             (self.absurd, "faster than any vehicle, dropped"),
+            (self.filled_in, "on straight lines that fill gaps, dropped"),
             (self.out_of_order, "out of order, sorted"),
             (len(self.gaps), f"gaps, longest {np.ptp(self.gaps, axis=1).max(initial=0.0):.2f} s"),
         ]
@@ -159,15 +162,17 @@ def clean_imu(
 
     `stamps` (n,) s; `specific_force` (n, 3) m/s²; `angular_rate` (n, 3) rad/s. Rows that are not finite
     or beyond any sensor are dropped (GTSAM would integrate them), so is every row after the first with the same
-    stamp, and every row whose stamp is `far_off`. Raises MeasurementError for another shape and when fewer than
-    two rows are left.
+    stamp, every row whose stamp is `far_off`, and what was `filled_in`. Raises MeasurementError for another shape and
+    when fewer than two rows are left.
     """
     values = [np.asarray(c, dtype=np.float64) for c in (specific_force, angular_rate)]
     sensible = [np.where(np.abs(c) <= LARGEST_OF_IMU, c, np.nan) for c in values]
     columns, repairs = _clean("IMU", stamps, *sensible)
     if len(columns[0]) < 2:
         raise MeasurementError(f"{repairs}: {len(columns[0])} left, expected at least 2")
-    return ImuSamples(*columns), repairs
+    filled = filled_in(columns[0], np.hstack(columns[1:]))
+    samples = ImuSamples(*columns)[~filled]
+    return samples, replace(repairs, filled_in=int(np.count_nonzero(filled)), gaps=gaps(samples.stamps))
 
 
 def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> tuple[GnssFixes, Repairs]:

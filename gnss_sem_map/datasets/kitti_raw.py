@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.filled_gaps import filled_in
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuSamples, far_off
 from factor_graphs.trajectory import Trajectory
@@ -248,7 +249,19 @@ def oxts_rows(drive: Path) -> tuple[NDArray[np.int64], Array, list[Skip]]:
             f"{shown(drive / 'oxts')}: found {len(order)} usable rows of {len(found.files)}, expected at least 3"
             + (f"; first reason: {skips[0].where}: {skips[0].reason}" if skips else "")
         )
-    return np.array(order, np.int64), np.stack([rows[stamp] for stamp in order]), skips
+    return _measured(drive, np.array(order, np.int64), np.stack([rows[stamp] for stamp in order]), skips)
+
+
+def _measured(
+    drive: Path, stamps: NDArray[np.int64], rows: Array, skips: list[Skip]
+) -> tuple[NDArray[np.int64], Array, list[Skip]]:
+    """Stamps and rows without those that fill gaps, and the skipped ones with them."""
+    said = np.hstack([rows[:, SPECIFIC_FORCE], rows[:, ANGULAR_RATE]])
+    filled = filled_in(_seconds(stamps, int(stamps[0])), said)
+    if count := int(np.count_nonzero(filled)):
+        reason = f"{count} rows on straight lines that fill gaps"
+        skips = [*skips, Skip("oxts", shown(drive / "oxts"), reason, count)]
+    return stamps[~filled], rows[~filled], skips
 
 
 def _oxts_row(path: Path) -> tuple[str, Array]:

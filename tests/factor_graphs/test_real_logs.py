@@ -20,6 +20,7 @@ def test_a_tenth_of_the_fixes_predicts_the_others_to_a_metre():
     rows = np.loadtxt(folder / "KittiEquivBiasedImu.txt", skiprows=1)
     gps = np.loadtxt(folder / "KittiGps_converted.txt", skiprows=1, delimiter=",")
     imu, repairs = clean_imu(rows[:, 0] - rows[0, 0], rows[:, 2:5], rows[:, 5:8])
+    assert repairs.filled_in == 1257  # eight gaps of 1.6 s
     assert repairs.gaps[0, 1] - repairs.gaps[0, 0] == pytest.approx(1.92, abs=0.01)
     fixes = GnssFixes(gps[:, 0] - rows[0, 0], gps[:, 1:], np.full((len(gps), 3), 0.07**0.5))
     used = np.arange(len(fixes)) % 10 == 0
@@ -29,10 +30,9 @@ def test_a_tenth_of_the_fixes_predicts_the_others_to_a_metre():
     )  # fmt: skip
     s = smooth(imu, fixes[used], LocalFrame(49.0, 8.4, 115.0), SmootherSettings(imu_noise=sheet))
     off = s.trajectory.at(fixes.stamps[~used])[:, :3, 3] - fixes.positions[~used]
-    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1.0
-    assert 0.8 < s.chi2_per_dof < 1.3
-    assert s.inflation > 5  # the data sheet is far too good for this log
-    assert any("silent for 1.92 s" in note for note in s.notes)
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.6
+    assert s.inflation < 1.5  # where nothing is believed that was not measured, the data sheet is right
+    assert any("silent for 14.57 s" in note for note in s.notes)
 
 
 @pytest.mark.parametrize("attitude_known", [True, False])

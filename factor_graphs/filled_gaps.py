@@ -25,7 +25,7 @@ def filled_in(stamps: Array, values: Array) -> NDArray[np.bool_]:
     straight = np.zeros(len(stamps), dtype=bool)
     if len(stamps) > FEWEST:
         inside = _are_straight(values, np.diff(stamps)) | _are_straight(values, np.ones(len(stamps) - 1))
-        straight[1:-1] = binary_opening(inside, np.ones(FEWEST))
+        straight[1:-1] = binary_opening(inside, np.ones(FEWEST, dtype=bool))
     return straight
 
 

@@ -200,6 +200,20 @@ def test_the_100_hz_twin_is_used_for_the_imu_only(copy: Path) -> None:
     assert len(log.gnss.stamps) == 14
 
 
+def test_rows_of_the_imu_that_fill_a_gap_are_left_out_and_counted(copy: Path) -> None:
+    twin = copy.with_name(copy.name.replace("_sync", "_extract"))
+    shutil.copytree(copy / "oxts", twin / "oxts")
+    files = sorted((twin / "oxts/data").iterdir())
+    rows = np.array([np.loadtxt(path) for path in files])
+    rows[:, 11:20] += np.random.default_rng(0).standard_normal((len(rows), 9))
+    rows[4:9, 11:20] = np.linspace(rows[3, 11:20], rows[9, 11:20], 7)[1:-1]
+    for path, row in zip(files, rows, strict=True):
+        path.write_text(" ".join(f"{value:.12f}" for value in row))
+    log = open_drive(copy)
+    np.testing.assert_allclose(log.imu.specific_force, np.delete(rows[:, 11:14], range(4, 9), axis=0))
+    assert left_out(log) == [("oxts", 5, "5 rows on straight lines that fill gaps")]
+
+
 def test_the_first_attitude_is_that_of_the_first_sample_of_the_imu(copy: Path) -> None:
     """The twin begins before the drive, and the vehicle may turn in between."""
     twin = copy.with_name(copy.name.replace("_sync", "_extract"))

@@ -25,7 +25,7 @@ from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, clean_im
 from factor_graphs.rigid_motion import Mounted, RigidMotion, drone, hand_held
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import random_drive, simulate_biases, simulate_gnss, simulate_imu
-from factor_graphs.smoothing import Solution, smooth
+from factor_graphs.smoothing import smooth
 from factor_graphs.streaming import StreamingSmoother
 from factor_graphs.trajectory import Trajectory
 
@@ -272,20 +272,28 @@ def mounting(seeds: int) -> Figures:
     return figures
 
 
-def cost() -> dict[str, Figures]:
-    """CPU time of the whole solution, dense output and covariances included, by length of the drive."""
-    print("\nlength s  keyframes   CPU s   times real time   of what the shortest takes per second")
+def cost(rounds: int = 5) -> dict[str, Figures]:
+    """CPU time of the whole solution, dense output and covariances included, by length of the drive.
+
+    All lengths are run in turn, as the speed of a machine changes from minute to minute: the least time of each, and
+    the median over the rounds of what it takes per second over the shortest.
+    """
+    print("\nlength s   CPU s   times real time   of what the shortest takes per second")
+    drives = {seconds: simulate(0, seconds)[1:3] for seconds in (900.0, 1800.0, 3600.0, 7200.0)}
+    spent = np.array([[_cpu_s(*drive) for drive in drives.values()] for _ in range(rounds)])
+    per_second = spent / list(drives)
+    least, over_linear = spent.min(axis=0), np.median(per_second / per_second[:, :1], axis=0)
     table: dict[str, Figures] = {}
-    least = float("nan")
-    for seconds in (900.0, 1800.0, 3600.0, 7200.0):
-        _, imu, fixes, _ = simulate(0, seconds)
-        spent, solution = _timed(lambda imu=imu, fixes=fixes: smooth(imu, fixes, FRAME, None, LEVER), 3)
-        least = spent / seconds if not table else least
-        figures = {"cpu_s": spent, "times_real_time": seconds / spent, "over_linear": spent / seconds / least}
-        table[f"{seconds:.0f} s"] = figures
-        line = "{cpu_s:7.2f} {times_real_time:12.0f} {over_linear:12.3f}"
-        print(f"{seconds:8.0f} {len(solution.keyframes):10} " + line.format(**figures), flush=True)
+    for seconds, cpu_s, ratio in zip(drives, least.tolist(), over_linear.tolist(), strict=True):
+        table[f"{seconds:.0f} s"] = {"cpu_s": cpu_s, "times_real_time": seconds / cpu_s, "over_linear": ratio}
+        print(f"{seconds:8.0f} {cpu_s:7.2f} {seconds / cpu_s:12.0f} {ratio:12.3f}", flush=True)
     return table
+
+
+def _cpu_s(imu: ImuSamples, fixes: GnssFixes) -> float:
+    start = time.process_time()
+    smooth(imu, fixes, FRAME, None, LEVER)
+    return time.process_time() - start
 
 
 def streaming(lag_s: float = 10.0) -> Figures:
@@ -313,16 +321,6 @@ def streaming(lag_s: float = 10.0) -> Figures:
     line += "h rms {horizontal_m:.2f} m, {restarts:.0f} restarts"
     print(line.format(lag_s, **figures))
     return figures
-
-
-def _timed(work: Callable[[], Solution], rounds: int) -> tuple[float, Solution]:
-    """The least of a few runs: the others were disturbed."""
-    best = float("inf")
-    for _ in range(rounds):
-        start = time.process_time()
-        result = work()
-        best = min(best, time.process_time() - start)
-    return best, result
 
 
 PARTS: dict[str, Callable[[int], Any]] = {

@@ -22,16 +22,20 @@ def filled_in(stamps: Array, values: Array) -> NDArray[np.bool_]:
     `stamps` (n,) s, increasing; `values` (n, c). Lines are straight in time or from row to row. What stays the same
     is no line: a sensor at rest may say one number again and again.
     """
-    straight = np.zeros(len(stamps), dtype=bool)
+    filled = np.zeros(len(stamps), dtype=bool)
     if len(stamps) > FEWEST:
-        inside = _are_straight(values, np.diff(stamps)) | _are_straight(values, np.ones(len(stamps) - 1))
-        straight[1:-1] = binary_opening(inside, np.ones(FEWEST, dtype=bool))
-    return straight
+        filled[1:-1] = _on_lines(values, np.diff(stamps)) | _on_lines(values, np.ones(len(stamps) - 1))
+    return filled
 
 
-def _are_straight(values: Array, steps: Array) -> NDArray[np.bool_]:
-    """Of every sample but the first and the last, whether all channels go on as they came."""
-    slopes = np.diff(values, axis=0) / steps[:, None]
-    bends = np.abs(np.diff(slopes, axis=0))
-    changes = (slopes[1:] != 0).all(axis=1) & (slopes[:-1] != 0).all(axis=1)
-    return np.asarray(changes & (bends <= STRAIGHT * np.median(bends, axis=0)).all(axis=1))
+def _on_lines(values: Array, steps: Array) -> NDArray[np.bool_]:
+    """Of every sample but the first and the last, whether all channels go on there as they came."""
+    found = np.ones(len(values) - 2, dtype=bool)
+    for channel in values.T:
+        slopes = np.diff(channel) / steps
+        bends = np.abs(np.diff(slopes))
+        found &= (bends <= STRAIGHT * np.median(bends)) & (slopes[1:] != 0) & (slopes[:-1] != 0)
+        found = binary_opening(found, np.ones(FEWEST, dtype=bool))
+        if not found.any():  # nearly always after the first channel
+            break
+    return found

@@ -170,9 +170,15 @@ def clean_imu(
     columns, repairs = _clean("IMU", stamps, *sensible)
     if len(columns[0]) < 2:
         raise MeasurementError(f"{repairs}: {len(columns[0])} left, expected at least 2")
-    filled = filled_in(columns[0], np.hstack(columns[1:]))
-    samples = ImuSamples(*columns)[~filled]
-    return samples, replace(repairs, filled_in=int(np.count_nonzero(filled)), gaps=gaps(samples.stamps))
+    samples = measured(ImuSamples(*columns))
+    filled = len(columns[0]) - len(samples)
+    return samples, replace(repairs, filled_in=filled, gaps=gaps(samples.stamps))
+
+
+def measured(imu: ImuSamples) -> ImuSamples:
+    """The samples without those that were `filled_in`."""
+    filled = filled_in(imu.stamps, np.hstack([imu.specific_force, imu.angular_rate]))
+    return imu[~filled] if filled.any() else imu
 
 
 def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> tuple[GnssFixes, Repairs]:

@@ -22,7 +22,7 @@ from factor_graphs.fitting import (
 )
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
@@ -103,21 +103,21 @@ def smooth(
 
     `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
     IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
-    its wheels rolled; none of them need be given. With `condensed` the solution says what is needed to bind it to other
-    drives or to itself (`sessions.bind`). Raises MeasurementError with fewer than three usable fixes, and
-    EstimationError when the optimiser stops at its limit.
+    its wheels rolled; none of them need be given. What fills gaps of the IMU with straight lines is not believed. With
+    `condensed` the solution says what is needed to bind it to other drives or to itself (`sessions.bind`). Raises
+    MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)
     if given.shape != (3,) or not np.isfinite(given).all():
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
 
-    relative = relative_poses or NO_RELATIVE_POSES
+    relative, samples = relative_poses or NO_RELATIVE_POSES, measured(imu)
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
         lever = calibration.p_imu_antenna
-        problem = pose_problem(imu, shifted, frame, settings, lever, initial_attitude, relative)
+        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
         return problem, fit_noise(problem)
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
@@ -132,6 +132,9 @@ def smooth(
         by_fixes = fit_noise_by_components(problem, by_fixes)
     shared_stddevs = np.sqrt(of_shared.diagonal())
     found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
+    if filled := len(imu) - len(samples):
+        told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
+        found = replace(found, notes=(told, *found.notes))
     if not condensed:
         return found
     lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])

@@ -16,6 +16,7 @@ from gnss_sem_map.dynamics.clusters import Segments
 from gnss_sem_map.dynamics.ground_grid import closer_than
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
 from gnss_sem_map.dynamics.object_track import velocities
+from gnss_sem_map.dynamics.seen_through import PERSON_M
 from gnss_sem_map.dynamics.tracking import Segment
 
 Array = NDArray[np.float64]
@@ -25,6 +26,9 @@ Prediction = tuple[int, int, Array]
 
 PREDICTED_S = 1.0
 """A track tells where its object is so long before and after each of its segments: a walker is then known to 0.2 m."""
+PERSON_S, PERSON_REACH_M = 2.0, 0.5
+"""The same for the track of a person, who is slow, and how far parts of a person are from each other: of one who walks
+along a wall the segments are but the half that is farther from it."""
 LEAST_SCANS = 3
 """A track of fewer scans tells no velocity."""
 WITH_MOVER_SHARE = 0.9
@@ -64,35 +68,46 @@ def near_movers(
     stamps: Array,
     reach_m: float,
 ) -> Masks:
-    """For each scan, the voxels (v,) closer than `reach_m` to where a track says that its object is.
+    """For each scan, the voxels (v,) closer than `reach_m`, or a person's reach, to where a track puts its object.
 
     `listed` are the segments of all scans, in the order of the scans; `stamps` (k,) s are those of the scans.
     """
-    predicted: list[list[Prediction]] = [[] for _ in segments]
+    gone = [one for one in objects if one.motion in GONE and len(one.segments) >= LEAST_SCANS]
+    is_person = [_is_person([listed[n] for n in one.segments]) for one in gone]
     first = np.append(0, np.cumsum([len(of_scan.truncated) for of_scan in segments]))
-    for one in objects:
-        if one.motion in GONE and len(one.segments) >= LEAST_SCANS:
+    near = [np.zeros(len(of_scan.keys), np.bool_) for of_scan in segments]
+    for kind, seconds, reach in ((False, PREDICTED_S, reach_m), (True, PERSON_S, PERSON_REACH_M)):
+        predicted: list[list[Prediction]] = [[] for _ in segments]
+        for one in (one for one, person in zip(gone, is_person, strict=True) if person == kind):
             scans = np.array([listed[n].scan for n in one.segments])
             numbers = np.array(one.segments) - first[scans]
-            for scan, k, way in _course(stamps, scans, one.path):
+            for scan, k, way in _course(stamps, scans, one.path, seconds):
                 predicted[scan].append((scans[k], numbers[k], way))
-    return [
-        _closer(of_scan, [_points(segments, *one) for one in there], reach_m)
-        for of_scan, there in zip(segments, predicted, strict=True)
-    ]
+        for is_near, of_scan, there in zip(near, segments, predicted, strict=True):
+            is_near |= _closer(of_scan, [_points(segments, *one) for one in there], reach)
+    return near
 
 
-def _course(stamps: Array, scans: NDArray[np.int64], centroids: Array) -> Iterator[tuple[int, int, Array]]:
+def _is_person(segments: Sequence[Segment]) -> bool:
+    """Whether the segments of a track are, usually, as short as a person and higher than long."""
+    length = np.median([np.linalg.norm(np.ptp(one.outline, axis=0)) for one in segments])
+    height = np.median([one.levels[1] - one.levels[0] for one in segments])
+    return bool(length < min(PERSON_M, height))
+
+
+def _course(
+    stamps: Array, scans: NDArray[np.int64], centroids: Array, seconds: float
+) -> Iterator[tuple[int, int, Array]]:
     """Scans; for each, which segment of a track is the nearest in time, and the way (3,) m of the object since then.
 
-    `scans` (s,) and `centroids` (s, 2) m are those of its segments.
+    `scans` (s,) and `centroids` (s, 2) m are those of its segments, which tell so many `seconds` before and after.
     """
     seen = stamps[scans]
     speed = velocities(seen, centroids)
-    start, end = np.searchsorted(stamps, (seen[0] - PREDICTED_S, seen[-1] + PREDICTED_S)).tolist()
+    start, end = np.searchsorted(stamps, (seen[0] - seconds, seen[-1] + seconds)).tolist()
     nearest = np.searchsorted((seen[1:] + seen[:-1]) / 2, stamps[start:end])
     late = stamps[start:end] - seen[nearest]
-    for scan in np.flatnonzero(abs(late) <= PREDICTED_S).tolist():
+    for scan in np.flatnonzero(abs(late) <= seconds).tolist():
         k = int(nearest[scan])
         yield start + scan, k, late[scan] * np.append(speed[k], 0.0)
 

@@ -18,9 +18,9 @@ OVER_M = 0.3
 INSIDE_M = 0.03
 """What is on the ground, in the next voxel over it, has its mean height so far over the bottom of its voxel: ground
 that touches two voxels does not."""
-STEP_M = 0.03
+STEP_M = 0.025
 """Or it is so far over the mean height in the voxel under it. Ground that touches two voxels of 0.2 m would have to be
-steeper than 1 in 3: rays meet the ground so flat that the noise of ranges hardly changes its height."""
+steeper than 1 in 4: rays meet the ground so flat that the noise of ranges hardly changes its height."""
 
 
 def over_ground(state: MapState) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ import pytest
 
 from gnss_sem_map.dynamics.clusters import PointSets, Segments
 from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
-from gnss_sem_map.dynamics.presence import PREDICTED_S, near_movers, presence
+from gnss_sem_map.dynamics.presence import PERSON_REACH_M, PERSON_S, PREDICTED_S, near_movers, presence
 from gnss_sem_map.dynamics.tracking import Segment
 
 REACH_M, STEP_S = 0.35, 0.1
@@ -46,8 +46,8 @@ def points_at(p):
     return Segments(np.arange(len(p)), parts, number, np.zeros(count, np.bool_))
 
 
-def walk(seen, scans=40, speed=1.5, motion=Motion.MOVING):
-    """Where a walker is near: he is found in the scans `seen`; a row of voxels lies all along his way, at y = 5.1."""
+def walk(seen, scans=60, speed=1.5, motion=Motion.MOVING, height=0.0):
+    """Where something of this height is near: it is found in the scans `seen`; a row of voxels lies along its way."""
     rng = np.random.default_rng(1)
     stamps = STEP_S * np.arange(scans)
     body = rng.uniform(-0.2, 0.2, (20, 3)) + np.array([0, 4.7, 1.0])
@@ -58,7 +58,9 @@ def walk(seen, scans=40, speed=1.5, motion=Motion.MOVING):
         segments.append(points_at(np.concatenate([him, row]) if scan in seen else row))
         if scan in seen:
             middle = him[:, :2].mean(axis=0)
-            listed.append(Segment(scan, t, middle, 20, False, False, him[:, :2], np.zeros(2)))
+            listed.append(
+                Segment(scan, t, middle, 20, False, False, him[:, :2], np.zeros(2), (0.2, 0.2 + height))
+            )
     one = TrackedObject(
         motion, 1.0, False, "", tuple(range(len(listed))), 20 * len(listed), 0.0, 1.0,
         np.array([segment.centroid for segment in listed]),
@@ -72,13 +74,17 @@ def walk(seen, scans=40, speed=1.5, motion=Motion.MOVING):
 
 
 @pytest.mark.parametrize("speed", [1.5, -1.0])
-def test_a_track_tells_where_its_object_is_in_scans_that_do_not_show_it(speed):
-    seen, told_scans = [10, 11, 12, 15, 16, 17, 20], PREDICTED_S / STEP_S
-    near, distance = walk(seen, speed=speed)
+@pytest.mark.parametrize(
+    ("height", "seconds", "reach"), [(0.3, PREDICTED_S, REACH_M), (1.6, PERSON_S, PERSON_REACH_M)]
+)
+def test_a_track_tells_where_its_object_is_in_scans_that_do_not_show_it(speed, height, seconds, reach):
+    """That of a person, who is higher than long, tells it for longer, and reaches farther."""
+    seen, told_scans = [20, 21, 22, 25, 26, 27, 30], seconds / STEP_S
+    near, distance = walk(seen, speed=speed, height=height)
     for scan, (part, away) in enumerate(zip(near, distance, strict=True)):
         is_told = min(seen) - told_scans < scan < max(seen) + told_scans
-        if abs(scan - 15) != 5 + told_scans:  # rounding decides there
-            np.testing.assert_array_equal(part, (away < REACH_M) & is_told, err_msg=f"scan {scan}")
+        if abs(scan - 25) != 5 + told_scans:  # rounding decides there
+            np.testing.assert_array_equal(part, (away < reach) & is_told, err_msg=f"scan {scan}")
 
 
 @pytest.mark.parametrize("change", [{"motion": Motion.PARKED}, {"seen": [10, 11]}])

@@ -95,7 +95,40 @@ def test_ground_that_touches_two_voxels_stays_and_a_crumb_on_it_goes(
 def test_what_has_many_points_stays_and_so_does_what_is_far_from_the_mover() -> None:
     static, moved = street(CRUMBS)
     assert not removed(static, moved, most_points=1).any()
-    static, moved = street(np.array([[30, 8, 4]]))
+    static, moved = street(*[np.array([[30, 8, k]]) for k in (3, 4, 5)])
+    assert not removed(static, moved).any()
+
+
+LORRY_TOP, BRANCH, OVER_LORRY = (np.array([at]) for at in ([15, 7, 14], [30, 8, 14], [15, 7, 22]))
+"""2.8 m over the road, but only one where something moved, and 4.4 m."""
+
+
+@pytest.mark.parametrize(
+    ("what", "points", "ground", "goes"),
+    [
+        (np.array([[30, 8, 4]]), 2, MANY, True),
+        (np.array([[30, 8, 4]]), 6, MANY, False),
+        (np.array([[30, 8, 4]]), 2, 30, False),
+        (LORRY_TOP, 2, MANY, True),
+        (BRANCH, 2, MANY, False),
+        (OVER_LORRY, 2, MANY, False),
+    ],
+)
+def test_what_was_gone_whenever_the_ground_under_it_was_seen_goes(
+    what: NDArray[np.int64], points: int, ground: int, goes: bool
+) -> None:
+    """Far from any mover up to the height of a person, and up to that of a lorry over what moved."""
+    solid = np.concatenate([ROAD, WALL])
+    static = voxel_map(np.concatenate([solid, what]), np.r_[np.full(len(solid), ground), points])
+    _, moved = street()
+    np.testing.assert_array_equal(static.keys[removed(static, moved)], pack(what)[: int(goes)])
+
+
+def test_the_edge_of_what_stands_stays_over_ground_that_is_seen_beside_it() -> None:
+    """A voxel at the edge of a roof: of what stands in the columns around it there is more than enough."""
+    parked, edge = box((25, 8, 1), (35, 12, 7)), np.array([[24, 9, 7]])
+    static = voxel_map(np.concatenate([ROAD, parked, edge]), np.r_[np.full(len(ROAD) + len(parked), MANY), 2])
+    _, moved = street()
     assert not removed(static, moved).any()
 
 

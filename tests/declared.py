@@ -7,8 +7,9 @@ from typing import NoReturn
 
 import pytest
 
-DATA, BROWSER = "GNSS_SEM_MAP_DATA", "GNSS_SEM_MAP_BROWSER"
-"""The folder of the real KITTI excerpts; anything but nothing where chromium and chromedriver must work."""
+DATA, BROWSER, ROOT = "GNSS_SEM_MAP_DATA", "GNSS_SEM_MAP_BROWSER", "GNSS_SEM_MAP_ROOT"
+"""The folder of the real KITTI excerpts; anything but nothing where chromium and chromedriver must work; likewise where
+tests have the rights of root: to mount a disk, and to hold a file (`chattr +i`)."""
 
 
 def absent(variable: str, reason: str) -> NoReturn:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from declared import ROOT, absent
 from faults.harness import gnss_sem_map
 from faults.killing import content, write_result
 from faults.results import RUN, refused, result_at, trajectory
@@ -36,37 +38,47 @@ def test_what_cannot_be_a_place_is_refused_in_one_line(
     trial("impossible OUT", refused(outcome, before, tmp_path, "choose"), outcome)
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can act as somebody with fewer rights")
 @pytest.mark.parametrize("what", ["place", "place/out", "place/out/map"])
 def test_without_the_right_to_replace_nothing_is_begun(small_drive, what: str, trial, tmp_path: Path) -> None:
-    user = 65534
     result_at(tmp_path / "place/out", listed=True)
-    for path in (tmp_path, *tmp_path.rglob("*")):
-        os.chown(path, user, user)
-    for path in tmp_path.parents:
-        if path.stat().st_uid == 0 and path != Path("/"):
-            path.chmod(path.stat().st_mode | 0o011)
+    (tmp_path / "trial").mkdir()
+    user = None if os.getuid() else as_nobody(tmp_path)
     (tmp_path / what).chmod(0o555)
     before = content(tmp_path / "place")
-    (tmp_path / "trial").mkdir()
-    os.chown(tmp_path / "trial", user, user)
     outcome = trajectory(small_drive, tmp_path / "place/out", tmp_path / "trial", user=user)
     (tmp_path / what).chmod(0o755)
     trial("rights", refused(outcome, before, tmp_path / "place", Path(what).name), outcome)
 
 
+def as_nobody(folder: Path) -> int:
+    """A user with fewer rights than root, to whom a folder is given."""
+    user = 65534
+    for path in (folder, *folder.rglob("*")):
+        os.chown(path, user, user)
+    for path in folder.parents:
+        if path.stat().st_uid == 0 and path != Path("/"):
+            path.chmod(path.stat().st_mode | 0o011)
+    return user
+
+
+@contextmanager
+def mounted(place: Path, size: str) -> Iterator[None]:
+    """A file system of this size, which only root can make."""
+    place.mkdir(parents=True)
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        absent(ROOT, "mounting is not allowed here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
 @pytest.fixture
 def tiny_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 100 kB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", place], capture_output=True, check=False
-    )
-    if done.returncode:
-        pytest.skip("mounting is not allowed here")
-    yield place
-    subprocess.run(["umount", "-l", place], check=True)
+    with mounted(tmp_path / "disk", "100k"):
+        yield tmp_path / "disk"
 
 
 def test_a_mount_point_is_refused_and_a_folder_on_it_is_not(
@@ -104,19 +116,15 @@ def test_a_full_stdout_is_one_line(small_drive: Street, words, trial, tmp_path: 
     trial("full stdout", faults, outcome)
 
 
-def held(path: Path) -> bool:
-    """Make a file such that nobody, not even root, can move or remove it; whether that is possible here."""
-    return subprocess.run(["chattr", "+i", path], capture_output=True, check=False).returncode == 0
-
-
 @pytest.mark.parametrize("what", [".", "map", "map/map.json"])
 def test_an_old_result_that_cannot_go_is_never_half_gone_with_the_new_one(
     what: str, trial, tmp_path: Path
 ) -> None:
     out = tmp_path / "place" / "out"
     write_result(out, RUN)
-    if not held(out / what):
-        pytest.skip("files cannot be held here")
+    hold = ["chattr", "+i", out / what]  # not even root can move or remove it then
+    if subprocess.run(hold, capture_output=True, check=False).returncode:
+        absent(ROOT, "files cannot be held here")
     try:
         said = ""
         for number in range(2):
@@ -135,19 +143,10 @@ def test_an_old_result_that_cannot_go_is_never_half_gone_with_the_new_one(
 
 @pytest.mark.faults
 def test_a_full_tmpdir_costs_nothing(small_drive: Street, trial, tmp_path: Path) -> None:
-    full = tmp_path / "trial" / "tmp"
-    full.mkdir(parents=True)
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", full], capture_output=True, check=False
-    )
-    if done.returncode:
-        pytest.skip("mounting is not allowed here")
-    try:
+    with mounted(tmp_path / "trial" / "tmp", "4k"):
         labels = f"labels:{small_drive.labels}"
         words = ("run", small_drive.drive, "--segmenter", labels, "-o", tmp_path / "out")
         for workers in ("1", "2"):
             chunks = ("--workers", workers, "--set", "dynamics.window_scans=2")
             outcome = gnss_sem_map(*words, *chunks, folder=tmp_path / "trial")
             trial("full TMPDIR", [*outcome.faults, *["refused"] * (outcome.code != 0)], outcome)
-    finally:
-        subprocess.run(["umount", "-l", full], check=True)

@@ -154,7 +154,7 @@ def test_a_command_says_it_in_one_line(layout, name, instead, drives, trial, tmp
 
 
 def _without_rights(arguments: tuple[object, ...], folder: Path) -> tuple[int, str]:
-    """A command as a user who is nobody: its exit code and what it printed on stderr."""
+    """A command as a user who is not root: its exit code and what it printed on stderr."""
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
@@ -162,8 +162,9 @@ def _without_rights(arguments: tuple[object, ...], folder: Path) -> tuple[int, s
         os.dup2(write_end, 2)
         code = 99
         try:
-            os.setgid(65534)
-            os.setuid(65534)
+            if os.getuid() == 0:
+                os.setgid(65534)
+                os.setuid(65534)
             open_drive(Path(str(arguments[0])))
             code = 0
         except SemMapError as error:
@@ -177,7 +178,6 @@ def _without_rights(arguments: tuple[object, ...], folder: Path) -> tuple[int, s
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), text
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
 @pytest.mark.parametrize(("layout", "name"), INPUTS)
 def test_what_may_not_be_read_is_said(layout, name, drives, trial, tmp_path) -> None:
     drive = _copy(drives[layout], tmp_path)

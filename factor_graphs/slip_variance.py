@@ -18,7 +18,8 @@ from factor_graphs.vehicle import Vehicle, body_motion, where_seen
 
 Array = NDArray[np.float64]
 
-# Blocks in a window over which drift of heading is taken away, and sideways and vertical means of each.
+# Blocks in a window over which drift of heading is taken from what is seen sideways; of pitch, gravity tells. The means
+# of each block are sideways and vertical.
 BLOCKS, AXES = round(DRIFT_S / BLOCK_S), 2
 # With fewer blocks nothing is changed. A solution is taken to leave at least this share of the slip.
 LEAST_BLOCKS, LEAST_SHARE = 12, 0.2
@@ -30,7 +31,7 @@ ENOUGH, MOST = 1.2, 4.0
 
 @dataclass(frozen=True, eq=False)
 class SlipSums:
-    """Sums of the slip over blocks, without the drift of heading: as seen, and what slip makes of their variance.
+    """Sums of slip over blocks, sideways without the drift of heading: as seen, and what slip makes of their variance.
 
     `seen` and `of_slip` (w, 2 BLOCKS) m², by window, block and axis; `variance` what the solution takes of it.
     """
@@ -59,12 +60,13 @@ def slip_sums(problem: Problem, fit: Fit, vehicle: Vehicle) -> SlipSums | None:
         return None
     window, block = block // BLOCKS, block % BLOCKS
     count = window[-1] + 1
-    # of every value its time, less the mean slope of its window: (n, BLOCKS)
+    # of every value its time, sideways less the mean slope of its window: (n, BLOCKS, AXES)
     own = np.zeros((len(where), BLOCKS))
     own[np.arange(len(where)), block] = spacing
     leaning, lever = np.zeros((count, BLOCKS)), np.bincount(window, ahead**2)
     np.add.at(leaning, window, own * ahead[:, None])
-    share = own - (leaning / np.maximum(lever, 1e-12)[:, None])[window] * ahead[:, None]
+    straight = own - (leaning / np.maximum(lever, 1e-12)[:, None])[window] * ahead[:, None]
+    share = np.stack([straight, own], axis=2)
 
     def summed(values: Array) -> Array:
         total = np.zeros((count, *values.shape[1:]))
@@ -72,12 +74,12 @@ def slip_sums(problem: Problem, fit: Fit, vehicle: Vehicle) -> SlipSums | None:
         return total
 
     sliding, believed = motion.sliding(vehicle.mounting)[where], vehicle.slip_stddevs(motion)[where]
-    seen = summed(share[:, :, None] * sliding[:, None]).reshape(count, -1)
-    of_slip = summed(share[:, :, None] ** 2 * believed[:, None] ** 2).reshape(count, -1)
+    seen = summed(share * sliding[:, None]).reshape(count, -1)
+    of_slip = summed(share**2 * believed[:, None] ** 2).reshape(count, -1)
     by_state, by_mounting = motion.by_state(vehicle.mounting)[where], -motion.by_mounting()[where]
     rows = np.zeros((len(motion.spacing), BLOCKS * AXES, SIZE))
-    rows[where, :, :9] = (share[:, :, None, None] * by_state[:, None]).reshape(len(where), -1, 9)
-    of_all = summed((share[:, :, None, None] * by_mounting[:, None]).reshape(len(where), -1, 4))
+    rows[where, :, :9] = (share[:, :, :, None] * by_state[:, None]).reshape(len(where), -1, 9)
+    of_all = summed((share[:, :, :, None] * by_mounting[:, None]).reshape(len(where), -1, 4))
     windows = np.full(len(rows), -1)
     windows[where] = window
     return SlipSums(seen, of_slip, SumVariance(rows, windows, of_all))

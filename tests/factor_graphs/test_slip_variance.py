@@ -47,14 +47,20 @@ def test_the_variance_of_sums_is_that_of_the_whole_covariance(simulate):
         np.testing.assert_allclose(sums.found[window], np.sum((G @ root) ** 2, axis=1), rtol=1e-4)
 
 
-def sliding(lateral: float, vertical: float):
-    """A drive that slides at random, m/s, for a second each time, when it moves."""
+def sliding(lateral: float, vertical: float, vertical_s: float = 1.0):
+    """A drive that slides at random when it moves, m/s: sideways for a second at a time, vertically `vertical_s` s."""
 
     def moves(seconds: float, rng: np.random.Generator) -> FreeMotion:
         motion, step = random_drive(seconds, rng), 0.1
         stamps = np.arange(0.0, motion.end, step)
         T, speed = motion.poses(stamps), np.linalg.norm(motion.velocities(stamps), axis=1)
-        noise = gaussian_filter1d(rng.standard_normal((2, len(stamps))), 0.5 / np.sqrt(np.pi) / step)
+        white, widths = (
+            rng.standard_normal((2, len(stamps))),
+            0.5 / np.sqrt(np.pi) * np.array([1.0, vertical_s]),
+        )
+        noise = np.array(
+            [gaussian_filter1d(row, width / step) for row, width in zip(white, widths, strict=True)]
+        )
         noise *= np.tanh(speed / 2) / noise.std(axis=1, keepdims=True)
         slip = lateral * noise[0, :, None] * T[:, :3, 1] + vertical * noise[1, :, None] * T[:, :3, 2]
         way = np.concatenate([np.zeros((1, 3)), np.cumsum((slip[1:] + slip[:-1]) / 2 * step, axis=0)])
@@ -73,6 +79,14 @@ def test_slip_that_is_held_is_found_as_large_as_it_is(simulate, lateral, vertica
         drive = simulate(seed, seconds=400.0, noise=ImuNoise(), moves=sliding(lateral, vertical))
         found.append(smooth(drive.imu, drive.fixes, FRAME, None, LEVER).vehicle.density)
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(found), axis=0)), [lateral, vertical], rtol=0.3)
+
+
+def test_a_body_that_pitches_for_ten_seconds_is_not_held_level(simulate):
+    found = []
+    for seed in range(4):
+        drive = simulate(seed, seconds=600.0, noise=ImuNoise(), moves=sliding(0.03, 0.06, 10.0))
+        found.append(smooth(drive.imu, drive.fixes, FRAME, None, LEVER).vehicle.density)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(found), axis=0)), [0.03, 0.06 * 10**0.5], rtol=0.3)
 
 
 def test_a_car_that_does_not_slide_is_believed_to_slide_less_than_at_first(simulate):

@@ -137,10 +137,7 @@ def _covariances(
 
 def _turned(covariances: Array, R: Array) -> Array:
     """Covariances (n, 6, 6) of rotation and translation, both seen in axes turned by R (n, 3, 3)."""
-    turned, back = np.empty_like(covariances), np.swapaxes(R, 1, 2)
-    a, b = slice(0, 3), slice(3, 6)
-    turned[:, a, a] = R @ covariances[:, a, a] @ back
-    turned[:, b, b] = R @ covariances[:, b, b] @ back
-    turned[:, a, b] = R @ covariances[:, a, b] @ back
-    turned[:, b, a] = np.swapaxes(turned[:, a, b], 1, 2)
+    both = np.zeros_like(covariances)
+    both[:, :3, :3] = both[:, 3:, 3:] = R
+    turned: Array = both @ covariances @ np.swapaxes(both, 1, 2).copy()  # NumPy takes twice as long for a view
     return turned

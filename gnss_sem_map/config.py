@@ -119,9 +119,17 @@ def _plain(content: Any) -> Any:
 
 
 def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
-    """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one."""
+    """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one.
+
+    A calibration that the file names is found from the file's folder, one of the overrides from the working folder.
+    """
     content = _read(file) if file is not None else {}
-    return parse(Settings, overrides, content, str(file) if file else "--set")
+    if file is not None and isinstance(content.get("calibration"), str):
+        content["calibration"] = str(file.parent / content["calibration"])
+    settings = parse(Settings, overrides, content, str(file) if file else "--set")
+    # a worker may have another working folder
+    absolute = settings.calibration and settings.calibration.absolute()
+    return settings.model_copy(update={"calibration": absolute})
 
 
 def parse(

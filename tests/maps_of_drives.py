@@ -11,8 +11,10 @@ from street_drives import Drives
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, run_drives
+from gnss_sem_map.segmentation import DEMO_CALIBRATION
 
-SETTINGS = Settings()
+# with a file that they name: each result has a copy of its own
+SETTINGS = Settings(calibration=DEMO_CALIBRATION)
 OF_MOMENT = ("run.json", "report.html")
 """Files of a drive that hold times and memory."""
 
@@ -46,4 +48,5 @@ def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def run_of(places: Sequence[Path | str], drives: Drives, out: Path, *more: str | Path) -> list[str | Path]:
-    return ["run", *places, "--segmenter", drives.labels, "--force", "-o", out, *more]
+    chosen = f"calibration={DEMO_CALIBRATION}"
+    return ["run", *places, "--segmenter", drives.labels, "--set", chosen, "--force", "-o", out, *more]

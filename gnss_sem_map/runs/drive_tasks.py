@@ -26,9 +26,8 @@ from gnss_sem_map.run_stats import Progress
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
 from gnss_sem_map.runs.match_tasks import SavedMatches
+from gnss_sem_map.runs.run_settings import differing, read_settings
 from gnss_sem_map.runs.source import Source
-
-SETTINGS = "config.yaml"
 
 
 def map_all(
@@ -114,6 +113,6 @@ def _is_done(
         about = read_run(folder)
         same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
         same = same and about["correction"] == correction
-        return bool(same and config.load(folder / SETTINGS) == settings)
+        return bool(same and not differing(read_settings(folder), settings))
     except (SemMapError, KeyError):
         return False

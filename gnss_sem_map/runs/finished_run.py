@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map import config, pipeline
+from gnss_sem_map import pipeline
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import ConfigError, DataError
@@ -42,6 +42,7 @@ from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, LabelledDrive, write_point_labels
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
+from gnss_sem_map.runs.run_settings import differing, read_settings
 from gnss_sem_map.runs.source import absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
@@ -132,7 +133,7 @@ class Run:
     @cached_property
     def settings(self) -> Settings:
         """The settings of the run."""
-        return config.load(self.folder / "config.yaml")
+        return read_settings(self.folder)
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -312,10 +313,9 @@ def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:
 def _check_same_map(before: Settings, after: Settings) -> None:
     """Raise ConfigError if settings other than those of the refinement differ."""
     same = after.model_copy(update={"refinement": before.refinement, "delivery": before.delivery})
-    if same == before:
-        return
-    differ = [name for name in Settings.model_fields if getattr(same, name) != getattr(before, name)]
-    raise ConfigError(
-        f"refine: {', '.join(differ)} differ from those of the run; refine changes those of refinement and delivery:"
-        " run the drive again"
-    )
+    differ = differing(same, before)
+    if differ:
+        raise ConfigError(
+            f"refine: {', '.join(differ)} differ from those of the run; refine changes those of refinement and"
+            " delivery: run the drive again"
+        )

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.laz_cloud import read_base
@@ -36,8 +35,9 @@ from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
-from gnss_sem_map.runs.drive_tasks import SETTINGS, map_all
+from gnss_sem_map.runs.drive_tasks import map_all
 from gnss_sem_map.runs.executors import executor_of
+from gnss_sem_map.runs.run_settings import SETTINGS, read_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.runs.written_drives import write_drives
@@ -233,7 +233,7 @@ def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:
     """Settings, frame and drives of a finished map, which may be that of one drive; raises DataError."""
-    about, settings = read_run(out), config.load(out / SETTINGS)
+    about, settings = read_run(out), read_settings(out)
     frame = read_frame(out / MAP)
     if frame is None:
         raise DataError(f"{shown(out)}: its map has no georeference, so no other drive fits to it")

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gnss_sem_map import config
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import new_folder
@@ -18,6 +17,7 @@ from gnss_sem_map.mapping.refining import refine_map
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.run_folder import claimed_run, write_about, write_map_files
+from gnss_sem_map.runs.run_settings import read_settings
 from gnss_sem_map.runs.tracks import keep_tracks, tracks_of
 
 
@@ -38,7 +38,7 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
 
 
 def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, Any]:
-    settings = config.load(first / "config.yaml")
+    settings = read_settings(first)
     label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
     merged.write_raw(folder)

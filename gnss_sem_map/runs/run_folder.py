@@ -49,6 +49,7 @@ from gnss_sem_map.runs.about import (
     with_objects,
 )
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
+from gnss_sem_map.runs.run_settings import CALIBRATION, write_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.thread_pools import leaving_all
@@ -56,7 +57,9 @@ from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
 
 RUN_FILES = re.compile(
-    "|".join(map(re.escape, (*(name for name in FILES if "." in name), "report.html")))
+    "|".join(
+        map(re.escape, (*(name for name in FILES if "." in name and name != CALIBRATION), "report.html"))
+    )
     + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
     r"|(labels|labels_raw|removed)/(\d+\.label)?|(confidence|looks)/(\d+\.bin)?"
 )
@@ -201,7 +204,7 @@ def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics
     frame = about.get("local_frame")
     georeference = georeference_of(settings, None if frame is None else LocalFrame(**frame))
     about = about | {"delivery": None if georeference is None else georeference.about()}
-    (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
+    write_settings(folder, settings)
     _write_json(folder / "run.json", about)
     _write_json(folder / "metrics.json", metrics)
     write_report(folder, about, metrics)
@@ -230,7 +233,7 @@ def write_trajectory_run(
     with claimed_run(out, [drive]), new_folder(out) as folder:
         write_trajectory_files(folder, Located(log, found.trajectory, found.solution, found.alone))
         write_plot(folder, log, found.solution)
-        (folder / "config.yaml").write_text(settings.to_yaml(), "utf-8")
+        write_settings(folder, settings)
         about = about_run(source_of(drive).name, log, stats) | {
             "preflight": page.as_dict(),
             "trajectory": about_solution(found.solution),

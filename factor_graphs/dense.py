@@ -139,7 +139,5 @@ def _turned(covariances: Array, R: Array) -> Array:
     """Covariances (n, 6, 6) of rotation and translation, both seen in axes turned by R (n, 3, 3)."""
     both = np.zeros_like(covariances)
     both[:, :3, :3] = both[:, 3:, 3:] = R
-    turned: Array = (
-        both @ covariances @ np.swapaxes(both, 1, 2).copy()
-    )  # NumPy takes twice as long for a view
-    return turned
+    back = np.swapaxes(both, 1, 2).copy()  # NumPy takes twice as long for a view
+    return np.asarray(both @ covariances @ back, np.float64)

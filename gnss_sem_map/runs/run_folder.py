@@ -63,7 +63,8 @@ RUN_FILES = re.compile(
     + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
     r"|(labels|labels_raw|removed)/(\d+\.label)?|(confidence|looks)/(\d+\.bin)?"
 )
-"""Pattern of all paths in run folders of older versions, which have no list of their files."""
+"""Pattern of all paths in run folders of older versions, which have no list of their files: a calibration there is the
+user's."""
 
 
 def is_run_file(name: str) -> bool:

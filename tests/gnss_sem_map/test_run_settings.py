@@ -25,6 +25,7 @@ def test_a_run_that_was_moved_is_refined_without_the_calibration_it_was_made_wit
     settings = Settings(calibration=calibration)
     made = run(small_drive.drive, tmp_path / "out", f"labels:{small_drive.labels}", settings)
     tiles = {path.name: path.read_bytes() for path in (made.folder / "refined").glob("*.parquet")}
+    assert tiles
     calibration.unlink()
     moved = type(made)(Path(shutil.move(made.folder, tmp_path / "delivered")))
     assert moved.settings.calibration == tmp_path / "delivered" / "calibration.yaml"

@@ -61,14 +61,14 @@ def collect_seldom() -> None:
     atexit.register(gc.freeze)
 
 
-def release_memory() -> None:
+def release_memory(near_peak_only: bool = True) -> None:
     """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used.
 
-    Only where the process holds about as much as it ever did: else its peak does not grow if the memory is used again,
-    and to get it anew from the system takes 1.5 us per page, 0.5 s of a run of the demo drive.
+    With `near_peak_only`, only where the process holds about as much as it ever did: else its peak does not grow if the
+    memory is used again, and to get it anew from the system takes 1.5 us per page, 0.5 s of a run of the demo drive.
     """
     with suppress(OSError, AttributeError):
-        if _held_bytes() > _most_held_bytes() - NEAR_PEAK_BYTES:
+        if not near_peak_only or _held_bytes() > _most_held_bytes() - NEAR_PEAK_BYTES:
             ctypes.CDLL(None).malloc_trim(0)
 
 

@@ -72,14 +72,18 @@ class MotionSettings(BaseModel):
         ge=0,
         description="An object that went elsewhere has moved if its points there have more misses per hit than this.",
     )
-    farthest_m: float = Field(default=40.0, gt=0, description="Scans farther than this are no evidence, m.")
+    farthest_m: float = Field(
+        default=40.0,
+        gt=0,
+        description="Scans farther than this are evidence only where no nearer one looks, m.",
+    )
     window_scans: int = Field(
         default=150,
         ge=1,
         description="A scan is decided with so many scans before and after it; two such windows are mapped, and"
         " saved for --resume, at a time.",
     )
-    farthest_object_m: float = Field(default=60.0, gt=0, description="Largest range of objects, m.")
+    farthest_object_m: float = Field(default=80.0, gt=0, description="Largest range of objects, m.")
     grow_m: float = Field(
         default=0.35, ge=0, description="Points above ground this close to a moving segment belong to it, m."
     )

@@ -24,6 +24,7 @@ from gnss_sem_map.dynamics.ground_grid import (
     within_radius,
 )
 from gnss_sem_map.dynamics.image_rows import Rows
+from gnss_sem_map.dynamics.lost_parts import joined_to_movers
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
@@ -110,10 +111,10 @@ def decide(
     if not observations:
         return Decision([], [], (), False)
     places = _places(observations)
-    of_places = _observations_by_others(observations, places, before, settings.farthest_m, SHARP_RATIO)
+    of_places = _observations_by_others(observations, places, before, settings, SHARP_RATIO)
     is_sharp = are_sharp(of_places, places)
     if not is_sharp:
-        of_places = _observations_by_others(observations, places, before, settings.farthest_m, WIDE_RATIO)
+        of_places = _observations_by_others(observations, places, before, settings, WIDE_RATIO)
 
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
@@ -128,9 +129,10 @@ def decide(
     )
     listed = _all_segments(observations, segments)
     objects = classify_motion(listed, hits, misses, settings, is_sharp)
-    gone = np.zeros(len(listed), np.bool_)
-    for one in objects:
-        gone[list(one.segments)] = one.motion in GONE
+    gone = _gone(objects, len(listed))
+    if is_sharp:
+        objects = joined_to_movers(objects, segments, places, _of_voxels(gone, segments), hits, misses)
+        gone = _gone(objects, len(listed))
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
     moved_of = _either(_of_voxels(gone, segments), free)
@@ -151,6 +153,14 @@ def decide(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
     return Decision(moved[:count], stands[:count], first_seen_here, is_sharp)
+
+
+def _gone(objects: Sequence[TrackedObject], count: int) -> NDArray[np.bool_]:
+    """Which of so many segments (s,) are of objects that moved."""
+    gone = np.zeros(count, np.bool_)
+    for one in objects:
+        gone[list(one.segments)] = one.motion in GONE
+    return gone
 
 
 def _parted(
@@ -210,20 +220,24 @@ def _observations_by_others(
     observations: Sequence[Observation],
     places: Sequence[NDArray[np.int32]],
     before: Keyframes | None,
-    farthest_m: float,
+    settings: MotionSettings,
     margin_ratio: float,
 ) -> NDArray[np.int32]:
-    """Hits and misses of every place (2, p) by the scans other than the one that found it."""
+    """Hits and misses of every place (2, p) by the scans other than the one that found it.
+
+    A place that no scan is near is told by those that are as far from it as objects are sought.
+    """
     count = 1 + max(int(place.max(initial=-1)) for place in places)
     points, centroids = np.zeros(count), np.zeros((count, 3))
     for seen, place in zip(observations, places, strict=True):  # side by side, all of a chunk take 60 MB
         _add(seen.segments.parts.points, seen.segments.parts.sums, place, points, centroids)
     centroids /= points[:, None]
     order = spatial_order(centroids)
-    centroids, counts = centroids[order], np.zeros((2, len(centroids)), np.int32)
-    for some in chain(() if before is None else before.parts(), _parts(observations)):
-        counts += hits_and_misses(centroids, some, farthest_m, margin_ratio)
-    counts[:, order] = counts.copy()
+    counts = np.zeros((2, count), np.int32)
+    for farthest_m in (settings.farthest_m, settings.farthest_object_m):
+        for some in chain(() if before is None else before.parts(), _parts(observations)):
+            counts[:, order] += hits_and_misses(centroids[order], some, farthest_m, margin_ratio)
+        order = order[counts[:, order].sum(axis=0) == 0]
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
     return counts
 

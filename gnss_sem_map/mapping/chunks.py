@@ -239,8 +239,10 @@ class _Chunk:
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None
-        static, seen = self._all.to_map() - gone, Attributes(*self._all.attributes())
+        seen, added = Attributes(*self._all.attributes()), self._all.to_map()
         del self._all  # 60 MB are free while the chunk is saved
+        static = added - gone
+        del added
         number, lidar = self._first + self._number, self._drive.log.lidar
         objects = tuple(replace(one, lidar=lidar, chunk=number) for one in decision.objects)
         return MappedChunk(

@@ -181,6 +181,13 @@ def test_a_car_that_creeps_past_parked_cars_takes_nothing_of_them_along():
     assert others == 0
 
 
+def test_a_car_that_no_scan_is_near_is_told_by_those_farther_away():
+    """It comes from 62 m to 47 m, where no scan is within `farthest_m`; the lowest ring is too far from the next."""
+    share, others, _ = drive([going(62, -3.5, -5.0), parked(60, 4.5)], scans=30, ego_speed=0.0)
+    assert share[0] > 0.75
+    assert (share[1], others) == (0, 0)
+
+
 @pytest.mark.parametrize("start", [2.0, 2.9])
 def test_what_no_image_shows_goes_however_short_the_drive(start):
     """Half a second of driving of its own is enough; and the row of parked cars stays."""

@@ -233,11 +233,14 @@ def _observations_by_others(
         _add(seen.segments.parts.points, seen.segments.parts.sums, place, points, centroids)
     centroids /= points[:, None]
     order = spatial_order(centroids)
-    counts = np.zeros((2, count), np.int32)
+    centroids, counts = centroids[order], np.zeros((2, count), np.int32)
     for farthest_m in (settings.farthest_m, settings.farthest_object_m):
+        found = np.zeros((2, len(order)), np.int32)
         for some in chain(() if before is None else before.parts(), _parts(observations)):
-            counts[:, order] += hits_and_misses(centroids[order], some, farthest_m, margin_ratio)
-        order = order[counts[:, order].sum(axis=0) == 0]
+            found += hits_and_misses(centroids, some, farthest_m, margin_ratio)
+        counts[:, order] = found
+        unseen = ~found.any(axis=0)
+        order, centroids = order[unseen], centroids[unseen]
     counts[0] = np.maximum(counts[0] - 1, 0)  # less the scan that found it
     return counts
 

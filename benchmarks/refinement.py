@@ -6,7 +6,8 @@
 prints the figures and writes them into benchmarks/results/refinement.json; parts that were not asked for stay as they
 are there. Removal: share of moving vehicle points removed (DA), of static vehicle points kept (SA_vehicle) and of all
 static points kept (SA), AA = sqrt(SA DA); on real data and with `semantics` the paper's rule beside ours. Simulated:
-what every mover does, how much of it was removed, and how many voxels are left over roads where nothing stands.
+what every mover does, how much of it was removed, and how many voxels are left over roads where nothing stands. Both
+also without labels, by free space and tracks alone.
 Semantics: strict IoU on the points that their own image labels, before and after. Times are CPU time of this process;
 what counts is their ratio.
 """
@@ -53,7 +54,7 @@ URBAN = open_label_set()
 TABLES = Tables.of(URBAN)
 RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
 RESULTS = Path(__file__).parent / "results" / "refinement.json"
-AS_IT_RUNS = "as the pipeline runs"
+AS_IT_RUNS, WITHOUT_LABELS = "as the pipeline runs", "without labels"
 PARTS = ["kernels", "raw", "semantics", "simulated"]
 Figures = dict[str, Any]
 GROUND_IDS = (40, 48)
@@ -180,8 +181,9 @@ def on_raw_drive(data: Path) -> Figures:
         update={"trajectory": alone.trajectory.model_copy(update={"lidar_odometry": False})}
     )
     figures: Figures = {}
+    as_it_runs = estimate_trajectory(log, Settings(), RunStats())[0]
     for name, trajectory in (
-        (AS_IT_RUNS, estimate_trajectory(log, Settings(), RunStats())[0]),
+        (AS_IT_RUNS, as_it_runs),
         ("the unit's own poses", log.reference),
         ("GNSS and IMU alone", estimate_trajectory(log, alone, RunStats())[0]),
     ):
@@ -191,7 +193,10 @@ def on_raw_drive(data: Path) -> Figures:
             tracklets.removal(drive, removed_in_all(drive, found, refined_map(found)), data / RAW_0005) | cost
         )
         figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
-    return figures
+    drive = Drive(log, as_it_runs, None, Settings(), from_lidar_odometry=True)
+    found = mapped(drive)
+    removed = removed_in_all(drive, found, refined_map(found))
+    return figures | {WITHOUT_LABELS: tracklets.removal(drive, removed, data / RAW_0005)}
 
 
 def simulated(folder: Path, seeds: int, seconds: float) -> list[Path]:
@@ -215,11 +220,22 @@ def perfectly_seen(folder: Path) -> Drive:
 
 
 def on_simulated_drive(folder: Path) -> Figures:
-    """Removal all around, mover by mover."""
+    """Removal all around, mover by mover; with labels, what it costs, and without."""
     drive = perfectly_seen(folder)
     found, cost = timed_mapping(drive)
-    refined = refined_map(found)
-    points = removed_in_all(drive, found, refined)
+    unlabelled = replace(drive, segmenter=None)
+    return (
+        {"scans": len(drive.log.scans)}
+        | cost
+        | against_truth(drive, folder, found)
+        | {WITHOUT_LABELS: against_truth(unlabelled, folder, mapped(unlabelled))}
+    )
+
+
+def against_truth(drive: Drive, folder: Path, chunks: list[MappedChunk]) -> Figures:
+    """Removal in a simulated drive, against the instance that every point is of."""
+    refined = refined_map(chunks)
+    points = removed_in_all(drive, chunks, refined)
     cases = what_they_do(folder)
     counts = np.zeros((3, 2), np.int64)
     movers: dict[str, NDArray[np.int64]] = {}
@@ -237,8 +253,6 @@ def on_simulated_drive(folder: Path) -> Figures:
             found = np.array([of_it.sum(), removed[of_it].sum()])
             movers[cases[int(instance)]] = movers.get(cases[int(instance)], 0) + found
     return dynamic(counts) | {
-        **cost,
-        "scans": len(drive.log.scans),
         "left_over_road": left_over_road(refined, *map(np.concatenate, keys)),
         "movers": {
             case: {"points": int(n), "removed": round(float(k / n), 4)}

@@ -186,8 +186,9 @@ class _Outline:
 
 
 def _size(seen: Array, is_cut: NDArray[np.bool_]) -> float:
-    """Extent of an object of which so much is seen, (k,) m, and in some scans not all."""
-    return float(np.quantile(seen[~is_cut] if not is_cut.all() else seen, SIZE_QUANTILE))
+    """Extent of an object of which so much is seen, (k,) m, in some scans not all: then it is no less."""
+    whole = seen[~is_cut] if not is_cut.all() else seen
+    return float(max(np.quantile(whole, SIZE_QUANTILE), np.quantile(seen, SIZE_QUANTILE)))
 
 
 def _middle(
@@ -204,6 +205,7 @@ def _middle(
     vehicle = CAR_M if (~is_cut).sum() >= WHOLE_SCANS else LORRY_M
     possible = max(extent, vehicle) if extent > SMALL_M / 2 else extent
     of_cut = np.maximum(possible - seen, 0.0) / 2 + HIDDEN_STDDEV_M
-    unknown = np.where(is_cut, of_cut, np.where(side == 0, hidden, 0.0))
+    is_abeam = (lidar > high - extent) & (lidar < low + extent)  # what is not seen may be on either side
+    unknown = np.where(is_cut, of_cut, np.where(is_abeam, hidden, 0.0))
     alike = min(max(int((unknown > edge).sum()), 1), SAME_VIEW_SCANS)
     return middle, np.hypot(edge, np.sqrt(alike) * unknown)

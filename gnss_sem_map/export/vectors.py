@@ -7,6 +7,7 @@ they did before. What stands on the ground is followed across tiles, and is fini
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -20,6 +21,9 @@ from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.tiles import TiledMap
+
+# of an array in memory, which has none: rasterio's own silence ends when another thread leaves a block of its own
+warnings.filterwarnings("ignore", "Dataset has no geotransform")
 
 Array = NDArray[np.float64]
 SMALLEST_AREA_M2 = 2.0

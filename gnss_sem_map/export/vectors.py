@@ -22,7 +22,7 @@ from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.tiles import TiledMap
 
-# of an array in memory, which has none: rasterio's own silence ends when another thread leaves a block of its own
+# Said of an array in memory, which has none. rasterio ignores the warning itself, but not when two threads export.
 warnings.filterwarnings("ignore", "Dataset has no geotransform")
 
 Array = NDArray[np.float64]

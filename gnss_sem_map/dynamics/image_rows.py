@@ -71,6 +71,11 @@ class Rows:
         return len(self.bounds)
 
     @cached_property
+    def elevations_rad(self) -> NDArray[np.float64]:
+        """(rows + 1,) the middle of every row of an image; the first one is empty."""
+        return np.radians(LOWEST_DEG + CELL_DEG * np.append(0.0, self.bounds.mean(axis=1)))
+
+    @cached_property
     def gaps_rad(self) -> NDArray[np.float64]:
         """(CELLS,) angle between the rings below and above each cell; 0 where rows adjoin."""
         gaps = np.zeros(CELLS)

@@ -317,6 +317,7 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
         centroids = whole.sums[:, :2] / whole.points[:, None]
         outlines = of_scan.outlines()
         levels = of_scan.levels()
+        covered = _covered(of_scan, seen.seen)
         seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
             listed.append(
@@ -331,10 +332,22 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     seen_from=seen_from,
                     levels=levels[number],
                     labelled=int(whole.labelled[number]),
+                    is_covered=bool(covered[number]),
                     delays=seen.delays,
                 )
             )
     return listed
+
+
+def _covered(segments: Segments, seen: RangeImage) -> NDArray[np.bool_]:
+    """Which segments (s,) of a scan something nearer hides in part, above or below."""
+    means = segments.parts.sums / segments.parts.points[:, None]
+    rows = seen.rows
+    hidden: NDArray[np.bool_] = range_images.hidden_above_or_below(
+        means, segments.number, seen.T_lidar_map, rows.of_return, rows.elevations_rad, seen.image,
+        len(segments.truncated), HIDING_M,
+    )  # fmt: skip
+    return hidden
 
 
 def moved_points(

@@ -28,6 +28,8 @@ HIDDEN_STDDEV_M = 0.3
 SMALL_M, CAR_M, LORRY_M = 2.3, 4.5, 12.0
 """Smaller objects, people and cyclists, have no sides that are seen well: the mean of what is seen is their place. A
 larger one that is hidden in part may be as long as a car, and one that was never seen whole as long as a lorry."""
+LOW_M = 1.0
+"""People and cyclists are higher: what is as small as they are, and lower, is part of something larger."""
 WHOLE_SCANS = 3
 """Scans in which an object is seen whole, that tell its size."""
 VELOCITY_SCANS = 5
@@ -90,20 +92,20 @@ def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | 
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     lidar = np.array([one.seen_from for one in segments]) - centroids
     ranges = np.linalg.norm(lidar, axis=1)
-    is_cut = np.array([one.truncated for one in segments])
-    may_be_cut = binary_dilation(is_cut, iterations=CUT_SCANS)  # what hides it comes and goes by and by
+    is_cut = np.array([one.truncated or one.is_covered for one in segments], np.bool_)
     edge = EDGE_STDDEV_M + EDGE_STDDEV_RATIO * ranges
     middle, variances = centroids.copy(), np.zeros_like(centroids)
     ends = [outline.extents(centroids, axis) for axis in (along, across)]
     size = [_size(high - low, is_cut) for low, high in ends]
+    levels = np.array([one.levels for one in segments])
+    height = foot_m + _height(levels, is_cut) + GRANULE_M
+    is_cut |= size[0] < SMALL_M and size[1] < SMALL_M / 2 and height < LOW_M
+    may_be_cut = binary_dilation(is_cut, iterations=CUT_SCANS)  # what hides it comes and goes by and by
     for axis, (low, high), extent in zip((along, across), ends, size, strict=True):
         shift, stddev = _middle(low, high, (lidar * axis).sum(axis=1), may_be_cut, edge, extent)
         if max(size) > SMALL_M:
             middle += shift[:, None] * axis
         variances += stddev[:, None] ** 2 * axis**2
-    levels = np.array([one.levels for one in segments])
-    whole = levels[~is_cut] if not is_cut.all() else levels
-    height = float(np.quantile(whole[:, 1] - whole[:, 0], SIZE_QUANTILE)) + foot_m + GRANULE_M
     points = sum(one.points for one in segments)
     return ObjectTrack(
         stamps,
@@ -189,6 +191,12 @@ def _size(seen: Array, is_cut: NDArray[np.bool_]) -> float:
     """Extent of an object of which so much is seen, (k,) m, in some scans not all: then it is no less."""
     whole = seen[~is_cut] if not is_cut.all() else seen
     return float(max(np.quantile(whole, SIZE_QUANTILE), np.quantile(seen, SIZE_QUANTILE)))
+
+
+def _height(levels: Array, is_cut: NDArray[np.bool_]) -> float:
+    """Of an object between these levels (k, 2) m: it is seen best where it is not cut off."""
+    whole = levels[~is_cut] if not is_cut.all() else levels
+    return float(np.quantile(whole[:, 1] - whole[:, 0], SIZE_QUANTILE))
 
 
 def _middle(

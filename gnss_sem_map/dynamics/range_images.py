@@ -145,6 +145,47 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def hidden_above_or_below(p_map, segments, T_lidar_map, row_of, elevations_rad, image, count, margin_m):
+    """Mask (count,) of the segments of a scan that something nearer hides in part, above or below.
+
+    An end are the points with no more of the segment in the next row. What is nearer above one hides it. Below it the
+    ground is nearer, too: only what is steep hides it. `elevations_rad` (h,) are those of the rows of the image.
+    """
+    members, flat = np.flatnonzero(segments >= 0), p_map.reshape(-1)
+    counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    for i in members:
+        x, y, z = _in_lidar(T_lidar_map, flat, i)
+        r = np.sqrt(x * x + y * y + z * z)
+        cell, column = _pixel(x, y, z)
+        row, s = row_of[cell], segments[i]
+        for side, step in ((0, 1), (1, -1)):
+            beyond = row + step
+            if row == 0 or beyond < 1 or beyond >= len(image):
+                continue
+            seen = image[beyond, column + 1] / UNITS_PER_M
+            if abs(seen - r) < margin_m:
+                continue
+            counts[s, side] += 1
+            if seen < r and (side == 0 or _is_steep(image, elevations_rad, beyond, column + 1)):
+                hidden[s, side] += 1
+    result = np.zeros(count, np.bool_)
+    for s in range(count):
+        result[s] = 3 * hidden[s, 0] > counts[s, 0] or 3 * hidden[s, 1] > counts[s, 1]
+    return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _is_steep(image, elevations_rad, row, column):
+    """Whether a return and the one in the row below lie above each other, rather than behind each other."""
+    if row < 2 or image[row - 1, column] == EMPTY:
+        return False
+    upper, lower = image[row, column], image[row - 1, column]
+    e, f = elevations_rad[row], elevations_rad[row - 1]
+    rise = upper * np.sin(e) - lower * np.sin(f)
+    return rise > abs(upper * np.cos(e) - lower * np.cos(f))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def count_hits_and_misses(
     positions,
     images,

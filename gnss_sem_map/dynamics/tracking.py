@@ -41,6 +41,8 @@ class Segment:
     """Points that the image labels as movable."""
     delays: SweepDelays | None = None
     """When the sweep met what; None: all at the stamp."""
+    is_covered: bool = False
+    """Something nearer hides what is above or below: what is seen of it may be seen through a gap."""
 
 
 @dataclass(eq=False)

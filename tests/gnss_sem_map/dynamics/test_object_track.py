@@ -1,6 +1,7 @@
 """The track of a car of known size that something hides in part: where its middle is, and how well that is known."""
 
 import numpy as np
+import pytest
 
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.tracking import Segment
@@ -9,11 +10,14 @@ LENGTH_M, SPEED_M_S, STEP_S = 4.0, 5.0, 0.1
 LIDAR = np.array([-0.1, -20.0])
 
 
-def segment(scan, begin, end, truncated=False):
+def segment(scan, begin, end, truncated=False, is_covered=False, highest=1.5):
     """A side of a car along x, of which so much is seen."""
     x = np.linspace(begin, end, 20)
     outline = np.stack([x, np.zeros(20)], axis=1)
-    return Segment(scan, scan * STEP_S, outline.mean(axis=0), 20, True, truncated, outline, LIDAR, (0.3, 1.5))
+    return Segment(
+        scan, scan * STEP_S, outline.mean(axis=0), 20, True, truncated, outline, LIDAR, (0.3, highest),
+        is_covered=is_covered,
+    )  # fmt: skip
 
 
 def test_of_a_car_that_comes_out_abeam_from_behind_something_the_hidden_part_is_unknown():
@@ -42,3 +46,15 @@ def test_an_object_is_no_smaller_than_what_is_seen_of_it_where_it_is_cut_off():
         ]
     )
     assert LENGTH_M < track.size_m[0] < LENGTH_M + 0.2
+
+
+@pytest.mark.parametrize(
+    "hidden", [{"is_covered": True}, {"highest": 0.9}], ids=["covered", "lower than people"]
+)
+def test_what_is_seen_through_a_gap_may_be_anywhere_along_a_lorry(hidden):
+    """The visible part of a lorry stays in the gap while it passes."""
+    middles = SPEED_M_S * STEP_S * np.arange(-5, 6)
+    track = track_of([segment(scan, -0.6, 0.6, **hidden) for scan in range(len(middles))])
+    assert (abs(track.positions[:, 0] - middles) < np.sqrt(track.variances[:, 0])).all()
+    person = track_of([segment(scan, -0.6, 0.6) for scan in range(len(middles))])
+    assert (person.variances[:, 0] < 0.2**2).all()

@@ -6,7 +6,7 @@ from scenes import DENSE
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.dynamics import range_images
-from gnss_sem_map.dynamics.image_rows import CELL_DEG, LOWEST_DEG
+from gnss_sem_map.dynamics.image_rows import CELL_DEG, LOWEST_DEG, Rows
 from gnss_sem_map.dynamics.visibility import (
     CUBE_M,
     MARGIN_M,
@@ -144,6 +144,40 @@ def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
         assert range_images.hidden_sides(
             points, segments, np.eye(4), DENSE.of_return, nearer, 1, 0.5
         ).tolist() == [expected]
+
+
+HEIGHT_M = 1.7
+
+
+@pytest.mark.parametrize("rings_deg", [np.arange(-24, 2, 0.4), np.arange(-15, 16, 2.0)])
+@pytest.mark.parametrize(
+    ("shown_m", "expected"),
+    [((-9.0, 9.0), False), ((-9.0, 1.0), True), ((0.8, 9.0), True), ((0.8, 1.6), True)],
+)
+def test_a_car_is_hidden_above_or_below_where_a_fence_stands_before_it_and_not_by_the_road(
+    rings_deg, shown_m, expected
+):
+    """Side of a car at 16 m, on level ground, behind a fence at 8 m that is open where the line of sight meets heights
+    of the car between `shown_m`."""
+    a, e = (
+        angle.ravel() for angle in np.meshgrid(np.radians(np.arange(-20, 20, 0.2)), np.radians(rings_deg))
+    )
+    rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+    with np.errstate(divide="ignore"):
+        road = np.where(rays[:, 2] < 0, -HEIGHT_M / rays[:, 2], 70.0)
+    beside = abs(rays[:, 1] / rays[:, 0]) < 2.0 / 16
+    at_car = HEIGHT_M + 16 / rays[:, 0] * rays[:, 2]
+    car = np.where(beside & (at_car > 0) & (at_car < 1.7), 16 / rays[:, 0], np.inf)
+    at_fence = HEIGHT_M + 8 / rays[:, 0] * rays[:, 2]
+    is_open = (at_car > shown_m[0]) & (at_car < shown_m[1])
+    fence = np.where((at_fence > 0) & ~is_open, 8 / rays[:, 0], np.inf)
+    points = rays * np.minimum(np.minimum(road, car), fence)[:, None]
+    of_car = (car < road) & (car < fence) & (at_car > 0.2)
+    rows = Rows.of([points])
+    assert range_images.hidden_above_or_below(
+        points, np.where(of_car, 0, -1), np.eye(4), rows.of_return, rows.elevations_rad,
+        image_of(points, rows), 1, 0.5,
+    ).tolist() == [expected]  # fmt: skip
 
 
 def test_pixels_are_where_the_angles_say():

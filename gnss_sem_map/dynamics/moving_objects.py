@@ -149,6 +149,7 @@ def decide(
         near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
         of_mover, without = presence(places, of_places, near)
         moved, stands = _either(moved, of_mover), _either(stands, without)
+    listed = _with_cover(listed, observations, segments, _of_voxels(gone, segments))
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
@@ -317,7 +318,6 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
         centroids = whole.sums[:, :2] / whole.points[:, None]
         outlines = of_scan.outlines()
         levels = of_scan.levels()
-        covered = _covered(of_scan, seen.seen)
         seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
             listed.append(
@@ -332,19 +332,33 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     seen_from=seen_from,
                     levels=levels[number],
                     labelled=int(whole.labelled[number]),
-                    is_covered=bool(covered[number]),
                     delays=seen.delays,
                 )
             )
     return listed
 
 
-def _covered(segments: Segments, seen: RangeImage) -> NDArray[np.bool_]:
-    """Which segments (s,) of a scan something nearer hides in part, above or below."""
-    means = segments.parts.sums / segments.parts.points[:, None]
-    rows = seen.rows
+def _with_cover(
+    listed: Sequence[Segment],
+    observations: Sequence[Observation],
+    segments: Sequence[Segments],
+    moved: Sequence[NDArray[np.bool_]],
+) -> list[Segment]:
+    """The segments of all scans, of which those are marked that moved and that something nearer hides in part."""
+    hidden = [
+        _covered(of_scan, seen.seen, some)
+        for of_scan, seen, some in zip(segments, observations, moved, strict=True)
+    ]
+    pairs = zip(listed, np.concatenate(hidden), strict=True)
+    return [replace(one, is_covered=True) if covered else one for one, covered in pairs]
+
+
+def _covered(segments: Segments, seen: RangeImage, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which segments (s,) of a scan something nearer hides in part, above or below; only what moved (v,) is asked."""
+    voxels, rows = np.flatnonzero(moved), seen.rows
+    means = segments.parts.sums[voxels] / segments.parts.points[voxels, None]
     hidden: NDArray[np.bool_] = range_images.hidden_above_or_below(
-        means, segments.number, seen.T_lidar_map, rows.of_return, rows.elevations_rad, seen.image,
+        means, segments.number[voxels], seen.T_lidar_map, rows.of_return, rows.elevations_rad, seen.image,
         len(segments.truncated), HIDING_M,
     )  # fmt: skip
     return hidden

@@ -234,7 +234,10 @@ def _doubts(
         yield f"{unfit.sum()} of {len(unfit)} relative poses rejected"
     heading = heading_stddevs(keyframes)
     if heading.min() > UNKNOWN_HEADING:
-        yield f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): did the vehicle move?"
+        yield (
+            f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): it takes some seconds of"
+            " driving, with turns or changes of speed"
+        )
 
 
 def heading_stddevs(trajectory: Trajectory) -> Array:

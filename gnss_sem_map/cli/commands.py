@@ -25,6 +25,7 @@ from gnss_sem_map.cli import (
 )
 from gnss_sem_map.cli.signals import Stopped, caused_by_signal, ignore_signals
 from gnss_sem_map.errors import SemMapError
+from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
@@ -79,11 +80,19 @@ def _all_commands(
     ] = False,
     log_file: Annotated[
         Path | None,
-        typer.Option(help="File to which stages, warnings and the error are appended; not in the folder -o."),
+        typer.Option(
+            help="File to which stages, warnings and the error are appended; not in a folder of results."
+        ),
     ] = None,
 ) -> None:
     if verbose and quiet:
         raise typer.BadParameter("--verbose and --quiet exclude each other", param_hint="-v, -q")
+    for folder in log_file.absolute().parents if log_file is not None else ():
+        if (folder / MARKER).exists():
+            raise typer.BadParameter(
+                f"{log_file} lies in {folder}, a folder of results; choose another place",
+                param_hint="--log-file",
+            )
     logs.set_up(
         logs.Terminal.VERBOSE if verbose else logs.Terminal.QUIET if quiet else logs.Terminal.NORMAL, log_file
     )

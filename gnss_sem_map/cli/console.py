@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,8 +65,8 @@ def warn(warnings: Iterable[str]) -> None:
             typer.echo(f"warning: {warning}", err=True)
 
 
-def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
-    """Summary of a run, with its times, in three lines or as JSON."""
+def print_run(about: dict[str, Any], out: Path, as_json: bool, stages: Container[str] | None = None) -> None:
+    """Summary of a run, with the times of some stages (None: all), in three lines or as JSON."""
     if as_json:
         typer.echo(json.dumps(about))
         return
@@ -75,7 +75,8 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool) -> None:
         f"{about['name']}: {counts.get('scans', 0)} scans, {counts.get('points', 0)} points,"
         f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
     )
-    typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items()))
+    done = {stage: value for stage, value in seconds.items() if stages is None or stage in stages}
+    typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in done.items()))
     _print_passes(about)
     typer.echo(f"results in {out}")
 

@@ -33,7 +33,7 @@ def refine(
     if again.is_merged and not as_json:
         print_merged(again.about, again.folder)
     else:
-        print_run(again.about, again.folder, as_json)
+        print_run(again.about, again.folder, as_json, ("refinement", "export"))
 
 
 def relabel(
@@ -50,7 +50,7 @@ def relabel(
 
     with progress_bars() as progress:
         again = Run.open(run).relabel(segmenter, out, device=device, progress=progress)
-    print_run(again.about, again.folder, as_json)
+    print_run(again.about, again.folder, as_json, ("mapping", "refinement", "export"))
 
 
 def export(

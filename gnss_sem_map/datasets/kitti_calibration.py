@@ -39,6 +39,8 @@ def read_rows(path: Path, expected: dict[str, int]) -> dict[str, Array]:
         row = rows.get(name)
         if row is None or np.shape(row) != (count,) or not (np.abs(row) <= LARGEST).all():
             found = "nothing" if row is None else f"{np.size(row)} numbers"
+            if np.shape(row) == (count,):
+                found = f"{row[np.flatnonzero(~(np.abs(row) <= LARGEST))[0]]} among them"
             raise DataError(f"{shown(path)}: row {name!r}: found {found}, expected {count} finite numbers")
     return {name: np.asarray(rows[name], np.float64) for name in expected}
 

@@ -272,8 +272,11 @@ def _oxts_row(path: Path) -> tuple[str, Array]:
         return str(error), np.empty(0)
     except ValueError:
         row = np.empty(0)
-    if row.shape != (OXTS_COLUMNS,) or not np.isfinite(np.delete(row, POSITION_ACCURACY)).all():
+    if row.shape != (OXTS_COLUMNS,):
         return f"found {row.size} numbers, expected {OXTS_COLUMNS} finite ones", row
+    bad = np.setdiff1d(np.flatnonzero(~np.isfinite(row)), POSITION_ACCURACY)
+    if len(bad):
+        return f"number {bad[0] + 1} of {OXTS_COLUMNS} is {row[bad[0]]}, expected a finite one", row
     if not (np.abs(row[[*range(11, 14), *range(17, 20)]]) <= LARGEST_OF_IMU).all():
         return "found a force or a rate beyond the range of any sensor", row
     return "", row

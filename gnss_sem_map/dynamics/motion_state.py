@@ -191,7 +191,7 @@ def _motion_of_track(
     reason = f"seen through {missed:,.0f} times, hit {hit:,.0f} times"
     if moved and displaced:
         motion = Motion.MOVING
-        reason = f"went {moved.shift_m:.1f} m, known to {moved.stddev_m:.1f} m, {reason}"
+        reason = f"went at least {moved.shift_m:.1f} m, known to {moved.stddev_m:.1f} m, {reason}"
     elif vanished > 0.5:
         stood = moved is not None and not moved.is_moving and hit > 0
         motion = Motion.STOPPED_AND_LEFT if stood else Motion.MOVING

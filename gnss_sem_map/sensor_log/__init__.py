@@ -242,6 +242,8 @@ class SensorLog:
         if not colon or not all(part == "" or part.isdecimal() for part in (first, last)):
             raise ConfigError(f"frames: found {frames!r}, expected A:B with frame numbers")
         low, high = int(first or 0), int(last) if last else float("inf")
+        if low >= high:
+            raise ConfigError(f"frames: found {frames!r}, expected A:B with A below B")
         return self._with_scans(lambda scans: tuple(scan for scan in scans if low <= scan.number < high))
 
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:

@@ -126,6 +126,11 @@ def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
     assert len(refused.stderr.splitlines()) == 1
     assert program("-q", "-v", *words).returncode == 2
 
+    inside = program("--log-file", tmp_path / "out" / "log.txt", *words)
+    assert inside.returncode == 2
+    assert "a folder of results; choose another place" in inside.stderr
+    assert not (tmp_path / "out" / "log.txt").exists()
+
 
 def test_the_first_progress_comes_before_large_packages_are_loaded(tmp_path: Path) -> None:
     seen = (

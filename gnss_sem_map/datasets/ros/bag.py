@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -49,6 +50,8 @@ class Bag:
     def __init__(self, path: Path) -> None:
         self.path = path
         names = bag_files(path)
+        if not names and not os.path.lexists(path):
+            raise DataError(f"{shown(path)}: no such file or folder; expected a bag of ROS 1 or ROS 2")
         if not names:
             raise DataError(
                 f"{shown(path)}: found no {', '.join(SUFFIXES)} file, expected a bag of ROS 1 or ROS 2"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ from sensor_drives import FRAME, LEVER, drive, findings, wrong
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
+from gnss_sem_map.simulation import Camera, Lidar, prepare
+from gnss_sem_map.simulation.table_drive import write_table
 
 Array = NDArray[np.float64]
 
@@ -179,3 +183,12 @@ def test_gps_time_in_place_of_utc_is_found(seed: int, shift_s: float) -> None:
     offset = float(told.rpartition("gnss_time_offset_s: ")[2])
     assert abs(offset + shift_s) < 0.25
     assert not [text for text in wrong(findings(log)) if text.startswith("GNSS clock")]
+
+
+def test_a_log_of_three_seconds_tells_nothing_of_the_clock(tmp_path: Path) -> None:
+    """By chance the fixes of this one agree best with the IMU 0.68 s after their stamps."""
+    small = Lidar(np.radians([-5.0, -10.0]), columns=60, range_m=50.0, blind_m=1.0)
+    short = prepare(1.5, 3, small, Camera(width=64, height=32))
+    log = open_drive(write_table(short, tmp_path))
+    [clock] = [one for one in findings(log) if one.check == "GNSS clock"]
+    assert clock.evidence.startswith("not observable")

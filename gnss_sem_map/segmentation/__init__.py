@@ -130,8 +130,8 @@ def open_segmenter(
     close = difflib.get_close_matches(scheme, SCHEMES, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
     raise ConfigError(
-        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected one of {list(SCHEMES.values())}, or none where"
-        " a map may have no classes"
+        f"segmenter {spec!r}: unknown kind {scheme!r}; {hint}expected one of {list(SCHEMES.values())}; `run` also"
+        " takes none, for the geometry alone"
     )
 
 

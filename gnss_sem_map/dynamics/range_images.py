@@ -149,7 +149,8 @@ def hidden_above_or_below(p_map, segments, T_lidar_map, row_of, elevations_rad, 
     """Mask (count,) of the segments of a scan that something nearer hides in part, above or below.
 
     At the points with no more of the segment in the next row it ends, or is hidden. What is nearer above them hides it.
-    Below them the ground is nearer, too: only what is steep hides it. `elevations_rad` (h,) are those of the rows of the image.
+    Below them the ground is nearer, too: only what is steep hides it. `elevations_rad` (h,) are those of the rows of
+    the image.
     """
     members, flat = np.flatnonzero(segments >= 0), p_map.reshape(-1)
     counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)

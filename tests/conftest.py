@@ -42,6 +42,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/export/test_pictures.py",
         "gnss_sem_map/many_drives",
         "gnss_sem_map/scans/test_lidar_odometry.py",
+        "gnss_sem_map/scans/test_sweeps_left_out.py",
         "gnss_sem_map/segmentation/test_checkpoints.py",
         "gnss_sem_map/segmentation/test_demo_network.py",
         "gnss_sem_map/segmentation/test_huggingface.py",

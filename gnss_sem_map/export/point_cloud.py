@@ -67,7 +67,7 @@ def _ply_vertices(piece: SemanticMap) -> NDArray[np.void]:
     vertices = np.empty(len(voxels), PLY_VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = voxels.centres.T
     vertices["red"], vertices["green"], vertices["blue"] = colours(labels, voxels.label_set).T
-    vertices["label"] = np.where(labels < 0, PLY_UNLABELLED, labels)
+    vertices["label"] = np.where(labels < 0, PLY_UNLABELLED, labels.astype(np.uint8))
     vertices["confidence"], vertices["hits"], vertices["state"] = piece.confidence, voxels.hits, piece.states
     return vertices
 

@@ -48,15 +48,15 @@ class BatchSegmenter(Protocol):
 
 @runtime_checkable
 class ThreadedSegmenter(Protocol):
-    """A segmenter that is faster when several threads call it, each with its own image."""
+    """A segmenter that is faster when several threads call it, each with its own images."""
 
     @property
     def threads(self) -> int:
         """Number of threads."""
         ...
 
-    def on_one_core(self, image: Image) -> NDArray[np.float32]:
-        """Class probabilities (h, w, c) of one image, computed by the calling thread alone."""
+    def on_one_core(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
+        """Class probabilities (h, w, c) of every image, computed by the calling thread alone."""
         ...
 
 
@@ -107,7 +107,7 @@ def _write_all(
     waiting = [image for image in images if not _file(folder, image).exists()]
     kept, skips, sizes, start = len(images) - len(waiting), list[Skip](), list[int](), time.perf_counter()
     progress("segmenting", kept, len(images))
-    threads = segmenter.threads if isinstance(segmenter, ThreadedSegmenter) and batch_size == 1 else 1
+    threads = segmenter.threads if isinstance(segmenter, ThreadedSegmenter) else 1
 
     def make(batch: list[Image]) -> tuple[list[int], list[Skip]]:
         lost: list[Skip] = []
@@ -142,16 +142,20 @@ def _segment(
     batch: list[Image], segmenter: Segmenter, skips: list[Skip], on_one_core: bool
 ) -> Iterator[tuple[Image, NDArray[np.uint8] | NDArray[np.float32]]]:
     """Segment a batch at once if the segmenter can; one by one if it cannot, or if one image is damaged."""
-    if isinstance(segmenter, BatchSegmenter) and len(batch) > 1:
+    many = None
+    if on_one_core and isinstance(segmenter, ThreadedSegmenter):
+        many = segmenter.on_one_core
+    elif isinstance(segmenter, BatchSegmenter):
+        many = segmenter.segment_many
+    if many and len(batch) > 1:
         try:
-            yield from zip(batch, unless_left(segmenter.segment_many, batch), strict=True)
+            yield from zip(batch, unless_left(many, batch), strict=True)
             return
         except DataError:
             pass  # some image is damaged: the loop below finds out which
-    ask = segmenter.on_one_core if on_one_core and isinstance(segmenter, ThreadedSegmenter) else segmenter
     for image in batch:
         try:
-            yield image, unless_left(ask, image)
+            yield image, unless_left(many, [image])[0] if many else unless_left(segmenter, image)
         except MissingLabels as error:
             skips.append(Skip("labels", f"frame {image.frame}", str(error)))
         except DataError as error:

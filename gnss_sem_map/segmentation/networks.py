@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
+from threading import Lock
 
 import numpy as np
 import torch
@@ -45,6 +46,8 @@ class NetworkSegmenter:
         self._mean = torch.tensor(mean, device=device).reshape(3, 1, 1)
         self._std = torch.tensor(std, device=device).reshape(3, 1, 1)
         self._scale, self._shrink = scale, shrink
+        # the memory of a GPU holds one batch, whoever asks
+        self._turn = nullcontext() if device.type == "cpu" else Lock()
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
         """Class probabilities (h, w, c) of one image."""
@@ -52,13 +55,14 @@ class NetworkSegmenter:
 
     @property
     def threads(self) -> int:
-        """Number of threads: one on a GPU; one per core on a CPU, where cores that share an image would wait."""
-        return torch.get_num_threads() if self._device.type == "cpu" else 1
+        """One per core: on a CPU, cores that share an image would wait for each other; while a GPU computes, the others
+        read images and write probabilities."""
+        return torch.get_num_threads()
 
-    def on_one_core(self, image: Image) -> NDArray[np.float32]:
-        """Class probabilities (h, w, c) of one image, computed by the calling thread alone."""
+    def on_one_core(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
+        """Class probabilities of several images, as `segment_many`, by the calling thread alone."""
         torch.set_num_threads(1)  # of this thread
-        return self(image)
+        return self.segment_many(images)
 
     def segment_many(self, images: Sequence[Image]) -> list[NDArray[np.float32]]:
         """Class probabilities of several images of one size in one batch; the same as one by one."""
@@ -67,7 +71,8 @@ class NetworkSegmenter:
             return [seen for image in images for seen in self.segment_many([image])]
         height, width = (side // self._shrink for side in pixels[0].shape[:2])
         inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
-        with torch.inference_mode(), enough_memory(self._device, "fewer images at once, or ?scale=0.5"):
+        advice = "fewer images at once, or ?scale=0.5"
+        with self._turn, torch.inference_mode(), enough_memory(self._device, advice):
             batch = torch.from_numpy(inputs).to(self._device).permute(0, 3, 1, 2).float() / 255
             seen = self._probabilities((batch - self._mean) / self._std, (height, width))
             result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.ownership import MARKER, write_list
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.prefetch import prefetch, threads
 from gnss_sem_map.segmentation.checkpoints import (
     LOAD_ERRORS,
     load_strictly,
@@ -45,7 +45,6 @@ from gnss_sem_map.segmentation.training_data import (
     class_weights,
     labelled_images,
 )
-from gnss_sem_map.thread_pools import thread_pool
 
 NETWORK, STATE, LOG = "network.safetensors", "state.pt", "log.csv"
 """Files in the folder of a training: the best weights so far, the state for resuming, and one row per validation."""
@@ -218,12 +217,7 @@ class _Run:
 
     def _batches(self) -> Iterator[tuple[int, tuple[NDArray[np.uint8], NDArray[np.uint8]]]]:
         steps = range(self._done + 1, self.settings.steps + 1)
-        with thread_pool(1) as thread:
-            ahead: list[Future[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = []
-            for step in steps:
-                while len(ahead) < 3 and step + len(ahead) in steps:
-                    ahead.append(thread.submit(batch_of, self._data, self.settings, step + len(ahead)))
-                yield step, ahead.pop(0).result()
+        return prefetch(lambda step: batch_of(self._data, self.settings, step), steps, threads())
 
     def checkpoint(self, step: int, loss: float, validation: tuple[float, NDArray[np.float64]]) -> None:
         """Keep the network if it is the best so far, then everything that resuming needs, then a row of the log."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import hypothesis
+import matplotlib.font_manager  # noqa: F401 (the first import on a machine starts a process, which no unit test may)
 import pytest
 import street
 from declared import DATA, absent

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
-from threading import Lock
 
 import numpy as np
 import torch
@@ -46,8 +46,8 @@ class NetworkSegmenter:
         self._mean = torch.tensor(mean, device=device).reshape(3, 1, 1)
         self._std = torch.tensor(std, device=device).reshape(3, 1, 1)
         self._scale, self._shrink = scale, shrink
-        # the memory of a GPU holds one batch, whoever asks
-        self._turn = nullcontext() if device.type == "cpu" else Lock()
+        # torch prepares every layer anew for each thread that uses a GPU, and a batch of each would fill its memory
+        self._gpu_thread = None if device.type == "cpu" else ThreadPoolExecutor(1)
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
         """Class probabilities (h, w, c) of one image."""
@@ -71,17 +71,23 @@ class NetworkSegmenter:
             return [seen for image in images for seen in self.segment_many([image])]
         height, width = (side // self._shrink for side in pixels[0].shape[:2])
         inputs = np.stack([scaled(p, self._shrink, self._scale) for p in pixels])
-        advice = "fewer images at once, or ?scale=0.5"
-        with self._turn, torch.inference_mode(), enough_memory(self._device, advice):
-            batch = torch.from_numpy(inputs).to(self._device).permute(0, 3, 1, 2).float() / 255
-            seen = self._probabilities((batch - self._mean) / self._std, (height, width))
-            result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()
+        if self._gpu_thread is None:
+            result = self._run(inputs, (height, width))
+        else:
+            result = self._gpu_thread.submit(self._run, inputs, (height, width)).result()
         if not np.isfinite(result).all():
             numbers = [image.number for image in images]
             raise DataError(
                 f"images {numbers}: the network's probabilities are not finite; are its weights damaged?"
             )
         return [np.ascontiguousarray(one) for one in result]
+
+    def _run(self, pixels: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
+        with torch.inference_mode(), enough_memory(self._device, "fewer images at once, or ?scale=0.5"):
+            batch = torch.from_numpy(pixels).to(self._device).permute(0, 3, 1, 2).float() / 255
+            seen = self._probabilities((batch - self._mean) / self._std, size)
+            result: NDArray[np.float32] = seen.permute(0, 2, 3, 1).float().cpu().numpy()
+        return result
 
 
 def from_logits(network: Callable[[Tensor], Tensor], class_names: Sequence[str]) -> Probabilities:

@@ -225,9 +225,8 @@ def test_labels_of_points_are_in_the_folder_of_their_lidar(
 
     out, truth = tmp_path / "out", tmp_path / "truth"
     spec = f"labels:{small_drive.labels}"
-    ran = CliRunner().invoke(
-        app, ["run", str(two_lidars), "-o", str(out), "--segmenter", spec, "--write-labels", "--force"]
-    )
+    words = ["-o", str(out), "--segmenter", spec, "--write-labels", "--workers", "1", "--force"]
+    ran = CliRunner().invoke(app, ["run", str(two_lidars), *words])
     assert ran.exit_code == 0, ran.output
     written = label_files(out / "labels")
     expected = {f"{('top', 'rear')[k % 2]}/{k}" for k in small_drive.frames}

@@ -10,8 +10,8 @@
           drives/NAME/           the maps of single drives (`runs.many_drives`)
           bound/NAME/            where these were driven, and how they are bound (`runs.bound_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
-          .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`), and the images
-                                 of the scans before it (`mapping.waiting_images`)
+          .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`), the images of the
+                                 scans before it (`mapping.waiting_images`), and tables that wait (`mapping.chunks`)
           part/                  the new result while it is written
           old/                   the result before it, from when it is replaced until it is removed
 """
@@ -32,7 +32,7 @@ JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
-    r"|\.\d+\.\d+\.waiting/((\d+|images)\.npy)?|edges/(\d+\.npz|\.[^/]+\.\d+\.part)?"
+    r"|\.\d+\.\d+\.waiting/((\d+|images)\.npy|\d+\.table)?|edges/(\d+\.npz|\.[^/]+\.\d+\.part)?"
 )
 OURS = re.compile(
     r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"

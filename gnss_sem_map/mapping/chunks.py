@@ -123,7 +123,9 @@ def _map_chunks(
             if seen is not None:
                 chunk.add(*seen)
             if place == window and undecided is not None:
+                chunk.put_table_aside()
                 yield undecided.decided(before, chunk.observations)
+                chunk.take_table_back()
                 before, undecided = undecided.last_images, None
             elif place == window and number > 0 and is_sought:
                 with writing_to(work):
@@ -132,6 +134,7 @@ def _map_chunks(
             progress("mapping", done, total)
             if done % RELEASED_EVERY == 0:
                 release_memory()
+        chunk.put_table_aside()
         undecided = chunk
     if undecided is not None:
         is_followed = numbers.stop < len(chunks) and is_sought
@@ -192,6 +195,7 @@ class _Chunk:
     def __init__(self, drive: Drive, number: int, first: int, folder: Path) -> None:
         self._drive, self._number, self._first, self._folder = drive, number, first, folder
         self._all, self._keyframes = new_table(drive.settings), KeyframeSelector()
+        self._table = folder / f"{number}.table"
         self.observations: list[Observation] = []
         self.last_images: WaitingImages | None = None
         """Of its last window of scans, once it is decided."""
@@ -209,11 +213,22 @@ class _Chunk:
             self._keyframes.add(observation.stamp, observation.seen)
             self.observations.append(observation)
 
+    def put_table_aside(self) -> None:
+        """Its 30 to 80 MB are free until it is taken back; raises DataError."""
+        with writing_to(self._folder):
+            self._all.put_aside(self._table)
+
+    def take_table_back(self) -> None:
+        """The table may be used again; raises DataError."""
+        with writing_to(self._folder):
+            self._all.take_back(self._table)
+
     def decided(self, before: WaitingImages | None, after: Sequence[Observation]) -> MappedChunk:
-        """The chunk, once the scans before and after it are known."""
+        """The chunk, whose table was put aside, once the scans before and after it are known."""
         release_memory()  # of the scans, freed by other threads: 250 MB after three hundred scans
         settings, numbers = self._drive.settings, [one.number for one in self.observations]
         decision = decide([*self.observations, *after], len(numbers), before, settings.dynamics)
+        self.take_table_back()
         last = self._last_window()
         images = [one.seen for one in self.observations if one.number in last]
         with writing_to(self._folder):

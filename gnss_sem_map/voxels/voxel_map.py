@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property, reduce
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -287,6 +288,16 @@ class VoxelTable:
     @property
     def _views(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint8]]:
         return self._rows, self._rows.view(np.int32), self._rows.view(np.uint8)
+
+    def put_aside(self, path: Path) -> None:
+        """Write the table into a file: until `take_back`, it takes no memory and cannot be used. Raises OSError."""
+        self._rows.tofile(path)
+        self._rows = np.empty((0, self._words), np.int64)
+
+    def take_back(self, path: Path) -> None:
+        """Read the table that was put aside, and remove the file; raises OSError."""
+        self._rows = np.fromfile(path, np.int64).reshape(-1, self._words)
+        path.unlink()
 
     @property
     def nbytes(self) -> int:

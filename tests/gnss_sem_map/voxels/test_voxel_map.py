@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy_chain
@@ -227,6 +228,20 @@ def test_a_large_table_takes_at_most_63_bytes_per_voxel_and_keeps_all() -> None:
             worst = max(worst, table.nbytes / len(table))
     assert 57 < worst <= 63
     np.testing.assert_array_equal(table.to_map().keys, np.sort(keys))
+
+
+def test_a_table_that_was_put_aside_goes_on_as_one_that_was_not(tmp_path: Path) -> None:
+    (first, pixels, classes), (second, *_) = batches(2, count=2)
+    away, stays = VoxelTable(0.2, URBAN), VoxelTable(0.2, URBAN)
+    for table in (away, stays):
+        table.add(keys_of(first, 0.2), pixels, classes)
+    away.put_aside(tmp_path / "table")
+    assert away.nbytes == 0
+    away.take_back(tmp_path / "table")
+    assert not list(tmp_path.iterdir())
+    for table in (away, stays):
+        table.add(keys_of(second, 0.2))
+    assert_same(away.to_map(), stays.to_map())
 
 
 @pytest.mark.parametrize("names", [2, 5, 6, 19])

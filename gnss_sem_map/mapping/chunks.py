@@ -41,9 +41,9 @@ WINDOWS = 2
 """Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed. With
 one, tracks are cut so often that 97.0 % of the moving points of the demo are removed, not 98.6 %."""
 
-RELEASED_EVERY = 50
+RELEASED_EVERY = 20
 """Scans after which freed memory goes back to the system: what lasts lies among what scans have used, and 100 MB of
-holes come together in a few chunks. It takes 0.3 ms per scan."""
+holes come together in a few chunks. It takes 0.6 ms per scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,14 +228,14 @@ class _Chunk:
         release_memory()  # of the scans, freed by other threads: 250 MB after three hundred scans
         settings, numbers = self._drive.settings, [one.number for one in self.observations]
         decision = decide([*self.observations, *after], len(numbers), before, settings.dynamics)
-        self.take_table_back()
         last = self._last_window()
         images = [one.seen for one in self.observations if one.number in last]
         with writing_to(self._folder):
             self.last_images = WaitingImages.write(images, self._folder)
         del images
         self.observations.clear()
-        release_memory()  # 110 MB
+        release_memory(near_peak_only=False)  # 110 MB; the columns of the chunk need twice as much
+        self.take_table_back()
 
         def taken(place: int) -> tuple[WaitingPoints, NDArray[np.bool_]]:
             points = WaitingPoints.take(self._waiting(numbers[place]))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.clusters import Segments, find_segments, split_segments
+from gnss_sem_map.dynamics.covered_parts import HIDING_M, with_cover
 from gnss_sem_map.dynamics.ground_grid import (
     GROUND_CELL_M,
     closer_than,
@@ -54,8 +55,6 @@ FOOT_REACH_M = 0.2
 CELL_M_PER_DEG, LARGEST_CELL_M = 1.0, 2.0
 """Cells of the ground grow with the gap between rings: in one of 1 m the lowest return of 16 rings is often of the
 object."""
-HIDING_M = 0.5
-"""Something nearer by this hides the side of an object."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +148,7 @@ def decide(
         near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
         of_mover, without = presence(places, of_places, near)
         moved, stands = _either(moved, of_mover), _either(stands, without)
-    listed = _with_cover(listed, observations, segments, _of_voxels(gone, segments))
+    listed = with_cover(listed, segments, [seen.seen for seen in observations], _of_voxels(gone, segments))
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
@@ -336,32 +335,6 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                 )
             )
     return listed
-
-
-def _with_cover(
-    listed: Sequence[Segment],
-    observations: Sequence[Observation],
-    segments: Sequence[Segments],
-    moved: Sequence[NDArray[np.bool_]],
-) -> list[Segment]:
-    """The segments of all scans, of which those are marked that moved and that something nearer hides in part."""
-    hidden = [
-        _covered(of_scan, seen.seen, some)
-        for of_scan, seen, some in zip(segments, observations, moved, strict=True)
-    ]
-    pairs = zip(listed, np.concatenate(hidden), strict=True)
-    return [replace(one, is_covered=True) if covered else one for one, covered in pairs]
-
-
-def _covered(segments: Segments, seen: RangeImage, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which segments (s,) of a scan something nearer hides in part, above or below; only what moved (v,) is asked."""
-    voxels, rows = np.flatnonzero(moved), seen.rows
-    means = segments.parts.sums[voxels] / segments.parts.points[voxels, None]
-    hidden: NDArray[np.bool_] = range_images.hidden_above_or_below(
-        means, segments.number[voxels], seen.T_lidar_map, rows.of_return, rows.elevations_rad, seen.image,
-        len(segments.truncated), HIDING_M,
-    )  # fmt: skip
-    return hidden
 
 
 def moved_points(

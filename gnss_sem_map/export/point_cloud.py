@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date, timedelta
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +33,8 @@ UNLABELLED_COLOUR = (150, 150, 150)
 LAZ_SCALE_M = 0.001
 LAZ_CHUNK = 250_000
 """Points converted at a time."""
+NOT_DATED = date(1970, 1, 1)
+"""Files are dated by their last measurement: the same run on another day writes the same bytes."""
 TEXT_AREA = 3
 """Record of the LAS specification for a text that people read."""
 NEVER_CLASSIFIED, UNCLASSIFIED = 0, 1  # ASPRS codes: nobody looked, and looked without a result
@@ -127,12 +130,16 @@ def _write_points(exported: Exported, path: Path | str, removed: bool) -> None:
         replacing(path) as file,
         laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
     ):
+        last_us = 0
         for piece, attributes in exported.tiles():
             chosen = np.flatnonzero((piece.states == State.REMOVED) == removed)
             for start in range(0, len(chosen), LAZ_CHUNK):
                 part = chosen[start : start + LAZ_CHUNK]
                 of_part = None if attributes is None else attributes[part]
                 writer.write_points(las_points(piece[part], of_part, georeference, header))
+                if of_part is not None:
+                    last_us = max(last_us, int(of_part.last_us.max()))
+        writer.header.creation_date += timedelta(microseconds=last_us)
 
 
 def las_header(
@@ -144,6 +151,7 @@ def las_header(
     from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
 
     header = laspy.LasHeader(point_format=7, version="1.4")
+    header.creation_date = NOT_DATED
     header.generating_software = f"gnss-sem-map {version('gnss-sem-map')}"[:32]  # no longer by the standard
     header.scales = np.full(3, LAZ_SCALE_M)
     header.offsets = np.floor(_placed(np.zeros((1, 3)), georeference)[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
+from datetime import date
 from pathlib import Path
 
 import laspy
@@ -106,6 +107,13 @@ def test_they_are_the_last_moment_and_the_median_of_the_points(finished: Run) ->
     assert assert_as_seen(finished.folder, found, 18, "removed.laz") > 50
     times = laspy.read(finished.folder / "map.laz").gps_time - ADJUSTED_AT_EPOCH_S
     assert -0.05 < times.min() < times.max() < SWEEPS * scenes.SWEEP_S + 0.05
+
+
+@pytest.mark.parametrize("name", ["map.laz", "removed.laz"])
+def test_a_file_is_dated_by_its_last_measurement_so_its_bytes_are_the_same_tomorrow(
+    finished: Run, name: str
+) -> None:
+    assert laspy.read(finished.folder / name).header.creation_date == date(2024, 3, 1)
 
 
 def test_a_mover_is_no_look_at_the_static_voxels_that_it_passes(finished: Run) -> None:

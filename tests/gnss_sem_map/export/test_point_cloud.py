@@ -15,7 +15,13 @@ from scipy.spatial import cKDTree
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.georeference import Georeference
-from gnss_sem_map.export.point_cloud import adjusted_gps_time, write_laz, write_ply, write_removed
+from gnss_sem_map.export.point_cloud import (
+    NOT_DATED,
+    adjusted_gps_time,
+    write_laz,
+    write_ply,
+    write_removed,
+)
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
@@ -116,6 +122,7 @@ def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
     )
     assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
     assert las.header.number_of_points_by_return[0] == len(order)
+    assert las.header.creation_date == NOT_DATED
 
 
 def test_a_reader_that_knows_no_flags_sees_no_ghost_in_the_map(

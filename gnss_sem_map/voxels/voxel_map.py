@@ -291,7 +291,7 @@ class VoxelTable:
 
     def put_aside(self, path: Path) -> None:
         """Write the table into a file: until `take_back`, it takes no memory and cannot be used. Raises OSError."""
-        self._rows.tofile(path)
+        path.write_bytes(self._rows.data)  # `tofile` does not say why it failed
         self._rows = np.empty((0, self._words), np.int64)
 
     def take_back(self, path: Path) -> None:

@@ -15,7 +15,7 @@ free at its end."""
 LARGE_BYTES, FREE_BYTES = 8 << 20, 64 << 20
 """Arrays of the first size, those of a whole tile or chunk, go back to the system when they are freed, and leave no
 holes: 20 MB less at the peak, at no cost in time. By default glibc raises that size to 32 MB."""
-NEAR_PEAK_BYTES = 128 << 20
+NEAR_PEAK_BYTES = 64 << 20
 """Memory is released from so much below the peak on: as much as is taken until it is asked for again. With less, holes
 are returned too late, and the peak rises a little from chunk to chunk though no more memory is in use."""
 NEW_OBJECTS = 20_000

@@ -47,6 +47,7 @@ INTEGRATION_FILES = tuple(
         "gnss_sem_map/segmentation/test_checkpoints.py",
         "gnss_sem_map/segmentation/test_demo_network.py",
         "gnss_sem_map/segmentation/test_huggingface.py",
+        "gnss_sem_map/segmentation/test_networks.py",
         "gnss_sem_map/segmentation/test_onnx_file.py",
         "gnss_sem_map/segmentation/test_refinenet.py",
         "gnss_sem_map/segmentation/test_training.py",

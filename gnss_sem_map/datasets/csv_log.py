@@ -44,7 +44,7 @@ from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
-from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_unit, in_order
+from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
@@ -130,7 +130,7 @@ class LogFile(SensorConventions):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    epoch_ns: int = Field(0, description="Unix time, ns, of stamp zero.")
+    epoch_ns: int = Field(0, ge=-(1 << 63), lt=1 << 63, description="Unix time, ns, of stamp zero.")
     p_imu_antenna: tuple[float, float, float] = Field(
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
@@ -175,6 +175,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     about = _about(drive / "log.yaml")
     imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
+    check_date(float(imu.stamps[-1]), about.epoch_ns, shown(drive / "imu.csv"))
     gnss_rows, fix_skips = _fix_rows(drive, about, imu.stamps)
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
     gnss, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])

@@ -24,7 +24,7 @@ from factor_graphs.measurements import LARGEST_OF_IMU, GnssFixes, ImuNoise, ImuS
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets import frames, kitti_calibration
-from gnss_sem_map.datasets.stamps import in_order, sweep_fault
+from gnss_sem_map.datasets.stamps import FIRST_YEAR, LAST_YEAR, in_order, sweep_fault
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog, Skip
@@ -32,8 +32,6 @@ from gnss_sem_map.sensor_log.cameras import Camera
 
 Array = NDArray[np.float64]
 STAMP = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d(\.\d{1,18})?)?", re.ASCII)
-FIRST_YEAR, LAST_YEAR = 1980, 2200
-"""Years of GPS, and of nanoseconds in 64 bits."""
 MOST_ROW_BYTES = 10_000
 
 CAMERA_TIME_OFFSET_S = -0.0085

@@ -14,6 +14,8 @@ from gnss_sem_map.sensor_log import Skip
 LONGEST_SWEEP_S = 1.0
 FAR_FROM_SWEEP_S = 0.5
 """A scan's stamp may lie this far outside its sweep."""
+FIRST_YEAR, LAST_YEAR = 1980, 2200
+"""Years of GPS, and of nanoseconds in 64 bits."""
 LONGEST_FRAME_STEP_S = 20.0
 """Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer."""
 
@@ -39,6 +41,16 @@ def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -
     """Raise DataError, with the likely unit, when the usual step between the stamps is longer than any sensor's."""
     if fault := unit_fault(stamps, longest_step_s):
         raise DataError(f"{where}: {fault}")
+
+
+def check_date(stamp: float, epoch_ns: int, where: str) -> None:
+    """Raise DataError when a stamp, s after the epoch, is later than any drive, or as long before 1970."""
+    year = 1970 + (stamp + epoch_ns * 1e-9) / (365.2425 * 86400)
+    if abs(year - 1970) > LAST_YEAR - 1970:
+        raise DataError(
+            f"{where}: the stamp {stamp:.10g} s is of the year {year:.0f}, expected one up to {LAST_YEAR}; seconds are"
+            " those since `epoch_ns` of log.yaml, or Unix time without it"
+        )
 
 
 def sweep_fault(stamp: float, start: float, end: float) -> str | None:

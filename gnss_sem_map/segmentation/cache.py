@@ -6,7 +6,7 @@ import io
 import json
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,9 @@ PARTIAL = re.compile(r"\.(\d+\.npz|about\.json)\.\d+\.part")
 
 STEP = 3
 """Probabilities are rounded to 3/255, less than the error of any network: the files are a third smaller."""
+
+
+SegmentMany = Callable[[Sequence[Image]], list[NDArray[np.float32]]]
 
 
 @runtime_checkable
@@ -107,11 +110,13 @@ def _write_all(
     waiting = [image for image in images if not _file(folder, image).exists()]
     kept, skips, sizes, start = len(images) - len(waiting), list[Skip](), list[int](), time.perf_counter()
     progress("segmenting", kept, len(images))
-    threads = segmenter.threads if isinstance(segmenter, ThreadedSegmenter) else 1
+    threads, many = 1, segmenter.segment_many if isinstance(segmenter, BatchSegmenter) else None
+    if isinstance(segmenter, ThreadedSegmenter) and segmenter.threads > 1:
+        threads, many = segmenter.threads, segmenter.on_one_core
 
     def make(batch: list[Image]) -> tuple[list[int], list[Skip]]:
         lost: list[Skip] = []
-        seen = _segment(batch, segmenter, lost, threads > 1)
+        seen = _segment(batch, segmenter, many, lost)
         small = ((image, quantised(each, segmenter.class_names, label_set)) for image, each in seen)
         names = (*label_set.names, OTHER)
         return [write_probabilities(_file(folder, image), each, names) for image, each in small], lost
@@ -139,14 +144,9 @@ def quantised(
 
 
 def _segment(
-    batch: list[Image], segmenter: Segmenter, skips: list[Skip], on_one_core: bool
+    batch: list[Image], segmenter: Segmenter, many: SegmentMany | None, skips: list[Skip]
 ) -> Iterator[tuple[Image, NDArray[np.uint8] | NDArray[np.float32]]]:
-    """Segment a batch at once if the segmenter can; one by one if it cannot, or if one image is damaged."""
-    many = None
-    if on_one_core and isinstance(segmenter, ThreadedSegmenter):
-        many = segmenter.on_one_core
-    elif isinstance(segmenter, BatchSegmenter):
-        many = segmenter.segment_many
+    """Segment a batch at once if there is a way; one by one if there is none, or if one image is damaged."""
     if many and len(batch) > 1:
         try:
             yield from zip(batch, unless_left(many, batch), strict=True)

@@ -85,7 +85,8 @@ def found_lever_arm(
 
 def _most_turning(imu: ImuSamples) -> float:
     """Where the stretch begins that turns most, s."""
-    starts = np.arange(imu.stamps[0], max(imu.stamps[-1] - STRETCH_S, imu.stamps[0]) + 1e-9, STRETCH_S / 4)
+    first, step_s = imu.stamps[0], STRETCH_S / 4
+    starts = first + step_s * np.arange(1 + max(imu.stamps[-1] - first - STRETCH_S, 0.0) // step_s)
     turned = np.concatenate([[0.0], np.cumsum(np.abs(imu.angular_rate[:-1, 2]) * np.diff(imu.stamps))])
     at = [np.interp(starts + shift, imu.stamps, turned) for shift in (0.0, STRETCH_S)]
     return float(starts[int(np.argmax(at[1] - at[0]))])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -261,6 +262,24 @@ def test_a_broken_table_of_wheel_speeds_is_refused(
 ) -> None:
     drive = street.write_table_log(tmp_path, small_drive)
     (drive / "wheels.csv").write_text(content)
+    with pytest.raises(DataError, match=says):
+        open_drive(drive)
+
+
+@pytest.mark.parametrize(
+    ("epoch_ns", "says"),
+    [
+        (9 * 10**18, r"imu\.csv: the stamp .* of the year 2255, expected one up to 2200"),
+        (-9 * 10**18, r"imu\.csv: the stamp .* of the year 1685"),
+        (10**30, r"log\.yaml: epoch_ns"),
+    ],
+)
+def test_a_table_log_of_an_impossible_year_is_refused(
+    small_drive: Street, tmp_path: Path, epoch_ns: int, says: str
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    about = json.loads((drive / "log.yaml").read_text())
+    (drive / "log.yaml").write_text(json.dumps(about | {"epoch_ns": epoch_ns}))
     with pytest.raises(DataError, match=says):
         open_drive(drive)
 

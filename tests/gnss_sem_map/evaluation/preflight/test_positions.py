@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sensor_drives import FRAME, LEVER, drive, findings, wrong
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
@@ -121,6 +121,22 @@ def test_an_antenna_elsewhere_is_found_in_the_turns(off: tuple[float, float, flo
     assert wrong(findings(good)) == []
     calibration = Calibration(np.eye(4), p_imu_antenna=np.array(LEVER) + off)
     assert any("antenna" in line for line in wrong(findings(replace(good, calibration=calibration))))
+
+
+@pytest.mark.parametrize("seconds", [10.0, 30.0, 100.0])
+def test_stamps_may_be_unix_time(seconds: float) -> None:
+    """There, a float is no finer than 0.2 us."""
+    log, unix_s = drive(4, seconds, ImuNoise()), 1_700_000_000.0
+    assert log.imu is not None
+    fixes, imu = fixes_of(log), log.imu
+    dated = replace(
+        log,
+        imu=ImuSamples(imu.stamps + unix_s, imu.specific_force, imu.angular_rate),
+        gnss=GnssFixes(fixes.stamps + unix_s, fixes.positions, fixes.stddevs),
+    )
+    assert [(one.check, one.level) for one in findings(dated)] == [
+        (one.check, one.level) for one in findings(log)
+    ]
 
 
 def test_single_outliers_are_left_to_the_smoother(right: SensorLog) -> None:

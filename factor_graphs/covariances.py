@@ -7,17 +7,19 @@ cov(x) = R⁻¹ R⁻ᵀ + W cov(y) Wᵀ with W = R⁻¹ S (Kaess and Dellaert 20
 """
 
 from collections import Counter
+from functools import cache
+from itertools import pairwise
 from typing import Protocol
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from factor_graphs.elimination import (
     PLACES,
     SIZE,
-    Conditional,
     by_sections,
     eliminate,
     in_time,
@@ -27,12 +29,17 @@ from factor_graphs.elimination import (
 )
 
 Array = NDArray[np.float64]
+Places = dict[int, NDArray[np.intp]]
+"""Where the numbers of a key stand in a joint covariance."""
 
 
 class Visitor(Protocol):
-    """Sees every keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`."""
+    """Sees every keyframe i of x_i = -W y + noise, with y at `rows` of those known before; now they are `known`.
 
-    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None: ...
+    `joint` is the covariance of all that are known now: the keyframe, in its 15 numbers, then y.
+    """
+
+    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: Places) -> None: ...
 
 
 class SumVariance:
@@ -50,7 +57,7 @@ class SumVariance:
         self._beside = np.empty((0, rows.shape[1]))
         """Covariance of the keyframes known, in their order, and the sum."""
 
-    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: list[int]) -> None:
+    def add(self, i: int, W: Array, rows: NDArray[np.intp], joint: Array, known: Places) -> None:
         later = self._beside[rows] if len(self._beside) else np.zeros((len(rows), len(self._sum)))
         own, window = -W @ later, int(self._windows[i])
         if window >= 0:
@@ -62,9 +69,8 @@ class SumVariance:
         if window >= 0 and self._first[window] == i:
             self._finish(window, joint, known)
 
-    def _finish(self, window: int, joint: Array, known: list[int]) -> None:
-        G = self._of_shared[window]
-        place = SIZE * known.index(len(self._windows)) + np.arange(G.shape[1])
+    def _finish(self, window: int, joint: Array, known: Places) -> None:
+        G, place = self._of_shared[window], known[M(len(self._windows))]
         both = G @ self._beside[place]
         total = self._sum + G @ joint[np.ix_(place, place)] @ G.T + both + both.T
         self.found[window] = total.diagonal()
@@ -83,53 +89,45 @@ def keyframe_covariances(
     shared = shared_keys(values, k)
     groups = by_sections(graph, k, shared) if also is None else in_time(k, shared)
     linear = (part.linearize(values) for part in split(graph, groups))
-    order = [split_key(keys[0])[1] for keys in groups]
-    given = {i: (one.R, *_by_keyframe(one)) for i, one in zip(order, eliminate(linear, groups), strict=True)}
-    # Of what a keyframe is given, its parent is eliminated first, and is given all the rest.
-    place = {i: n for n, i in enumerate(order)}
-    parents = {i: min(later, key=place.__getitem__) for i, (_, later, _) in given.items() if later}
-    children = Counter(parents.values())
+    net = list(eliminate(linear, groups))
+    children = Counter(one.parent for one in net)
     covariances, of_shared = np.empty((k, SIZE, SIZE)), np.empty((0, 0))
-    # The joint covariance of a keyframe and of those it is given, as long as it has children to come: memory does not
-    # grow with the drive.
-    joints: dict[int, tuple[list[int], Array]] = {}
-    if shared:
-        there = np.concatenate([PLACES[split_key(key)[0]] for key in shared])
-        root, joint = np.linalg.inv(given.pop(order.pop())[0]), np.zeros((SIZE, SIZE))
-        of_shared = joint[np.ix_(there, there)] = root @ root.T
-        joints[k] = [k], joint
-    for i in reversed(order):
-        R, later, S = given.pop(i)
-        known, joint = joints[parents[i]] if later else ([], np.empty((0, 0)))
-        own, _ = dtrtri(R)
-        W, rows = own @ S, _rows(later, known)
-        joint = joint[np.ix_(rows, rows)]
-        cross = -W @ joint
-        covariance = own @ own.T - cross @ W.T
-        covariances[i] = (covariance + covariance.T) / 2
-        joints[i] = [i, *later], np.vstack([np.hstack([covariances[i], cross]), np.hstack([cross.T, joint])])
-        if also is not None:
-            also.add(i, W, rows, joints[i][1], joints[i][0])
-        if later:
-            children[parents[i]] -= 1
-        for j in (i, parents.get(i, i)):
-            if not children[j]:
-                joints.pop(j, None)
+    # The joint covariance of a group and of those it is given, as long as it has children to come: memory does not
+    # grow with the drive. Of what a group is given, its parent is eliminated first, and is given all the rest.
+    joints: dict[int, tuple[Places, Array]] = {-1: ({}, np.empty((0, 0)))}
+    for n in range(len(net) - 1, -1, -1):
+        one, keys = net.pop(), groups[n]
+        (known, joint), size = joints[one.parent], len(one.R)
+        rows = np.concatenate([known[key] for key in one.later]) if one.later else np.empty(0, np.intp)
+        own, _ = dtrtri(one.R)
+        W, given = own @ one.S, joint[rows[:, None], rows]
+        cross = W @ given
+        covariance = own @ own.T + cross @ W.T
+        joint = np.empty((size + len(rows),) * 2)
+        joint[:size, :size] = (covariance + covariance.T) / 2
+        joint[:size, size:], joint[size:, :size], joint[size:, size:] = -cross, -cross.T, given
+        known = _places([*keys, *one.later])
+        if keys == shared:
+            of_shared = joint[:size, :size]
+        else:
+            i = split_key(keys[0])[1]
+            covariances[i] = joint[:size, :size]
+            if also is not None:
+                also.add(i, W, rows, joint, known)
+        joints[n] = known, joint
+        children[one.parent] -= 1
+        for m in (n, one.parent):
+            if not children[m]:
+                joints.pop(m, None)
     return covariances, of_shared
 
 
-def _rows(keyframes: list[int], known: list[int]) -> NDArray[np.intp]:
-    """Where some of the keyframes stand in the joint covariance of those known."""
-    first = SIZE * np.array([known.index(i) for i in keyframes], np.intp)
-    return (first[:, None] + np.arange(SIZE)).ravel()
+def _places(keys: list[int]) -> Places:
+    """Where the numbers of each of these keys stand, when they are put one after the other."""
+    return dict(zip(keys, _ranges(tuple([split_key(key)[0] for key in keys])), strict=True))
 
 
-def _by_keyframe(conditional: Conditional) -> tuple[list[int], Array]:
-    """The later keyframes that a conditional is given, and its S with 15 columns for each of them."""
-    keys = [split_key(key) for key in conditional.later]
-    later = sorted({index for _, index in keys})
-    first = {index: SIZE * n for n, index in enumerate(later)}
-    S = np.zeros((len(conditional.S), SIZE * len(later)))
-    columns = [first[index] + column for letter, index in keys for column in PLACES[letter]]
-    S[:, columns] = conditional.S
-    return later, S
+@cache
+def _ranges(letters: tuple[int, ...]) -> list[NDArray[np.intp]]:
+    ends = np.cumsum([0, *(len(PLACES[letter]) for letter in letters)]).tolist()
+    return [np.arange(*both) for both in pairwise(ends)]

@@ -75,13 +75,15 @@ def _turn(intervals: ImuIntervals, R_keyframes: Array, rate: Array, frame: Local
     dt, bounds = intervals.durations[:, None], intervals.bounds
     turns = Rotation.from_rotvec(rate * dt).as_matrix()
     earth = Rotation.from_rotvec(-frame.earth_rate * dt).as_matrix()
-    R, now = np.empty((len(dt), 3, 3)), R_keyframes[:-1].copy()
-    for step in range(int(np.max(np.diff(bounds)))):
-        active = np.flatnonzero(bounds[:-1] + step < bounds[1:])
-        at = bounds[active] + step
-        R[at] = now[active]
-        now[active] = earth[at] @ now[active] @ turns[at]
-    return R, now
+    # All intervals go on together, the longest first: those that have a step to come are always the first ones.
+    order = np.argsort(-np.diff(bounds), kind="stable")
+    first, now, R = bounds[order], R_keyframes[order], np.empty((len(dt), 3, 3))
+    shorter = np.cumsum(np.bincount(np.diff(bounds)))
+    for step, active in enumerate((len(order) - shorter[:-1]).tolist()):
+        at = first[:active] + step
+        R[at] = now[:active]
+        now[:active] = earth[at] @ now[:active] @ turns[at]
+    return R, now[np.argsort(order)]
 
 
 def _move(

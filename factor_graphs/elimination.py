@@ -32,10 +32,12 @@ PLACES = OF_KEYFRAME | {ord("m"): range(4), ord("w"): range(4, 8)}
 class Conditional:
     """R x = d - S y: the numbers x of a group given those y of later ones.
 
-    `later` are the keys of y, in the order of the columns of S.
+    `later` are the keys of y, in the order of the columns of S; `parent` is the number of the group that is eliminated
+    first of those which hold y, -1 where none does.
     """
 
     later: list[int]
+    parent: int
     R: Array
     S: Array
     d: Array
@@ -71,8 +73,9 @@ def split(graph: Graph, groups: Sequence[Group]) -> list[Graph]:
     """The factors of a graph by the group in which they are first needed; last, those that no group needs."""
     place = {key: n for n, keys in enumerate(groups) for key in keys}
     parts = [type(graph)() for _ in range(len(groups) + 1)]
+    # named, or the binding tries a factor as all that can be pushed: twice the time
     for factor in (graph.at(n) for n in range(graph.size())):
-        parts[min(place.get(key, len(groups)) for key in list(factor.keys()))].push_back(factor)
+        parts[min([place.get(key, len(groups)) for key in list(factor.keys())])].push_back(factor=factor)
     return parts
 
 
@@ -90,15 +93,18 @@ def eliminate(
     left_for: defaultdict[int, list[gtsam.GaussianFactor]] = defaultdict(list)
     for n, (part, keys) in enumerate(zip(parts, groups, strict=False)):
         factors = gtsam.GaussianFactorGraph()
-        factors.push_back(part)
+        factors.push_back(graph=part)
         for left in left_for.pop(n, []):
             factors.push_back(left)
         found, left = gtsam.EliminateQR(factors, ordering_of(keys))
-        later = list(found.keys())[len(keys) :]
+        later, parent = list(found.keys())[len(keys) :], -1
         if later:
-            left_for[min(place.get(key, len(groups)) for key in later)].append(left)
-        # GTSAM returns views into the conditional, which do not keep it alive
-        yield Conditional(later, found.R().copy(), found.S().copy(), found.d().copy())
+            parent = min([place.get(key, len(groups)) for key in later])
+            left_for[parent].append(left)
+        # a copy: what R(), S() and d() give does not keep the conditional alive
+        rows = found.augmentedJacobian()
+        size = len(rows)
+        yield Conditional(later, parent, rows[:, :size], rows[:, size:-1], rows[:, -1])
     if rest is not None:
         rest += left_for[len(groups)]
 

@@ -205,13 +205,13 @@ def motion_graph(problem: Problem, inflation: float, of_walk: float) -> gtsam.No
     graph = gtsam.NonlinearFactorGraph()
     noise = problem.intervals.noise(problem.noise.scaled(inflation, of_walk))
     for factor in imu_factors(problem.intervals, noise, problem.frame):
-        graph.push_back(factor)
+        graph.add(factor)
     T, velocities = problem.guess
     priors = prior_factors(
         T[0], velocities[0], problem.attitude, START_POSITION_STDDEV, START_SPEED_STDDEV, problem.noise
     )
     for prior in priors:
-        graph.push_back(prior)
+        graph.add(prior)
     return graph
 
 
@@ -233,12 +233,12 @@ def optimise(
     T, velocities = motion_from(start)
     fixes = replace(problem.fixes, positions=problem.antennas_found(T, velocities))
     for factor in gnss_factors(fixes, problem.at, problem.p_imu_antenna, kernel):
-        graph.push_back(factor)
+        graph.add(factor)
     relative_kernel = RELATIVE_LOSSES[loss]
     for between in relative_pose_factors(problem.relative, problem.relative_at, relative_kernel):
-        graph.push_back(between)
+        graph.add(between)
     for constraint in constraints:
-        graph.push_back(constraint)
+        graph.add(constraint)
     values, iterations = _minimise(problem, graph, start, tolerance)
     squares = _squares(problem, values)
     relative_squares = _relative_squares(problem, values)

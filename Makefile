@@ -2,6 +2,7 @@
 # PYTHON may be any Python from 3.11 on.
 PYTHON ?= python3
 VENV := .venv
+CONSTRAINTS := constraints.txt
 BIN := $(VENV)/bin
 # One process more than there are cores: some tests wait for others. The tests of one file share what they made. Files
 # are taken in the order of tests/conftest.py: the longest first.
@@ -17,17 +18,17 @@ SETTINGS := s/^[^=]*\.index-url=/export UV_DEFAULT_INDEX=/p; s/^[^=]*\.extra-ind
   s/^[^=]*\.cert=/export SSL_CERT_FILE=/p; s/^[^=]*\.find-links=/export UV_FIND_LINKS=/p
 define install
 	eval "$$($(BIN)/pip config list | sed -n '$(SETTINGS)')"; \
-	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(1)' || \
+	UV_INDEX_STRATEGY=unsafe-best-match $(BIN)/uv pip install --quiet --python $(BIN)/python -c $(CONSTRAINTS) -e '$(1)' || \
 	{ test -z "$$UV_TORCH_BACKEND" && \
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '$(1)'; }
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c $(CONSTRAINTS) -e '$(1)'; }
 endef
 
-.PHONY: test test-unit test-slow test-demo test-faults check demo notebooks docs package clean
+.PHONY: test test-newest test-unit test-slow test-demo test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
 	$(PYTHON) -m venv $(VENV)
-	-$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt uv
+	-$(BIN)/pip install --quiet --disable-pip-version-check -c $(CONSTRAINTS) uv
 	$(call install,.[segmentation])
 	touch $@
 
@@ -62,6 +63,12 @@ package: $(TOOLS)
 	$$place/venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
 	mkdir $$place/empty; cd $$place/empty; ../venv/bin/gnss-sem-map demo --seconds 3
 
+# The tests with the newest of every dependency, which is what a user of pip gets; torch alone is held, or pip takes its
+# build for GPUs.
+test-newest:
+	mkdir -p build && grep ^torch== constraints.txt > build/newest.txt
+	$(MAKE) test VENV=.venv-newest CONSTRAINTS=build/newest.txt
+
 test-slow: $(TOOLS)
 	$(PYTEST) -m slow
 
@@ -78,4 +85,4 @@ check: $(TOOLS)
 	$(BIN)/lint-imports
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) .venv-newest build dist *.egg-info

@@ -45,7 +45,7 @@ def source(tmp_path: Path) -> Path:
 def archive(source: Path, to: Path) -> Path:
     to.mkdir()
     done("git", "archive", "-o", str(to / "archive.tar"), "HEAD", at=source)
-    shutil.unpack_archive(to / "archive.tar", to)
+    shutil.unpack_archive(to / "archive.tar", to, filter="data")
     return to
 
 
@@ -54,7 +54,7 @@ def test_a_tag_is_the_version_in_a_clone_an_archive_and_an_sdist(source: Path, t
     assert version_of(source) == "3.2.1"
     assert version_of(archive(source, tmp_path / "archive")) == "3.2.1"
     done(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path), at=source)
-    shutil.unpack_archive(tmp_path / "gnss_sem_map-3.2.1.tar.gz", tmp_path)
+    shutil.unpack_archive(tmp_path / "gnss_sem_map-3.2.1.tar.gz", tmp_path, filter="data")
     assert version_of(tmp_path / "gnss_sem_map-3.2.1") == "3.2.1"
 
 

@@ -99,8 +99,11 @@ def test_what_text_calls_a_command_is_one(code: str) -> None:
         known = {option for each in parameters for option in (*each.opts, *each.secondary_opts)}
         assert options | ({name} if is_of_all else set()) <= known | {"--help", "-h"}
     elif program == "make":
-        targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
-        assert {name, *words} <= targets
+        makefile = (ROOT / "Makefile").read_text("utf-8")
+        targets, variables = (set(re.findall(rf"^([\w-]+){sign}", makefile, re.M)) for sign in (":", r" \?="))
+        assigned = {word for word in words if "=" in word}
+        assert {name, *words} - assigned <= targets
+        assert {word.split("=")[0] for word in assigned} <= variables
     else:
         path = ROOT / name.split("::")[0]
         assert path.exists()

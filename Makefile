@@ -39,6 +39,12 @@ $(TOOLS): $(PACKAGE)
 test: $(TOOLS)
 	$(PYTEST) -m 'not slow and not demo and not faults'
 
+# The tests with the newest of every dependency, which is what a user of pip gets; torch alone is held, or pip takes its
+# build for GPUs.
+test-newest:
+	mkdir -p build && grep ^torch== constraints.txt > build/newest.txt
+	$(MAKE) test VENV=.venv-newest CONSTRAINTS=build/newest.txt
+
 # What every change should pass at once: no process is started, no drive simulated, no real data read.
 test-unit: $(TOOLS)
 	$(PYTEST) -m 'not slow and not demo and not faults and not integration'
@@ -62,12 +68,6 @@ package: $(TOOLS)
 	$(PYTHON) -m venv $$place/venv; \
 	$$place/venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
 	mkdir $$place/empty; cd $$place/empty; ../venv/bin/gnss-sem-map demo --seconds 3
-
-# The tests with the newest of every dependency, which is what a user of pip gets; torch alone is held, or pip takes its
-# build for GPUs.
-test-newest:
-	mkdir -p build && grep ^torch== constraints.txt > build/newest.txt
-	$(MAKE) test VENV=.venv-newest CONSTRAINTS=build/newest.txt
 
 test-slow: $(TOOLS)
 	$(PYTEST) -m slow

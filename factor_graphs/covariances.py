@@ -97,15 +97,15 @@ def keyframe_covariances(
     joints: dict[int, tuple[Places, Array]] = {-1: ({}, np.empty((0, 0)))}
     for n in range(len(net) - 1, -1, -1):
         one, keys = net.pop(), groups[n]
-        (known, joint), size = joints[one.parent], len(one.R)
+        (known, of_parent), size = joints[one.parent], len(one.R)
         rows = np.concatenate([known[key] for key in one.later]) if one.later else np.empty(0, np.intp)
         own, _ = dtrtri(one.R)
-        W, given = own @ one.S, joint[rows[:, None], rows]
-        cross = W @ given
-        covariance = own @ own.T + cross @ W.T
+        W, given = own @ one.S, of_parent[rows[:, None], rows]
+        cross = -W @ given
+        covariance = own @ own.T - cross @ W.T
         joint = np.empty((size + len(rows),) * 2)
         joint[:size, :size] = (covariance + covariance.T) / 2
-        joint[:size, size:], joint[size:, :size], joint[size:, size:] = -cross, -cross.T, given
+        joint[:size, size:], joint[size:, :size], joint[size:, size:] = cross, cross.T, given
         known = _places([*keys, *one.later])
         if keys == shared:
             of_shared = joint[:size, :size]

@@ -76,9 +76,10 @@ def _turn(intervals: ImuIntervals, R_keyframes: Array, rate: Array, frame: Local
     turns = Rotation.from_rotvec(rate * dt).as_matrix()
     earth = Rotation.from_rotvec(-frame.earth_rate * dt).as_matrix()
     # All intervals go on together, the longest first: those that have a step to come are always the first ones.
-    order = np.argsort(-np.diff(bounds), kind="stable")
+    counts = np.diff(bounds)
+    order = np.argsort(-counts, kind="stable")
     first, now, R = bounds[order], R_keyframes[order], np.empty((len(dt), 3, 3))
-    shorter = np.cumsum(np.bincount(np.diff(bounds)))
+    shorter = np.cumsum(np.bincount(counts))
     for step, active in enumerate((len(order) - shorter[:-1]).tolist()):
         at = first[:active] + step
         R[at] = now[:active]

@@ -85,17 +85,21 @@ def _squares(fit: Fit, k: int) -> float:
 
 def _redundancy(fit: Fit, covariances: Array) -> float:
     """Rows of the IMU, less what the unknowns take from them: all unknowns, less what they take from other factors."""
-    k, others = len(covariances), gtsam.NonlinearFactorGraph()
+    k, others, total = len(covariances), gtsam.NonlinearFactorGraph(), 0.0
     for n in range(k - 1, fit.graph.size()):
         others.add(fit.graph.at(n))
     linear = others.linearize(fit.values)
-    keys = [split_key(key) for key in sorted(linear.keyVector())]
-    keyframe, place = np.array([(i, n) for letter, i in keys for n in PLACES[letter]], np.intp).T
-    # As GTSAM numbers them, from one, the columns in the order of the keys; the last column is the right side.
-    row, column, value = np.asarray(linear.sparseJacobian_())
-    row, column = row.astype(np.intp) - 1, column.astype(np.intp) - 1
-    own = np.append(keyframe < k, False)[column]  # not of what all keyframes share
-    row, column, value = row[own], column[own], value[own]
-    A, of_row = np.zeros((row.max() + 1, SIZE)), np.zeros(row.max() + 1, np.intp)
-    A[row, place[column]], of_row[row] = value, keyframe[column]
-    return float(np.einsum("ri,rij,rj", A, covariances[of_row], A, optimize=True)) - SIZE
+    for n in range(linear.size()):
+        factor = linear.at(n)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        A, begin = factor.jacobian()[0], 0
+        rows, i = np.zeros((len(A), covariances.shape[1])), -1
+        for letter, index in map(split_key, factor.keys()):
+            place = PLACES[letter]
+            end = begin + len(place)
+            if index < k:
+                rows[:, place], i = A[:, begin:end], index
+            begin = end
+        if i >= 0:
+            total += float(np.sum(rows @ covariances[i] * rows))
+    return total - SIZE

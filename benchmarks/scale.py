@@ -50,7 +50,7 @@ DASK_SETTINGS = {
     "NUMBA_NUM_THREADS": "1",
     "MALLOC_ARENA_MAX": "1",
     "MALLOC_TRIM_THRESHOLD_": f"{64 << 20}",
-    "MALLOC_MMAP_THRESHOLD_": f"{8 << 20}",
+    "MALLOC_MMAP_THRESHOLD_": f"{4 << 20}",
 }
 """Environment of the workers."""
 TILED = ("trajectory", "mapping", "refinement")

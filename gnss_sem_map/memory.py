@@ -12,12 +12,13 @@ from contextlib import suppress
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1
 """Of glibc's `mallopt`: the number of heaps, the size from which memory is not taken from a heap, and how much may be
 free at its end."""
-LARGE_BYTES, FREE_BYTES = 8 << 20, 64 << 20
-"""Arrays of the first size, those of a whole tile or chunk, go back to the system when they are freed, and leave no
-holes: 20 MB less at the peak, at no cost in time. By default glibc raises that size to 32 MB."""
-NEAR_PEAK_BYTES = 64 << 20
-"""Memory is released from so much below the peak on: as much as is taken until it is asked for again. With less, holes
-are returned too late, and the peak rises a little from chunk to chunk though no more memory is in use."""
+LARGE_BYTES, FREE_BYTES = 4 << 20, 64 << 20
+"""Arrays of the first size, those of a tile, a chunk or a large scan, go back to the system when they are freed, and
+leave no holes: 30 MB less at the peak, at no cost in time. With 1 MB it costs 5 ms per scan. By default glibc raises
+that size to 32 MB."""
+GROWN_BYTES = 64 << 20
+"""Memory is released when the process holds so much more than after the last time. With the peak as the measure in its
+place, holes fill up to the peak, and then it rises from chunk to chunk though no more memory is in use."""
 NEW_OBJECTS = 20_000
 """So many more objects than before let Python look for reference cycles; its own default is 700."""
 
@@ -61,22 +62,24 @@ def collect_seldom() -> None:
     atexit.register(gc.freeze)
 
 
-def release_memory(near_peak_only: bool = True) -> None:
+def release_memory(always: bool = False) -> None:
     """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used.
 
-    With `near_peak_only`, only where the process holds about as much as it ever did: else its peak does not grow if the
-    memory is used again, and to get it anew from the system takes 1.5 us per page, 0.5 s of a run of the demo drive.
+    Unless `always`, only where the process holds much more than after the last time: what is returned and used again
+    takes 1.5 us per page.
     """
+    global _held_before
     with suppress(OSError, AttributeError):
-        if not near_peak_only or _held_bytes() > _most_held_bytes() - NEAR_PEAK_BYTES:
+        if always or held_bytes() > _held_before + GROWN_BYTES:
             ctypes.CDLL(None).malloc_trim(0)
+            _held_before = held_bytes()
 
 
-def _held_bytes() -> int:
+_held_before = 0
+"""Bytes that were held after memory was last released."""
+
+
+def held_bytes() -> int:
     """Physical memory of this process; raises OSError where the system does not tell."""
     with open("/proc/self/statm", "rb") as file:
         return int(file.read().split()[1]) * resource.getpagesize()
-
-
-def _most_held_bytes() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -145,7 +145,7 @@ def run(
         with stats.stage("export"):
             write(located)
         located = located.in_short()
-    release_memory(near_peak_only=False)  # of graph and local map: holes too small for the arrays of scans
+    release_memory(always=True)  # of graph and local map: holes too small for the arrays of scans
     drive = Drive(
         located.log, located.trajectory, segmenter, settings, from_lidar_odometry=from_lidar_odometry
     )

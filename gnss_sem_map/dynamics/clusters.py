@@ -144,13 +144,10 @@ class Segments:
         """Statistics of every segment (s,)."""
         return self.parts.merged(self.number, len(self.truncated))
 
-    def outlines(self) -> list[NDArray[np.float32]]:
-        """For every segment, its voxels by the means of their points (v, 2) m."""
-        inside = np.flatnonzero(self.number >= 0)  # most voxels are in none
-        order = inside[np.argsort(self.number[inside], kind="stable")]
-        means = (self.parts.sums[order, :2] / self.parts.points[order, None]).astype(np.float32)
-        ends = np.cumsum(np.bincount(self.number[inside], minlength=len(self.truncated)))
-        return np.split(means, ends)[:-1]  # the last is empty
+    def outline(self, number: int) -> NDArray[np.float32]:
+        """The voxels of a segment by the means of their points (v, 2) m."""
+        mine = np.flatnonzero(self.number == number)
+        return (self.parts.sums[mine, :2] / self.parts.points[mine, None]).astype(np.float32)
 
     def levels(self) -> list[tuple[float, float]]:
         """For every segment the lowest and the highest of its voxels, by the means of their points, m."""

@@ -6,7 +6,7 @@ speed of such a segment are known less (`object_track`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ def with_cover(
     listed: Sequence[Segment],
     segments: Sequence[Segments],
     images: Sequence[RangeImage],
-    moved: Sequence[NDArray[np.bool_]],
+    moved: Iterable[NDArray[np.bool_]],
 ) -> list[Segment]:
     """The segments of all scans, of which those are marked that moved and that something nearer hides in part.
 

@@ -7,7 +7,7 @@ what stands: both are one object.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +26,7 @@ def joined_to_movers(
     objects: Sequence[TrackedObject],
     segments: Sequence[Segments],
     places: Sequence[NDArray[np.int32]],
-    moved: Sequence[NDArray[np.bool_]],
+    moved: Iterable[NDArray[np.bool_]],
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
 ) -> list[TrackedObject]:

@@ -207,7 +207,7 @@ def _beside(
     free = [n for n in members if misses[n] > hits[n]]
     if not free or len(free) < FREE_SHARE * len(members):
         return []
-    extents = {n: float(np.linalg.norm(np.ptp(segments[n].outline, axis=0))) for n in members}
+    extents = {n: float(np.linalg.norm(np.ptp(segments[n].outline(), axis=0))) for n in members}
     usual = float(np.median([extents[n] for n in free]))
     if usual > PERSON_M:
         return []

@@ -6,8 +6,9 @@ and misses of their voxels in all of them, and tells which have moved. `moved_po
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
@@ -118,11 +119,11 @@ def decide(
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
 
-    parted = [
+    parted = (
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)
         for seen, counted in zip(observations, counts(), strict=True)
-    ]
-    segments, free = [one[0] for one in parted], [one[1] for one in parted]
+    )
+    segments, free = map(list, zip(*parted, strict=True))
     hits, misses = np.concatenate(
         [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts(), strict=True)], axis=1
     )
@@ -134,20 +135,22 @@ def decide(
         gone = _gone(objects, len(listed))
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
+    stood_of = (
+        np.int8(2) * whole + ((of_scan.number < 0) & is_occupied(*counted))
+        for whole, of_scan, counted in zip(_of_voxels(stood, segments), segments, counts(), strict=True)
+    )
     moved_of = _either(_of_voxels(gone, segments), free)
-    occupied = [is_occupied(*counted) for counted in counts()]
-    stood_of = [
-        np.int8(2) * whole + ((of_scan.number < 0) & there)
-        for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
-    ]
+    del free
     stays = standing(places, counts(), moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of, stays, strict=True)]
-    stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
     if is_sharp:
         stamps = np.array([seen.stamp for seen in observations])
         near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
         of_mover, without = presence(places, of_places, near)
-        moved, stands = _either(moved, of_mover), _either(stands, without)
+        moved = _either(moved, of_mover)
+        stands = _either((is_occupied(*counted) for counted in counts()), without)
+    else:
+        stands = [of_scan.number >= 0 for of_scan in segments]
     listed = with_cover(listed, segments, [seen.seen for seen in observations], _of_voxels(gone, segments))
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
@@ -187,17 +190,17 @@ def _with_track(one: TrackedObject, listed: Sequence[Segment]) -> TrackedObject:
 
 
 def _either(
-    some: Sequence[NDArray[np.bool_]], others: Sequence[NDArray[np.bool_]]
+    some: Iterable[NDArray[np.bool_]], others: Iterable[NDArray[np.bool_]]
 ) -> list[NDArray[np.bool_]]:
     """For each scan, the voxels (v,) that are in one of two sets."""
     return [one | other for one, other in zip(some, others, strict=True)]
 
 
-def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> list[NDArray[np.bool_]]:
+def _of_voxels(of_segments: NDArray[np.bool_], segments: Sequence[Segments]) -> Iterator[NDArray[np.bool_]]:
     """For each scan, for its voxels (v,) what is true of their segments (s,), which are those of all scans."""
     ends = np.cumsum([len(of_scan.truncated) for of_scan in segments])[:-1]
     parts = zip(np.split(of_segments, ends), segments, strict=True)
-    return [np.append(part, False)[of_scan.number] for part, of_scan in parts]
+    return (np.append(part, False)[of_scan.number] for part, of_scan in parts)
 
 
 def _check_order(observations: Sequence[Observation]) -> None:
@@ -315,7 +318,6 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
     for scan, (seen, of_scan) in enumerate(zip(observations, segments, strict=True)):
         whole = of_scan.whole
         centroids = whole.sums[:, :2] / whole.points[:, None]
-        outlines = of_scan.outlines()
         levels = of_scan.levels()
         seen_from = np.asarray(np.linalg.inv(seen.seen.T_lidar_map)[:2, 3], np.float64)
         for number, truncated in enumerate(of_scan.truncated.tolist()):
@@ -327,7 +329,7 @@ def _all_segments(observations: Sequence[Observation], segments: list[Segments])
                     points=int(whole.points[number]),
                     shown=bool(whole.labelled[number]),
                     truncated=truncated,
-                    outline=outlines[number],
+                    outline=partial(of_scan.outline, number),
                     seen_from=seen_from,
                     levels=levels[number],
                     labelled=int(whole.labelled[number]),

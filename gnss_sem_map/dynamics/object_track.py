@@ -156,8 +156,8 @@ class _Outline:
 
     @classmethod
     def of(cls, segments: Sequence[Segment]) -> _Outline:
-        points = np.concatenate([one.outline for one in segments]).astype(np.float64)
-        counts = np.array([len(one.outline) for one in segments])
+        outlines = [one.outline() for one in segments]
+        points, counts = np.concatenate(outlines).astype(np.float64), np.array(list(map(len, outlines)))
         ways = points - np.repeat([one.seen_from for one in segments], counts, axis=0)
         none = SweepDelays.none()
         profiles = [one.delays or none for one in segments]

@@ -104,7 +104,7 @@ def motion_of(segments: Sequence[Segment]) -> OwnMotion | None:
     along = way[np.linalg.norm(way, axis=1).argmax()]
     length = float(np.linalg.norm(along))
     along = -along / length if length else np.array([1.0, 0.0])
-    ends = np.array([(values.min(), values.max()) for one in whole for values in [one.outline @ along]])
+    ends = np.array([(values.min(), values.max()) for one in whole for values in [one.outline() @ along]])
     lidar = np.array([one.seen_from @ along for one in whole])
     ranges = np.array([np.linalg.norm(one.centroid - one.seen_from) for one in whole])
     return own_motion(ends[:, 0], ends[:, 1], lidar, ranges)

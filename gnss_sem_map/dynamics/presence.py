@@ -90,7 +90,7 @@ def near_movers(
 
 def _is_person(segments: Sequence[Segment]) -> bool:
     """Whether the segments of a track are, usually, as short as a person and higher than long."""
-    length = np.median([np.linalg.norm(np.ptp(one.outline, axis=0)) for one in segments])
+    length = np.median([np.linalg.norm(np.ptp(one.outline(), axis=0)) for one in segments])
     height = np.median([one.levels[1] - one.levels[0] for one in segments])
     return bool(length < min(PERSON_M, height))
 

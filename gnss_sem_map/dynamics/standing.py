@@ -6,7 +6,7 @@ others, and what was never seen through and belongs to it stays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,9 +25,9 @@ def is_occupied(hits: ArrayLike, misses: ArrayLike) -> NDArray[np.bool_]:
 def standing(
     places: Sequence[NDArray[np.int32]],
     counts: Iterable[NDArray[np.int32]],
-    moved: Sequence[NDArray[np.bool_]],
-    stood: Sequence[NDArray[np.integer]],
-) -> list[NDArray[np.bool_]]:
+    moved: Iterable[NDArray[np.bool_]],
+    stood: Iterable[NDArray[np.integer]],
+) -> Iterator[NDArray[np.bool_]]:
     """For each scan, the voxels (v,) that stand, whatever the rest of their segment did.
 
     `places` (v,) number the voxels of each scan, the same in all scans; `counts` (2, v) are their hits and misses.
@@ -40,4 +40,4 @@ def standing(
         times_moved[place] += is_moved
         times_stood[place] += is_stood
     stands = times_stood > times_moved
-    return [stands[place] & is_occupied(*counted) for place, counted in zip(places, counts, strict=True)]
+    return (stands[place] & is_occupied(*counted) for place, counted in zip(places, counts, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,8 +32,8 @@ class Segment:
     """An image labels some of its points as vehicle."""
     truncated: bool
     """It is cut off by the edge of the image or hidden in part: its box is not that of the object."""
-    outline: NDArray[np.floating]
-    """(v, 2) m: the points of its voxels on average, which tell its extent in any direction."""
+    outline: Callable[[], NDArray[np.floating]]
+    """(v, 2) m: the points of its voxels on average, which tell its extent in any direction; few segments are asked."""
     seen_from: NDArray[np.float64]
     """(2,) m: where the LiDAR was."""
     levels: tuple[float, float] = (0.0, 0.0)

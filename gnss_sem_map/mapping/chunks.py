@@ -41,9 +41,9 @@ WINDOWS = 2
 """Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed. With
 one, tracks are cut so often that 97.0 % of the moving points of the demo are removed, not 98.6 %."""
 
-RELEASED_EVERY = 20
-"""Scans after which freed memory goes back to the system: what lasts lies among what scans have used, and 100 MB of
-holes come together in a few chunks. It takes 0.6 ms per scan."""
+RELEASED_EVERY = 10
+"""Scans after which freed memory goes back to the system: what lasts lies among what scans have used, and ten scans
+leave 70 MB of holes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +226,7 @@ class _Chunk:
     def decided(self, before: WaitingImages | None, after: Sequence[Observation]) -> MappedChunk:
         """The chunk, whose table was put aside, once the scans before and after it are known."""
         # of the scans, freed by other threads: 250 MB after three hundred; to decide takes 100 MB at once
-        release_memory(near_peak_only=False)
+        release_memory(always=True)
         settings, numbers = self._drive.settings, [one.number for one in self.observations]
         decision = decide([*self.observations, *after], len(numbers), before, settings.dynamics)
         last = self._last_window()
@@ -235,7 +235,7 @@ class _Chunk:
             self.last_images = WaitingImages.write(images, self._folder)
         del images
         self.observations.clear()
-        release_memory(near_peak_only=False)  # 110 MB
+        release_memory(always=True)  # 110 MB
         self.take_table_back()
 
         def taken(place: int) -> tuple[WaitingPoints, NDArray[np.bool_]]:
@@ -252,7 +252,8 @@ class _Chunk:
                 (points.levels[moved], points.moments_us[moved]),
             )  # fmt: skip
             moving[numbers[place]] = points.near.indices[moved].astype(np.int64)
-        release_memory(near_peak_only=False)  # of the points; table and columns side by side take 150 MB
+            release_memory()  # the points of all scans together leave 200 MB of holes
+        release_memory(always=True)  # table and columns side by side take 150 MB
         gone = removed.to_map()
         self.stats.counts["points of moving objects"] += sum(map(len, moving.values()))
         keyframes = self._keyframes.keyframes() if decision.is_sharp else None

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import attribute_table, kernels
 from gnss_sem_map.voxels.kernels import (
     AXIS_BITS,
@@ -234,6 +235,7 @@ class VoxelTable:
 
     def _grow(self) -> None:
         size = len(self._rows)
+        release_memory()  # both tables are needed, 50 and 70 MB
         larger = np.zeros((size + size // (2 if size < LARGE_TABLE else 12), self._words), np.int64)
         kernels.rehash(self._rows, larger)
         self._rows = larger

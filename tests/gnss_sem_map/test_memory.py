@@ -1,4 +1,4 @@
-"""One heap for all threads, also of Arrow, in the process and in those that it starts; a user's choice stands."""
+"""One heap for all threads, also of Arrow; a user's choice stands. What is freed goes back once it is much."""
 
 from __future__ import annotations
 
@@ -16,6 +16,36 @@ import pyarrow
 told = "import os; print(os.environ['MALLOC_ARENA_MAX'], os.environ['ARROW_DEFAULT_MEMORY_POOL'])"
 print(pyarrow.default_memory_pool().backend_name, subprocess.check_output([sys.executable, "-c", told], text=True))
 """
+
+FREED_BETWEEN_OTHERS = """
+from gnss_sem_map.memory import held_bytes, release_memory, share_one_heap
+share_one_heap()
+import numpy as np
+
+def one_of_sixteen(count):
+    return [np.ones(1 << 17) for _ in range(count)][::16]
+
+release_memory(always=True)
+start, kept = held_bytes(), []
+for count, always in ((32, False), (32, True), (160, False)):
+    kept += one_of_sixteen(count)
+    before = held_bytes()
+    release_memory(always)
+    print((before - start) >> 20, (held_bytes() - start) >> 20)
+"""
+
+
+@pytest.mark.integration
+def test_freed_memory_between_other_objects_goes_back_once_it_is_much() -> None:
+    """MB held before and after: little stays, unless all of it is to go back; much goes back."""
+    said = subprocess.check_output([sys.executable, "-c", FREED_BETWEEN_OTHERS], text=True)
+    (little, stayed), (again, returned), (much, left) = (map(int, line.split()) for line in said.splitlines())
+    assert little >= 30
+    assert stayed >= little - 1
+    assert again >= 30
+    assert returned <= 10
+    assert much >= 150
+    assert left <= 25
 
 
 @pytest.mark.integration

@@ -48,7 +48,7 @@ def test_what_is_asked_of_a_segment_is_what_its_points_say():
         assert whole.points[number] == len(points)
         assert whole.labelled[number] == np.count_nonzero(points[:, 0] > 2.0)
         np.testing.assert_allclose(whole.sums[number], points.sum(axis=0))
-        outline = segments.outlines()[number]
+        outline = segments.outline(number)
         np.testing.assert_allclose(outline.min(axis=0), points[:, :2].min(axis=0), atol=VOXEL_M)
         np.testing.assert_allclose(outline.max(axis=0), points[:, :2].max(axis=0), atol=VOXEL_M)
 

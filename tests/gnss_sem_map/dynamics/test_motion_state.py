@@ -9,7 +9,7 @@ from gnss_sem_map.dynamics.tracking import Segment
 def segment(scan, x, length):
     """A segment of 50 points along x."""
     outline = np.column_stack([np.linspace(x - length / 2, x + length / 2, 20), np.full(20, 8.0)])
-    return Segment(scan, 0.1 * scan, np.array([x, 8.0]), 50, False, False, outline, np.zeros(2))
+    return Segment(scan, 0.1 * scan, np.array([x, 8.0]), 50, False, False, outline.copy, np.zeros(2))
 
 
 def test_a_person_who_comes_off_a_hedge_leaves_the_hedge():

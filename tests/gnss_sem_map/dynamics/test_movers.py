@@ -41,7 +41,7 @@ def segments(place, heading, lidar, scans=40, delay=lambda t: 0.0):
         outline = visible_part(np.array(place(t)), heading(t), np.array(lidar(t)))
         found.append(
             Segment(
-                k, 0.1 * k, outline.mean(axis=0), len(outline), True, False, outline, np.array(lidar(t)),
+                k, 0.1 * k, outline.mean(axis=0), len(outline), True, False, outline.copy, np.array(lidar(t)),
                 (0.2, HEIGHT), len(outline) // 2, SweepDelays(np.full(72, delay(0.1 * k))),
             )
         )  # fmt: skip

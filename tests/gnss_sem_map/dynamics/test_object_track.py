@@ -15,7 +15,7 @@ def segment(scan, begin, end, truncated=False, is_covered=False, highest=1.5):
     x = np.linspace(begin, end, 20)
     outline = np.stack([x, np.zeros(20)], axis=1)
     return Segment(
-        scan, scan * STEP_S, outline.mean(axis=0), 20, True, truncated, outline, LIDAR, (0.3, highest),
+        scan, scan * STEP_S, outline.mean(axis=0), 20, True, truncated, outline.copy, LIDAR, (0.3, highest),
         is_covered=is_covered,
     )  # fmt: skip
 

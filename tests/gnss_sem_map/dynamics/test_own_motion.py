@@ -27,7 +27,7 @@ def seen(scan, centre, heading, lidar, truncated=False, grazing_deg=3.0):
     outline = np.array(points)
     return Segment(
         scan, 0.1 * scan, outline.mean(axis=0), len(outline), True,
-        truncated, outline, np.asarray(lidar, float),
+        truncated, outline.copy, np.asarray(lidar, float),
     )  # fmt: skip
 
 

@@ -59,7 +59,7 @@ def walk(seen, scans=60, speed=1.5, motion=Motion.MOVING, height=0.0):
         if scan in seen:
             middle = him[:, :2].mean(axis=0)
             listed.append(
-                Segment(scan, t, middle, 20, False, False, him[:, :2], np.zeros(2), (0.2, 0.2 + height))
+                Segment(scan, t, middle, 20, False, False, him[:, :2].copy, np.zeros(2), (0.2, 0.2 + height))
             )
     one = TrackedObject(
         motion, 1.0, False, "", tuple(range(len(listed))), 20 * len(listed), 0.0, 1.0,

@@ -21,8 +21,9 @@ def stands(in_mover, alone, counted=HIT, whole=True):
         of_scans(*([moved] for moved, _ in scans)),
         of_scans(*([stood] for _, stood in scans)),
     )
-    assert len({bool(stay[0]) for stay in stays}) == 1, "a place stands or does not, in all scans alike"
-    return bool(stays[0][0])
+    found = {bool(stay[0]) for stay in stays}
+    assert len(found) == 1, "a place stands or does not, in all scans alike"
+    return found.pop()
 
 
 def test_a_place_that_stood_alone_in_more_than_half_as_many_scans_stays():

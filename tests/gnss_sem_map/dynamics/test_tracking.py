@@ -10,7 +10,7 @@ from gnss_sem_map.refinement.vehicles import Motion
 def segment(scan, x, y=0.0, length=4.0, points=50, shown=True, truncated=False):
     centre, half = np.array([x, y]), np.array([length / 2, 0.9])
     corners = centre + half * [[-1, -1], [-1, 1], [1, -1], [1, 1]]
-    return Segment(scan, scan * 0.1, centre, points, shown, truncated, corners, np.array([-20.0, 0.0]))
+    return Segment(scan, scan * 0.1, centre, points, shown, truncated, corners.copy, np.array([-20.0, 0.0]))
 
 
 def test_two_cars_that_pass_each_other_keep_their_tracks():

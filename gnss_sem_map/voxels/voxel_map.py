@@ -29,9 +29,10 @@ from gnss_sem_map.voxels.kernels import (
 )
 
 SMALLEST_TABLE = 1 << 16
-LARGE_TABLE = 1 << 20
-"""Rows (40 MB for five classes) up to which a table grows by half. A larger one grows by a twelfth, to stay under 63
-bytes per voxel; growing is cheap, for it reads and writes memory in order."""
+LARGE_TABLE = 1 << 18
+"""Rows (25 MB for five classes and attributes) up to which a table grows by half. A larger one grows by a twelfth, to
+stay under 63 bytes per voxel, and because old and new are held at once; growing is cheap, for it reads and writes
+memory in order."""
 HIGHEST_LOAD = 0.7
 ANSWER_SHARE = 0.5
 """With a confusion model, an observation is half the likelihood of the predicted class and half the probabilities of
@@ -235,7 +236,7 @@ class VoxelTable:
 
     def _grow(self) -> None:
         size = len(self._rows)
-        release_memory()  # both tables are needed, 50 and 70 MB
+        release_memory()  # for both tables
         larger = np.zeros((size + size // (2 if size < LARGE_TABLE else 12), self._words), np.int64)
         kernels.rehash(self._rows, larger)
         self._rows = larger

@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import resource
+import sys
 from contextlib import suppress
 
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1
@@ -77,6 +78,12 @@ def release_memory(always: bool = False) -> None:
 
 _held_before = 0
 """Bytes that were held after memory was last released."""
+
+
+def most_held_bytes() -> int:
+    """The most physical memory that this process has had."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def held_bytes() -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from gnss_sem_map.memory import release_memory
+from gnss_sem_map.memory import most_held_bytes, release_memory
 from gnss_sem_map.sensor_log import Skip
 
 Progress = Callable[[str, int, int], None]
@@ -42,4 +41,4 @@ class RunStats:
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
         release_memory()
-        self.peak_memory_mb[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        self.peak_memory_mb[name] = most_held_bytes() / (1 << 20)

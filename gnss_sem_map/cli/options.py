@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -138,4 +137,6 @@ def frame_of(origin: str | None) -> LocalFrame | None:
 
 def default_workers() -> int:
     """All cores but one."""
-    return max((os.cpu_count() or 1) - 1, 1)
+    from gnss_sem_map.thread_pools import cores
+
+    return max(cores() - 1, 1)

@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from itertools import islice
 from typing import TypeVar
 
-from gnss_sem_map.thread_pools import thread_pool
+from gnss_sem_map.thread_pools import cores, thread_pool
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -23,7 +23,7 @@ THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
 def threads() -> int:
     """Threads that this process should use at a time: what the variable says, else one per core that it may use."""
     said = os.environ.get(THREADS_VARIABLE, "")
-    return int(said) if said.isdecimal() and int(said) else len(os.sched_getaffinity(0))
+    return int(said) if said.isdecimal() and int(said) else cores()
 
 
 def prefetch(

@@ -36,7 +36,7 @@ from gnss_sem_map.simulation.truth import (
     write_vehicles,
 )
 from gnss_sem_map.simulation.world import World
-from gnss_sem_map.thread_pools import thread_pool
+from gnss_sem_map.thread_pools import cores, thread_pool
 
 SECONDS = 30.0  # of a drive, when nothing else is said
 _OTHER_SENSOR = 20_011  # apart in the numbers of the noise: a drive of 2000 s has as many frames
@@ -250,7 +250,7 @@ def simulate(
         _write_still(simulation, partial)
         frames = len(simulation.sweeps)
         seen: list[npt.NDArray[np.uint16]] = []
-        with thread_pool(workers or os.cpu_count() or 1) as pool:
+        with thread_pool(workers or cores()) as pool:
             for done, instances in enumerate(
                 pool.map(lambda k: _write_frame(simulation, k, partial / "sync"), range(frames)), 1
             ):

@@ -1,7 +1,6 @@
 """Drives of rigs with several sensors, rendered straight into a CSV log."""
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +15,7 @@ from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
-from gnss_sem_map.thread_pools import thread_pool
+from gnss_sem_map.thread_pools import cores, thread_pool
 
 UNFILTERED: Final = (
     cv2.IMWRITE_PNG_FILTER,
@@ -67,7 +66,7 @@ def render_frames(
 ) -> None:
     """Write all frames on some threads (None: one per core)."""
     frames = len(simulation.sweeps)
-    with thread_pool(workers or os.cpu_count() or 1) as pool:
+    with thread_pool(workers or cores()) as pool:
         for done, _ in enumerate(pool.map(write, range(frames)), 1):
             if progress is not None:
                 progress(done, frames)

@@ -38,8 +38,10 @@ def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None
 
 
 KILLED = 137
-LIVE = ("--set", "dynamics.window_scans=2", "--write-labels")
-SMALL = ("--set", "dynamics.window_scans=1")
+ONE_PROCESS = ("--workers", "1")
+"""The command dies, not a process that it has started, on a machine with many cores too."""
+LIVE = ("--set", "dynamics.window_scans=2", "--write-labels", *ONE_PROCESS)
+SMALL = ("--set", "dynamics.window_scans=1", *ONE_PROCESS)
 """Two scans in a chunk."""
 COMMAND = """
 import os, re, sys

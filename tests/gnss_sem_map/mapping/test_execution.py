@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from processes import is_alive, wait_until
 
+from gnss_sem_map.cli.options import default_workers
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
 from gnss_sem_map.mapping.worker_processes import Processes, machine_memory_bytes
@@ -89,6 +90,17 @@ def test_threads_obey_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for nonsense in ("", "0", "many", "-2"):
         monkeypatch.setenv("GNSS_SEM_MAP_THREADS", nonsense)
         assert threads() == len(os.sched_getaffinity(0))
+
+
+def test_workers_are_one_fewer_than_the_cores_that_the_process_may_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3, 5, 7})
+    assert default_workers() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert default_workers() == 7
+    assert threads() == 8
 
 
 def test_a_container_has_the_memory_that_it_may_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 Workers = Annotated[
     int | None,
-    typer.Option(min=1, help="Processes that map; the result is the same. Default: all cores but one."),
+    typer.Option(
+        min=1, help="Processes that map; the result is the same. Default: all cores but one, with 2 GB each."
+    ),
 ]
 Scheduler = Annotated[
     str | None,

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from gnss_sem_map.config import Settings
     from gnss_sem_map.sensor_log import SensorLog
 
+WORKER_BYTES = 2 << 30
+"""Memory of a worker, which maps the scans of an HDL-64E in 1 GB; the machine is divided by one more than workers."""
 
 Drive = Annotated[
     Path,
@@ -136,7 +138,8 @@ def frame_of(origin: str | None) -> LocalFrame | None:
 
 
 def default_workers() -> int:
-    """All cores but one."""
+    """All cores but one, as long as each worker, and this process, has enough memory."""
+    from gnss_sem_map.mapping.worker_processes import machine_memory_bytes
     from gnss_sem_map.thread_pools import cores
 
-    return max(cores() - 1, 1)
+    return max(min(cores(), machine_memory_bytes() // WORKER_BYTES) - 1, 1)

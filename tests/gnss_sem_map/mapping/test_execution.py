@@ -17,6 +17,7 @@ from processes import is_alive, wait_until
 
 from gnss_sem_map.cli.options import default_workers
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
+from gnss_sem_map.mapping import worker_processes
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
 from gnss_sem_map.mapping.worker_processes import Processes, machine_memory_bytes
 from gnss_sem_map.scans.prefetch import threads
@@ -95,12 +96,22 @@ def test_threads_obey_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_are_one_fewer_than_the_cores_that_the_process_may_use(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(worker_processes, "machine_memory_bytes", lambda: 64 << 30)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3, 5, 7})
     assert default_workers() == 3
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     assert default_workers() == 7
     assert threads() == 8
+
+
+@pytest.mark.parametrize(("memory_gb", "workers"), [(16, 7), (8, 3), (2, 1), (0.5, 1)])
+def test_workers_of_16_cores_have_2_gb_each(
+    memory_gb: float, workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)))
+    monkeypatch.setattr(worker_processes, "machine_memory_bytes", lambda: int(memory_gb * (1 << 30)))
+    assert default_workers() == workers
 
 
 def test_a_container_has_the_memory_that_it_may_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

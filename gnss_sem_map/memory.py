@@ -6,9 +6,9 @@ import atexit
 import ctypes
 import gc
 import os
-import resource
-import sys
 from contextlib import suppress
+
+from gnss_sem_map.machine import held_bytes
 
 M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1
 """Of glibc's `mallopt`: the number of heaps, the size from which memory is not taken from a heap, and how much may be
@@ -63,6 +63,10 @@ def collect_seldom() -> None:
     atexit.register(gc.freeze)
 
 
+_held_before = 0
+"""Bytes that were held after memory was last released."""
+
+
 def release_memory(always: bool = False) -> None:
     """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used.
 
@@ -74,19 +78,3 @@ def release_memory(always: bool = False) -> None:
         if always or held_bytes() > _held_before + GROWN_BYTES:
             ctypes.CDLL(None).malloc_trim(0)
             _held_before = held_bytes()
-
-
-_held_before = 0
-"""Bytes that were held after memory was last released."""
-
-
-def most_held_bytes() -> int:
-    """The most physical memory that this process has had."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def held_bytes() -> int:
-    """Physical memory of this process; raises OSError where the system does not tell."""
-    with open("/proc/self/statm", "rb") as file:
-        return int(file.read().split()[1]) * resource.getpagesize()

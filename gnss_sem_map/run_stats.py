@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from gnss_sem_map.memory import most_held_bytes, release_memory
+from gnss_sem_map.machine import most_held_bytes
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.sensor_log import Skip
 
 Progress = Callable[[str, int, int], None]

@@ -6,7 +6,6 @@ that may take longer than that is made `unless_left`.
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -18,13 +17,6 @@ Given = ParamSpec("Given")
 
 LOOK_S = 0.05
 """So often a thread looks whether it was left."""
-
-
-def cores() -> int:
-    """Cores that this process may use: a batch system or a container may give it fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 class _OfThread(threading.local):

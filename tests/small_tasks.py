@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError, WriteError
-from gnss_sem_map.scans.prefetch import threads
+from gnss_sem_map.machine import threads
 
 
 def times(a: float, b: float) -> float:

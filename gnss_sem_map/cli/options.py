@@ -139,7 +139,6 @@ def frame_of(origin: str | None) -> LocalFrame | None:
 
 def default_workers() -> int:
     """All cores but one, as long as each worker, and this process, has enough memory."""
-    from gnss_sem_map.mapping.worker_processes import machine_memory_bytes
-    from gnss_sem_map.thread_pools import cores
+    from gnss_sem_map.machine import cores, memory_bytes
 
-    return max(min(cores(), machine_memory_bytes() // WORKER_BYTES) - 1, 1)
+    return max(min(cores(), memory_bytes() // WORKER_BYTES) - 1, 1)

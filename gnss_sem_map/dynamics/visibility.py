@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.image_rows import Rows
-from gnss_sem_map.scans.prefetch import prefetch, threads
+from gnss_sem_map.machine import threads
+from gnss_sem_map.scans.prefetch import prefetch
 
 THREADS = min(threads(), 4)
 """More threads would wait for the one that reads, each with two scans in memory."""

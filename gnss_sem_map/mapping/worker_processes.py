@@ -18,18 +18,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess, parent_process
-from pathlib import Path
 from typing import Any
 
+from gnss_sem_map.machine import THREADS_VARIABLE, held_bytes, memory_bytes, threads
 from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
 from gnss_sem_map.memory import collect_seldom
-from gnss_sem_map.scans.prefetch import THREADS_VARIABLE, threads
 
 WATCH_S = 0.1
 """Memory and time of the workers are looked at this often, whenever the next result is waited for."""
 THREADS_VARIABLES = (THREADS_VARIABLE, "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")
-"""Bytes that this container may use, or "max"."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ class Processes:
     def run(self, tasks: Sequence[Task]) -> Generator[tuple[Task, Any]]:
         """Call all tasks; yields each with its result when it is done."""
         count = min(self.workers, len(tasks))
-        most_bytes = self.memory_bytes or machine_memory_bytes() // (count + 1)
+        most_bytes = self.memory_bytes or memory_bytes() // (count + 1)
         waiting, losses = deque(tasks), Losses()
         own_threads = max(threads() // max(count, 1), 1)
         team = self._kept(count, own_threads)
@@ -136,7 +133,7 @@ class _Worker:
             self.task = None
             self.tasks_done += 1
             return answered
-        if self.task is not None and _resident_bytes(self._process.pid) > most_bytes:
+        if self.task is not None and held_bytes(self._process.pid) > most_bytes:
             raise Lost(f"it held more than {most_bytes / 1e9:.2f} GB of memory")
         if self.task is not None and time.monotonic() - self._since > timeout_s:
             raise Lost(f"it was not done after {timeout_s:g} s")
@@ -156,23 +153,6 @@ class _Worker:
         self._process.kill()
         self._process.join()
         self._process.close()
-
-
-def machine_memory_bytes() -> int:
-    """Memory of this machine, or of the container that this is."""
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    try:
-        return min(memory, int(CONTAINER_MEMORY.read_text()))
-    except (OSError, ValueError):  # no container, or one without a limit
-        return memory
-
-
-def _resident_bytes(pid: int | None) -> int:
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except OSError:  # it has just died
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _start() -> tuple[Connection, BaseProcess]:

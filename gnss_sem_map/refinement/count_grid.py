@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaln
 
+from gnss_sem_map.machine import threads
 from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
 from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of
-from gnss_sem_map.thread_pools import cores, thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 
 WHOLE_COLUMN = 1 << 21
 """Layer height, in voxels, that holds every column in one layer."""
-THREADS = cores()
+THREADS = threads()
 LEAST_AT_ONCE = 1 << 18
 """Fewer voxels are not worth a thread."""
 OWN_LIMIT_NAT = 1.0

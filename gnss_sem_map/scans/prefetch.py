@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from itertools import islice
 from typing import TypeVar
 
-from gnss_sem_map.thread_pools import cores, thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 PER_THREAD = 2
 """Items in progress per thread: enough to keep every thread busy, with little memory."""
-THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
-"""Environment variable: threads of one process. Several processes of one machine share its cores by it."""
-
-
-def threads() -> int:
-    """Threads that this process should use at a time: what the variable says, else one per core that it may use."""
-    said = os.environ.get(THREADS_VARIABLE, "")
-    return int(said) if said.isdecimal() and int(said) else cores()
 
 
 def prefetch(

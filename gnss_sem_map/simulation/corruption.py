@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.compiled import Bytes, Floats, Singles, kernel
 from gnss_sem_map.simulation.noise import value_noise
-from gnss_sem_map.thread_pools import cores, thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 
 CLASS_NAMES: Final = ("road", "sidewalk", "vehicle", "building", "vegetation", "other")
 _ROAD, _SIDEWALK, _VEHICLE, _BUILDING, _VEGETATION, _OTHER = range(6)
@@ -119,7 +120,7 @@ def write_corrupted_labels(
     def write(path: Path) -> None:
         _write_corrupted(path, targets[path.parent], keys[path.parent])
 
-    with thread_pool(workers or cores()) as pool:
+    with thread_pool(workers or threads()) as pool:
         for done, _ in enumerate(pool.map(write, paths), 1):
             if progress is not None:
                 progress(done, len(paths))

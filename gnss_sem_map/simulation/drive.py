@@ -17,6 +17,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.files.ownership import MARKER, read_list, write_list
+from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
@@ -36,7 +37,7 @@ from gnss_sem_map.simulation.truth import (
     write_vehicles,
 )
 from gnss_sem_map.simulation.world import World
-from gnss_sem_map.thread_pools import cores, thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 
 SECONDS = 30.0  # of a drive, when nothing else is said
 _OTHER_SENSOR = 20_011  # apart in the numbers of the noise: a drive of 2000 s has as many frames
@@ -250,7 +251,7 @@ def simulate(
         _write_still(simulation, partial)
         frames = len(simulation.sweeps)
         seen: list[npt.NDArray[np.uint16]] = []
-        with thread_pool(workers or cores()) as pool:
+        with thread_pool(workers or threads()) as pool:
             for done, instances in enumerate(
                 pool.map(lambda k: _write_frame(simulation, k, partial / "sync"), range(frames)), 1
             ):

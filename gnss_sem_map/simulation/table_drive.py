@@ -13,9 +13,10 @@ import numpy as np
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
-from gnss_sem_map.thread_pools import cores, thread_pool
+from gnss_sem_map.thread_pools import thread_pool
 
 UNFILTERED: Final = (
     cv2.IMWRITE_PNG_FILTER,
@@ -66,7 +67,7 @@ def render_frames(
 ) -> None:
     """Write all frames on some threads (None: one per core)."""
     frames = len(simulation.sweeps)
-    with thread_pool(workers or cores()) as pool:
+    with thread_pool(workers or threads()) as pool:
         for done, _ in enumerate(pool.map(write, range(frames)), 1):
             if progress is not None:
                 progress(done, frames)

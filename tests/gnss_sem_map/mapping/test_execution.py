@@ -15,13 +15,9 @@ from typing import Any
 import pytest
 from processes import is_alive, wait_until
 
-from gnss_sem_map.cli.options import default_workers
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
-from gnss_sem_map.mapping import worker_processes
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
-from gnss_sem_map.mapping.worker_processes import Processes, machine_memory_bytes
-from gnss_sem_map.scans.prefetch import threads
-from gnss_sem_map.thread_pools import cores
+from gnss_sem_map.mapping.worker_processes import Processes
 
 ALLOWED = "small_tasks."
 HERE = InProcess(ALLOWED)
@@ -84,44 +80,6 @@ def test_a_name_that_is_no_function_is_refused(name: str) -> None:
 def test_an_argument_that_is_no_json_is_refused(argument: object) -> None:
     with pytest.raises(ConfigError, match="its arguments are not JSON"):
         task("echo", argument)
-
-
-def test_threads_obey_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "3")
-    assert threads() == 3
-    for nonsense in ("", "0", "many", "-2"):
-        monkeypatch.setenv("GNSS_SEM_MAP_THREADS", nonsense)
-        assert threads() == cores()
-
-
-def test_workers_are_one_fewer_than_the_cores_that_the_process_may_use(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(worker_processes, "machine_memory_bytes", lambda: 64 << 30)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3, 5, 7}, raising=False)
-    assert default_workers() == 3
-    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert default_workers() == 7
-    assert threads() == 8
-
-
-@pytest.mark.parametrize(("memory_gb", "workers"), [(16, 7), (8, 3), (2, 1), (0.5, 1)])
-def test_workers_of_16_cores_have_2_gb_each(
-    memory_gb: float, workers: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)), raising=False)
-    monkeypatch.setattr(worker_processes, "machine_memory_bytes", lambda: int(memory_gb * (1 << 30)))
-    assert default_workers() == workers
-
-
-def test_a_container_has_the_memory_that_it_may_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    limit = tmp_path / "memory.max"
-    monkeypatch.setattr("gnss_sem_map.mapping.worker_processes.CONTAINER_MEMORY", limit)
-    machine = machine_memory_bytes()
-    for text, expected in (("1000000\n", 1000000), ("max\n", machine), ("", machine)):
-        limit.write_text(text)
-        assert machine_memory_bytes() == expected
 
 
 @integration
@@ -212,7 +170,6 @@ def test_a_worker_that_exits_is_told_with_its_code() -> None:
 
 
 @integration
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what a process holds")
 def test_a_worker_that_takes_too_much_memory_is_killed(tmp_path: Path) -> None:
     (tmp_path / "once").mkdir()
     (tmp_path / "ever").mkdir()

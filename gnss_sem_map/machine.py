@@ -1,0 +1,51 @@
+"""What this process may use of the machine, and what it uses: cores and memory."""
+
+from __future__ import annotations
+
+import os
+import resource
+import sys
+from pathlib import Path
+
+THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
+"""Environment variable: threads of one process. Several processes of one machine share its cores by it."""
+CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")
+"""Bytes that this container may use, or "max"."""
+
+
+def cores() -> int:
+    """Cores that this process may use: a batch system or `taskset` may give it fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def threads() -> int:
+    """Threads that this process should use at a time: what the variable says, else one per core that it may use."""
+    said = os.environ.get(THREADS_VARIABLE, "")
+    return int(said) if said.isdecimal() and int(said) else cores()
+
+
+def memory_bytes() -> int:
+    """Memory of this machine, or of the container that this is."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        return min(memory, int(CONTAINER_MEMORY.read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return memory
+
+
+def held_bytes(pid: int | None = None) -> int:
+    """Physical memory of a process, by default of this one; 0 of one that has ended."""
+    import psutil
+
+    try:
+        return int(psutil.Process(pid).memory_info().rss)
+    except psutil.NoSuchProcess:
+        return 0
+
+
+def most_held_bytes() -> int:
+    """The most physical memory that this process has had."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

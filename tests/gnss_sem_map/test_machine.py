@@ -1,0 +1,70 @@
+"""Cores and memory that a process may use, and what it holds; how many workers that makes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gnss_sem_map import machine
+from gnss_sem_map.cli.options import default_workers
+from gnss_sem_map.machine import cores, held_bytes, memory_bytes, most_held_bytes, threads
+
+
+def test_threads_obey_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "3")
+    assert threads() == 3
+    for nonsense in ("", "0", "many", "-2"):
+        monkeypatch.setenv("GNSS_SEM_MAP_THREADS", nonsense)
+        assert threads() == cores()
+
+
+def test_workers_are_one_fewer_than_the_cores_that_the_process_may_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(machine, "memory_bytes", lambda: 64 << 30)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3, 5, 7}, raising=False)
+    assert default_workers() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert default_workers() == 7
+    assert threads() == 8
+
+
+@pytest.mark.parametrize(("memory_gb", "workers"), [(16, 7), (8, 3), (2, 1), (0.5, 1)])
+def test_workers_of_16_cores_have_2_gb_each(
+    memory_gb: float, workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(16)), raising=False)
+    monkeypatch.setattr(machine, "memory_bytes", lambda: int(memory_gb * (1 << 30)))
+    assert default_workers() == workers
+
+
+def test_a_container_has_the_memory_that_it_may_use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr("gnss_sem_map.machine.CONTAINER_MEMORY", limit)
+    whole = memory_bytes()
+    for text, expected in (("1000000\n", 1000000), ("max\n", whole), ("", whole)):
+        limit.write_text(text)
+        assert memory_bytes() == expected
+
+
+def test_what_a_process_holds_grows_by_what_it_writes_and_never_exceeds_its_peak() -> None:
+    before = held_bytes()
+    written = np.ones(64 << 17)  # 64 MB
+    held = held_bytes()
+    assert 63 << 20 <= held - before <= 80 << 20
+    assert held_bytes(os.getpid()) - most_held_bytes() < 1 << 20  # the system counts pages in portions
+    assert most_held_bytes() < memory_bytes()
+    del written
+
+
+@pytest.mark.integration
+def test_a_process_that_has_ended_holds_nothing() -> None:
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    assert held_bytes(ended.pid) == 0

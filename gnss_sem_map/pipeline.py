@@ -26,8 +26,9 @@ from gnss_sem_map.evaluation import preflight
 from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sample
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor
-from gnss_sem_map.mapping.fusion import Elsewhere, map_scans, probabilities_fingerprint
+from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.passes import TwoPasses
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
@@ -283,5 +284,5 @@ def _remembered(drive: Drive, work: Path, resume: bool, labels_from: str) -> Dri
     if drive.segmenter is None or not drive.log.cameras or isinstance(drive.segmenter, CachedLabels):
         return drive
     sizes = drive.log.calibration.image_sizes
-    folder = probabilities_folder(work, probabilities_fingerprint(drive, labels_from), resume, sizes)
+    folder = probabilities_folder(work, fingerprints.of_probabilities(drive, labels_from), resume, sizes)
     return replace(drive, segmenter=CachedSegmenter(drive.segmenter, drive.label_set, sizes, folder))

@@ -7,27 +7,20 @@ bytes in all cases.
 
 from __future__ import annotations
 
-import hashlib
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels import sensor_model
-from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks, writing_to
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
-from gnss_sem_map.sensor_log import Image, Scan, Skip, file_of
-from gnss_sem_map.voxels.reuse import VERSION
+from gnss_sem_map.sensor_log import Skip
 
 Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
 """Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
@@ -54,7 +47,7 @@ def map_scans(
     chunks, total = chunks_of(drive), drive.log.scan_count
     voxel_size_m = drive.settings.mapping.voxel_size_m
     store = open_store(
-        work, fingerprint(drive, labels_from), len(chunks), resume, voxel_size_m, drive.label_set
+        work, fingerprints.of_map(drive, labels_from), len(chunks), resume, voxel_size_m, drive.label_set
     )
     there = store.done()
     done = sum(len(chunks[number]) for number in there)
@@ -130,69 +123,3 @@ def _check(drive: Drive, stats: RunStats) -> None:
 def _first_reason(stats: RunStats, what: str) -> str:
     """The reason of the first skip of this kind, as the end of a sentence; empty without skips."""
     return next((f"; first reason: {s.where}: {s.reason}" for s in stats.skips if s.what == what), "")
-
-
-def fingerprint(drive: Drive, labels_from: str) -> str:
-    """Digest of everything that decides the map, this version too: a run may resume another one with the same."""
-    log, settings = drive.log, drive.settings
-    names = () if drive.segmenter is None else drive.segmenter.class_names
-    said = [
-        VERSION, log.name, labels_from, list(names), settings.classes,
-        settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
-        settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
-        [(one.lidar, scan.name, scan.number, scan.stamp, state_of(scan)) for one in log.by_lidar for scan in one.scans],
-        [(image.camera, image.number, image.stamp, state_of(image)) for image in log.images], _states(labels_from),
-        [(camera.name, camera.image_size, camera.time_offset_s) for camera in log.calibration.cameras],
-    ]  # fmt: skip
-    digest = hashlib.sha256(repr(said).encode())
-    for array in _arrays(drive):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
-def probabilities_fingerprint(drive: Drive, labels_from: str) -> str:
-    """Digest of the network, the images and the classes: a run may use the probabilities of one with the same."""
-    log = drive.log
-    names = () if drive.segmenter is None else drive.segmenter.class_names
-    said = [
-        log.name, labels_from, list(names), drive.settings.classes, log.calibration.image_sizes,
-        [(image.camera, image.number, state_of(image)) for image in log.images], _states(labels_from),
-    ]  # fmt: skip
-    return hashlib.sha256(repr(said).encode()).hexdigest()
-
-
-def state_of(item: Scan | Image) -> tuple[int, int] | None:
-    """Size and time of the file of a scan or an image."""
-    path = file_of(item)
-    return None if path is None else _size_and_time(path)
-
-
-def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
-    """Sizes and times of the files that a segmenter's description names: label files, or those of a network."""
-    place = Path(labels_from.partition(":")[2].partition("?")[0])
-    if not labels_from.partition(":")[2] or not place.exists():
-        return []
-    folders = [place, *sorted(path for path in place.iterdir() if path.is_dir())] if place.is_dir() else []
-    files = [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()] or [place]
-    return [(str(path.relative_to(place)), _size_and_time(path)) for path in files]
-
-
-def _size_and_time(path: Path) -> tuple[int, int] | None:
-    try:
-        about = path.stat()
-    except OSError:  # the reader reports it
-        return None
-    return about.st_size, about.st_mtime_ns
-
-
-def _arrays(drive: Drive) -> Iterable[NDArray[Any]]:
-    calibration, trajectory = drive.log.calibration, drive.trajectory
-    learnt = sensor_model.opened(drive.settings.calibration, open_label_set(drive.settings.classes))
-    if learnt is not None:
-        yield learnt.log_likelihoods
-    yield from (trajectory.stamps, trajectory.T_map_imu)
-    yield from (one.calibration.T_imu_lidar for one in drive.log.by_lidar)
-    for camera in calibration.cameras:
-        yield from (camera.T_camera_lidar, camera.K, camera.lens)
-    if trajectory.velocities is not None:
-        yield trajectory.velocities

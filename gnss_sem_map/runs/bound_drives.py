@@ -33,6 +33,7 @@ from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -42,6 +43,8 @@ from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
+from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels.reuse import read_record
 
 Array = NDArray[np.float64]
 
@@ -152,11 +155,12 @@ def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequ
 
 
 def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFrame) -> None:
-    folder, fingerprint = work / BOUND / source.name, _fingerprint(source, settings, frame)
-    if _known(folder, fingerprint):
+    log, folder = source.open_log().in_our_conventions(settings.sensors), work / BOUND / source.name
+    fingerprint = _fingerprint(log, settings, frame)
+    if (read_record(folder / JOB) or {}).get("fingerprint") == fingerprint:  # located before an interruption
         return
     with run_folder.claimed_run(work / DRIVES / source.name) as claim:
-        log = source.open_log().in_our_conventions(settings.sensors)
+        (folder / JOB).unlink(missing_ok=True)  # of the drive as it was
         match = SavedMatches(source, claim.work, resume=True)
         found = pipeline.locate(log, settings, RunStats(), match=match, bound=False)
         if found.solution is None or found.solution.condensed is None:
@@ -167,17 +171,9 @@ def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFram
         write_job(folder, source, settings, trajectory, fingerprint)
 
 
-def _fingerprint(source: Source, settings: Settings, frame: LocalFrame) -> str:
-    said = [source.inputs, settings.model_dump(mode="json"), asdict(frame)]
+def _fingerprint(log: SensorLog, settings: Settings, frame: LocalFrame) -> str:
+    said = [fingerprints.of_log(log), settings.model_dump(mode="json"), asdict(frame)]
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
-
-
-def _known(folder: Path, fingerprint: str) -> bool:
-    """Whether the drive was located in the same way before an interruption."""
-    try:
-        return bool(json.loads((folder / JOB).read_text("utf-8"))["fingerprint"] == fingerprint)
-    except (OSError, ValueError, KeyError):
-        return False
 
 
 def _bound(

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import fusion
+from gnss_sem_map.mapping import fingerprints, fusion
 from gnss_sem_map.mapping.checkpoints import ChunkStore
 from gnss_sem_map.mapping.dask_cluster import Cluster
 from gnss_sem_map.mapping.execution import Task, run_tasks
@@ -84,7 +84,7 @@ def _opened(work: str, fingerprint: str) -> tuple[Drive, ChunkStore]:
             network, label_set, log.calibration.image_sizes, Path(about["probabilities"])
         )
     drive = Drive(log, trajectory, network, settings, from_lidar_odometry=about["from_lidar_odometry"])
-    if not fusion.fingerprint(drive, source.labels_from) == about["fingerprint"] == fingerprint:
+    if not fingerprints.of_map(drive, source.labels_from) == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     store = ChunkStore(Path(work), fingerprint, about["chunks"], settings.mapping.voxel_size_m, label_set)
     return drive, store

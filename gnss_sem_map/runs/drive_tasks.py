@@ -21,6 +21,7 @@ from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.run_stats import Progress
 from gnss_sem_map.runs import run_folder
@@ -85,12 +86,14 @@ def map_one(
 def _map_one(
     source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool, correction_file: str
 ) -> None:
-    correction, digest = read_correction(correction_file)
-    if _is_done(folder, settings, source.inputs, frame, digest):  # what is not to be used was removed before
+    log, (correction, digest) = source.open_log(), read_correction(correction_file)
+    read = fingerprints.of_log(log, source.labels_from)
+    if _is_done(
+        folder, settings, source.inputs, frame, read, digest
+    ):  # what is not to be used was removed before
         return
     places = run_folder.places_read(Path(source.drive), settings, source.segmenter)
     with run_folder.claimed_run(folder, places) as claim:
-        log = source.open_log()
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
         with new_folder(folder) as part:
@@ -100,11 +103,11 @@ def _map_one(
                 labels_from=source.labels_from, force=force, correction=correction,
                 write=partial(run_folder.write_trajectory_files, part),
             )  # fmt: skip
-            run_folder.write_drive(part, source, mapped, settings, digest)
+            run_folder.write_drive(part, source, mapped, settings, read, digest)
 
 
 def _is_done(
-    folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame, correction: str
+    folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame, read: str, correction: str
 ) -> bool:
     """Whether a folder holds this drive, mapped from the same inputs in the same way."""
     if not is_file(folder / "run.json"):
@@ -112,7 +115,7 @@ def _is_done(
     try:
         about = read_run(folder)
         same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
-        same = same and about["correction"] == correction
+        same = same and about["read"] == read and about["correction"] == correction
         return bool(same and not differing(read_settings(folder), settings))
     except (SemMapError, KeyError):
         return False

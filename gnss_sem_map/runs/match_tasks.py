@@ -26,8 +26,8 @@ from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
-from gnss_sem_map.mapping.fusion import state_of
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
@@ -53,7 +53,7 @@ class SavedMatches:
     ) -> ScanMatches:
         """Relative poses from all sweeps, as `match_scans` finds them; raises DataError."""
         sections = sections_of(len(log.scans), settings.trajectory.scan_matching)
-        fingerprint = fingerprint_of(log, trajectory, settings)
+        fingerprint = fingerprints.of_matches(log, trajectory, settings)
         work_folder.make(self.work)
         if not self.resume:
             work_folder.remove_matches(self.work)
@@ -121,21 +121,9 @@ def _match(
 def _opened(folder: str, fingerprint: str) -> tuple[SensorLog, Trajectory, Settings]:
     """The drive of a job: opened once for all tasks of a worker."""
     _, source, settings, log, trajectory = read_job(Path(folder))
-    if fingerprint_of(log, trajectory, settings) != fingerprint:
+    if fingerprints.of_matches(log, trajectory, settings) != fingerprint:
         raise other_drive(source)
     return log, trajectory, settings
-
-
-def fingerprint_of(log: SensorLog, trajectory: Trajectory, settings: Settings) -> str:
-    """Digest of everything that decides the matches."""
-    said = [
-        log.name, settings.trajectory.scan_matching.model_dump_json(),
-        [(scan.name, scan.number, scan.stamp, state_of(scan)) for scan in log.scans],
-    ]  # fmt: skip
-    digest = hashlib.sha256(repr(said).encode())
-    for array in (trajectory.stamps, trajectory.T_map_imu, log.calibration.T_imu_lidar):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> None:

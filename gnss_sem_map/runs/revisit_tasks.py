@@ -18,9 +18,9 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.work_folder import REVISITS
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
-from gnss_sem_map.runs.match_tasks import fingerprint_of
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.local_maps import LocalMaps
 from gnss_sem_map.scans.revisits import Found, Pair, Pass, Registrar, RevisitSettings, register_pair
@@ -54,7 +54,7 @@ class RevisitTasks:
         if len(pairs) <= PAIRS_PER_TASK:  # a worker would take as long to open the drive
             yield from (register_pair([places], pair, settings.trajectory.revisits) for pair in pairs)
             return
-        fingerprint = fingerprint_of(log, trajectory, settings)
+        fingerprint = fingerprints.of_matches(log, trajectory, settings)
         work_folder.make(self.work)
         folder = (self.work / REVISITS).resolve()
         folder.mkdir(exist_ok=True)
@@ -88,7 +88,7 @@ def register_some(folder: str, fingerprint: str, number: int, pairs: list[list[i
 def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings, list[float]]:
     """The places of a job: opened once for all tasks of a worker."""
     about, source, settings, log, trajectory = read_job(Path(folder))
-    if not fingerprint_of(log, trajectory, settings) == about["fingerprint"] == fingerprint:
+    if not fingerprints.of_matches(log, trajectory, settings) == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     stamps = np.array(about["stamps"])
     maps = LocalMaps(log, trajectory, stamps)

@@ -111,14 +111,16 @@ def write_run(
     write_about(folder, settings, about, metrics_of(mapped))
 
 
-def write_drive(folder: Path, source: Source, mapped: Mapped, settings: Settings, correction: str) -> None:
+def write_drive(
+    folder: Path, source: Source, mapped: Mapped, settings: Settings, read: str, correction: str
+) -> None:
     """Write what is known of one of several drives beside its raw map, which is in the folder already.
 
-    `correction`: digest of that with which it is bound to others, empty without.
+    `read`: digest of all that was read; `correction`: of that with which it is bound to others, empty without.
     """
     write_plot(folder, mapped.log, mapped.solution)
     write_objects(folder, source.name, mapped, settings)
-    about = about_mapped(source, mapped) | {"correction": correction}
+    about = about_mapped(source, mapped) | {"read": read, "correction": correction}
     write_about(folder, settings, about, metrics_of(mapped))
 
 

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import pytest
 import street
+import street_drives
 from maps_of_drives import SETTINGS, assert_same, gnss_sem_map, mapped, products, run_of
 from street import Street
 from street_drives import Drives
@@ -198,6 +199,28 @@ def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
         with pytest.raises(KeyboardInterrupt):
             run_drives([drives.by_name["a"]], tmp_path / "out", settings, again, origin=origin)
         assert len(calls) == times
+
+
+def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed(
+    how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, calls = street_drives.write(tmp_path / "drives", ("a", "b")), calls_of_the_pipeline(monkeypatch)
+    labels, drive = Path(written.labels.partition(":")[2].format(drive="a")), written.by_name["b"]
+    places, again = list(written.by_name.values()), replace(how, segmenter=written.labels, resume=True)
+    monkeypatch.setattr(many_drives, "write_drives", stopped)
+
+    def mapped_again(changed: Path, content: bytes) -> list[str]:
+        changed.write_bytes(content)
+        calls.clear()
+        with pytest.raises(KeyboardInterrupt):
+            run_drives(places, tmp_path / "out", SETTINGS, again)
+        return list(calls)
+
+    image, row = labels / "0000000002.npz", drive / "oxts/data/0000000003.txt"
+    latitude, rest = row.read_text().split(" ", 1)
+    assert mapped_again(image, image.read_bytes()) == ["a", "b"]
+    assert mapped_again(row, f"{float(latitude) + 1e-7:.12f} {rest}".encode()) == ["b"]
+    assert mapped_again(image, image.read_bytes()) == ["a"]
 
 
 def test_two_drives_of_one_name_are_refused(drives: Drives, how: HowMapped, tmp_path: Path) -> None:

@@ -22,8 +22,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
-from gnss_sem_map.mapping.fusion import fingerprint, map_scans
+from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
@@ -214,8 +215,8 @@ def test_an_input_that_was_changed_since_is_noticed(
     opened = open_drive(next(street_copy.glob("*/*_sync")))
     labels_from = f"labels:{street_copy / 'probabilities'}"
     copied = by_chunks(replace(drive, log=opened), 2)
-    before = fingerprint(copied, labels_from)
-    assert fingerprint(copied, labels_from) == before
+    before = fingerprints.of_map(copied, labels_from)
+    assert fingerprints.of_map(copied, labels_from) == before
     for changed in (
         "*/*_sync/velodyne_points/data/*4.bin",
         "*/*_sync/image_02/data/*5.png",
@@ -223,8 +224,8 @@ def test_an_input_that_was_changed_since_is_noticed(
     ):
         (path,) = (p for p in street_copy.glob(changed) if "1" not in p.stem)
         halved(path)
-        assert fingerprint(copied, labels_from) != before, changed
-        before = fingerprint(copied, labels_from)
+        assert fingerprints.of_map(copied, labels_from) != before, changed
+        before = fingerprints.of_map(copied, labels_from)
 
 
 FILL = """

@@ -24,7 +24,7 @@ from gnss_sem_map.evaluation.preflight import camera
 from gnss_sem_map.evaluation.preflight.findings import Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.fusion import fingerprint
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.segmentation import open_segmenter
@@ -145,7 +145,7 @@ def test_a_fisheye_shows_points_their_class_at_its_own_exposure(surround: Path, 
 
 def test_what_is_said_of_a_camera_decides_the_map(surround: Path, small_drive: Street) -> None:
     drive = job(surround, small_drive)
-    said = {fingerprint(drive, "")}
+    said = {fingerprints.of_map(drive, "")}
     calibration = drive.log.calibration
     front, side = calibration.cameras
     assert side.distortion is not None
@@ -156,7 +156,7 @@ def test_what_is_said_of_a_camera_decides_the_map(surround: Path, small_drive: S
         replace(side, K=side.K + np.eye(3)),
     ):
         log = replace(drive.log, calibration=replace(calibration, cameras=(front, other)))
-        said.add(fingerprint(replace(drive, log=log), ""))
+        said.add(fingerprints.of_map(replace(drive, log=log), ""))
     assert len(said) == 4
 
 

@@ -20,8 +20,9 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.label_files import label_files
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
-from gnss_sem_map.mapping.fusion import fingerprint, map_scans
+from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.run_stats import RunStats
@@ -150,7 +151,9 @@ def test_where_another_lidar_is_decides_the_map(moving: Drive) -> None:
     log = moving.log
     places = [np.eye(4), turned_and_moved()]
     said = {
-        fingerprint(replace(moving, log=replace(log, lidar="a", others=(Lidar("b", T, log.scans),))), "")
+        fingerprints.of_map(
+            replace(moving, log=replace(log, lidar="a", others=(Lidar("b", T, log.scans),))), ""
+        )
         for T in places
     }
     assert len(said) == 2

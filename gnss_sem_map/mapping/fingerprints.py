@@ -1,0 +1,126 @@
+"""Digests of what decides a result: an interrupted run may be resumed where they are the same.
+
+A file stands in them with its size and its time of change, and the values that were read from small files as they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.config import Settings
+from gnss_sem_map.labels import sensor_model
+from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
+from gnss_sem_map.voxels.reuse import VERSION
+
+
+def of_log(log: SensorLog, labels_from: str = "") -> str:
+    """Digest of all that is read of a drive and of the labels of its images, and of this version."""
+    said = [
+        VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.conventions, _scans(log), _images(log),
+        _cameras(log), labels_from, _states(labels_from),
+    ]  # fmt: skip
+    tables = (log.imu, log.gnss, log.wheels, log.given, log.initial_attitude)
+    values = (
+        getattr(table, column.name) for table in tables if table is not None for column in fields(table)
+    )
+    arrays = [np.asarray(value, np.float64) for value in values if value is not None]
+    return _digest(said, [*_calibration(log), log.calibration.p_imu_antenna, *arrays])
+
+
+def of_matches(log: SensorLog, trajectory: Trajectory, settings: Settings) -> str:
+    """Digest of everything that decides the matches of LiDAR odometry."""
+    said = [
+        log.name, settings.trajectory.scan_matching.model_dump_json(),
+        [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
+    ]  # fmt: skip
+    return _digest(said, [trajectory.stamps, trajectory.T_map_imu, log.calibration.T_imu_lidar])
+
+
+def of_map(drive: Drive, labels_from: str) -> str:
+    """Digest of everything that decides the map, this version too."""
+    log, settings, trajectory = drive.log, drive.settings, drive.trajectory
+    said = [
+        VERSION, log.name, labels_from, _classes(drive), settings.classes,
+        settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
+        settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
+        _scans(log), _images(log), _states(labels_from), _cameras(log),
+    ]  # fmt: skip
+    learnt = sensor_model.opened(settings.calibration, open_label_set(settings.classes))
+    arrays = [] if learnt is None else [learnt.log_likelihoods]
+    arrays += [trajectory.stamps, trajectory.T_map_imu, *_calibration(log)]
+    return _digest(said, arrays if trajectory.velocities is None else [*arrays, trajectory.velocities])
+
+
+def of_probabilities(drive: Drive, labels_from: str) -> str:
+    """Digest of the network, the images and the classes: they decide the class probabilities."""
+    said = [
+        drive.log.name, labels_from, _classes(drive), drive.settings.classes,
+        drive.log.calibration.image_sizes, _images(drive.log), _states(labels_from),
+    ]  # fmt: skip
+    return _digest(said, [])
+
+
+def _digest(said: list[Any], arrays: Iterable[NDArray[Any]]) -> str:
+    digest = hashlib.sha256(repr(said).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _classes(drive: Drive) -> list[str]:
+    return [] if drive.segmenter is None else list(drive.segmenter.class_names)
+
+
+def _scans(log: SensorLog) -> list[Any]:
+    return [
+        (one.lidar, scan.name, scan.number, scan.stamp, _state(scan))
+        for one in log.by_lidar
+        for scan in one.scans
+    ]
+
+
+def _images(log: SensorLog) -> list[Any]:
+    return [(image.camera, image.number, image.stamp, _state(image)) for image in log.images]
+
+
+def _cameras(log: SensorLog) -> list[Any]:
+    return [(camera.name, camera.image_size, camera.time_offset_s) for camera in log.calibration.cameras]
+
+
+def _calibration(log: SensorLog) -> Iterator[NDArray[Any]]:
+    yield from (one.calibration.T_imu_lidar for one in log.by_lidar)
+    for camera in log.calibration.cameras:
+        yield from (camera.T_camera_lidar, camera.K, camera.lens)
+
+
+def _state(item: Scan | Image) -> tuple[int, int] | None:
+    path = file_of(item)
+    return None if path is None else _size_and_time(path)
+
+
+def _states(labels_from: str) -> list[tuple[str, tuple[int, int] | None]]:
+    """Sizes and times of the files that a segmenter's description names: label files, or those of a network."""
+    place = Path(labels_from.partition(":")[2].partition("?")[0])
+    if not labels_from.partition(":")[2] or not place.exists():
+        return []
+    folders = [place, *sorted(path for path in place.iterdir() if path.is_dir())] if place.is_dir() else []
+    files = [path for folder in folders for path in sorted(folder.iterdir()) if path.is_file()] or [place]
+    return [(str(path.relative_to(place)), _size_and_time(path)) for path in files]
+
+
+def _size_and_time(path: Path) -> tuple[int, int] | None:
+    try:
+        about = path.stat()
+    except OSError:  # the reader reports it
+        return None
+    return about.st_size, about.st_mtime_ns

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import ros
 from ros import START_NS, rig_yaml, sweep, with_camera
 
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.errors import DataError, PointTimesError
 
 TIMES = np.linspace(-0.05, 0.05, 64)
@@ -37,6 +39,26 @@ def test_a_truncated_bag_is_refused_with_its_repair(tmp_path: Path, storage: str
     damaged(bag, lambda content: content[: len(content) // 3])
     with pytest.raises(DataError, match=r"truncated.*(mcap recover|rosbag reindex|sqlite3)"):
         open_drive(bag).scans[-1].read()
+
+
+def test_messages_that_are_in_a_log_beside_the_bag_are_not_lost(tmp_path: Path) -> None:
+    recorded = next(ros.write(tmp_path / "recorded", ros.drive(), "db3").glob("*.db3"))
+    file, log = tmp_path / "killed.db3", tmp_path / "killed.db3-wal"
+    with closing(sqlite3.connect(recorded)) as recorder:
+        recorder.execute("PRAGMA journal_mode=WAL")
+        recorder.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT 1, 0, zeroblob(9)")
+        recorder.commit()
+        shutil.copy(recorded, file)  # as after a recorder that was killed: one that ends empties the log
+        shutil.copy(recorded.with_name(f"{recorded.name}-wal"), log)
+    with pytest.raises(DataError, match=r'killed.db3-wal: .*sqlite3 killed.db3 "PRAGMA wal_checkpoint'):
+        open_drive(file)
+    (tmp_path / "link.db3").symlink_to(file)
+    with pytest.raises(DataError, match=r"killed\.db3-wal"):
+        open_drive(tmp_path / "link.db3")
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        log.touch()  # an empty one holds nothing
+        assert len(Bag(file).messages("/imu")) + len(Bag(file).messages("/fix")) == 207
 
 
 def test_an_unindexed_ros1_bag_is_refused(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -30,6 +31,20 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def damaged(bag: Path, change: Callable[[bytearray], bytes | bytearray]) -> None:
     file = bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
     file.write_bytes(change(bytearray(file.read_bytes())))
+
+
+def chunk_index(content: bytearray, at: int) -> int:
+    """Where the first record of a chunk is in the summary of an MCAP file."""
+    while content[at] != 0x08:
+        at += 9 + int(struct.unpack_from("<Q", content, at + 1)[0])
+    return at
+
+
+def read_all(file: Path) -> None:
+    bag = Bag(file)
+    for topic in bag.kinds:
+        for _ in bag.each(bag.messages(topic)):
+            pass
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3", "bag"])
@@ -79,6 +94,29 @@ def test_an_mcap_that_was_not_closed_is_refused(plain: Path, tmp_path: Path) -> 
     (tmp_path / "open.mcap").write_bytes(content[:-40])
     with pytest.raises(DataError, match=r"not closed.*mcap recover open.mcap"):
         open_drive(tmp_path / "open.mcap")
+
+
+@pytest.mark.parametrize(
+    ("record", "at", "number"),
+    [
+        pytest.param(0x08, 9 + 16, 2**64 - 1, id="a place that 64 bits with a sign do not hold"),
+        pytest.param(0x08, 1, 2**62, id="a record that no memory holds"),
+        pytest.param(0x07, 9 + 6 + 8, 2**63 - 1, id="a message beyond the largest place of a file"),
+    ],
+)
+def test_a_wild_number_in_an_mcap_is_refused(
+    plain: Path, tmp_path: Path, record: int, at: int, number: int
+) -> None:
+    content = bytearray(next(plain.glob("*.mcap")).read_bytes())
+    [summary] = struct.unpack_from("<Q", content, len(content) - 37 + 9)
+    start = chunk_index(content, summary)
+    if record == 0x07:  # the index of messages is behind its chunk
+        start = sum(struct.unpack_from("<QQ", content, start + 9 + 16))
+    assert content[start] == record
+    struct.pack_into("<Q", content, start + at, number)
+    (tmp_path / "wild.mcap").write_bytes(content)
+    with pytest.raises(DataError, match=r"wild\.mcap: .*damaged.*mcap recover"):
+        read_all(tmp_path / "wild.mcap")
 
 
 @pytest.mark.integration

@@ -6,7 +6,8 @@
     wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
                                                        or by `speed_unit` in log.yaml
     log.yaml            optional: see `LogFile`
-    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp]
+    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
+                                                       intensity from 0 to 1, or to `intensity_max` in log.yaml
     images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg
 
 Of several LiDARs or cameras, each has a folder of its name in lidar/ or images/.
@@ -123,6 +124,7 @@ class LidarFile(BaseModel):
 
     T_imu_lidar: Matrix4 = Field(description="LiDAR to IMU.")
     is_compensated: bool = Field(False, description="As `lidar_is_compensated`.")
+    intensity_max: float = Field(1.0, gt=0, description="Number for an intensity of 1 in its scans.")
 
 
 class LogFile(SensorConventions):
@@ -154,11 +156,18 @@ class LogFile(SensorConventions):
     lidar_is_compensated: bool = Field(
         False, description="Scans of four columns are already motion-compensated to their stamp."
     )
+    intensity_max: float = Field(
+        1.0, gt=0, description="Number for an intensity of 1 in the scans of the only LiDAR."
+    )
 
     @property
     def all_lidars(self) -> list[tuple[str, LidarFile]]:
         """The LiDARs with the names of their folders; the first is the one that all else is relative to."""
-        alone = LidarFile(T_imu_lidar=self.T_imu_lidar, is_compensated=self.lidar_is_compensated)
+        alone = LidarFile(
+            T_imu_lidar=self.T_imu_lidar,
+            is_compensated=self.lidar_is_compensated,
+            intensity_max=self.intensity_max,
+        )
         return list(self.lidars.items()) or [("", alone)]
 
 
@@ -342,27 +351,27 @@ def _lidars(folder: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]
     found: list[Lidar] = []
     skips: list[Skip] = []
     for name, one in about.all_lidars:
-        scans, lost = _scans(folder / name, one.is_compensated)
+        scans, lost = _scans(folder / name, one)
         called = name if len(about.all_lidars) > 1 else ""
         found.append(Lidar(called, np.array(one.T_imu_lidar, np.float64), scans))
         skips += lost
     return tuple(found), skips
 
 
-def _scans(folder: Path, is_compensated: bool) -> tuple[tuple[Scan, ...], list[Skip]]:
+def _scans(folder: Path, about: LidarFile) -> tuple[tuple[Scan, ...], list[Skip]]:
     found, skips = _stamped("scan", folder, ".bin")
     scans = [
-        Scan(path.stem, n, t, partial(_read_scan, path, t, is_compensated, frames.state_of(path)))
+        Scan(path.stem, n, t, partial(_read_scan, path, t, about, frames.state_of(path)))
         for n, t, path in found
     ]
     return in_order("scan", scans, skips), skips
 
 
-def _read_scan(path: Path, stamp: float, is_compensated: bool, state: frames.State | None) -> Points:
-    if is_compensated:
-        rows = frames.read_points(path, 4, state)
+def _read_scan(path: Path, stamp: float, about: LidarFile, state: frames.State | None) -> Points:
+    rows = frames.read_points(path, 4 if about.is_compensated else 5, state)
+    frames.scale_intensity(rows, about.intensity_max)
+    if about.is_compensated:
         return Points(rows[:, :3], rows[:, 3], None)
-    rows = frames.read_points(path, 5, state)
     with np.errstate(invalid="ignore"):  # of signalling NaN
         after = rows[:, 4].astype(np.float64)
     leave_out_of_sweep(rows, after, shown(path))

@@ -109,6 +109,13 @@ def refuse_other_bytes(rows: NDArray[np.float32], where: str) -> None:
         )
 
 
+def scale_intensity(rows: NDArray[np.float32], intensity_max: float) -> None:
+    """Divide the fourth column of points (n, 4 or more) by the number that stands for an intensity of 1."""
+    if intensity_max != 1:
+        with np.errstate(over="ignore", invalid="ignore"):  # of damaged points
+            rows[:, 3] = rows[:, 3] / np.float64(intensity_max)
+
+
 def read_image(path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     """RGB pixels (h, w, 3); raises DataError for a damaged file or another (width, height) than the calibration's."""
     return read_picture(path, size)

@@ -200,9 +200,7 @@ def _scans(bag: Bag, about: LidarTopic, epoch_ns: int) -> tuple[tuple[Scan, ...]
     scans = []
     for k in np.flatnonzero(believed).tolist():
         ns, stamp = int(said[k]), (int(said[k]) - epoch_ns) * 1e-9
-        read_it = partial(
-            _read_scan, bag.file_of(messages, k), bag, messages, k, stamp, ns, about.point_times
-        )
+        read_it = partial(_read_scan, bag.file_of(messages, k), bag, messages, k, stamp, ns, about)
         scans.append(Scan(f"{k:010d}", k, stamp, read_it))
     return in_order("scan", scans, skips), skips
 
@@ -217,9 +215,9 @@ def _check_times(bag: Bag, messages: Messages, about: LidarTopic) -> None:
 
 
 def _read_scan(
-    _file: Path, bag: Bag, messages: Messages, k: int, stamp: float, stamp_ns: int, times: str | None
+    _file: Path, bag: Bag, messages: Messages, k: int, stamp: float, stamp_ns: int, about: LidarTopic
 ) -> Points:
-    return clouds.read_cloud(bag, messages, k, stamp, stamp_ns, times)
+    return clouds.read_cloud(bag, messages, k, stamp, stamp_ns, about.point_times, about.intensity_max)
 
 
 def _images(

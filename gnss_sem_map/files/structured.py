@@ -1,7 +1,8 @@
 """Safe loaders for YAML and JSON: with limits on size, depth and time, and without code execution.
 
-In our YAML only true and false are truth values (`vehicles: off` is a word, as it looks), dates are words, and there
-are no tags. Aliases count as much as what they stand for, so that a few lines cannot stand for a billion.
+In our YAML only true and false are truth values (`vehicles: off` is a word, as it looks), dates and times are words,
+there are no tags, and no key is there twice. Aliases count as much as what they stand for, so that a few lines cannot
+stand for a billion.
 """
 
 from __future__ import annotations
@@ -55,15 +56,34 @@ class _Loader(yaml.SafeLoader):
             self._count += self._weights[id(node)]
         else:
             self._weights[id(node)] = self._count - before
+            _refuse_repeated_keys(node)
         if self._count > MOST_NODES:
             raise _Refused(f"more than {MOST_NODES} values, aliases written out")
         return node
+
+    def resolve(self, kind: type[yaml.Node], value: str | None, implicit: Any) -> str:
+        """The tag of a node; what has a colon in it is text: YAML 1.1 takes 12:30:45 for 45045."""
+        if kind is yaml.ScalarNode and ":" in (value or ""):
+            return str(self.DEFAULT_SCALAR_TAG)
+        return str(super().resolve(kind, value, implicit))
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         """A whole number with a limited number of digits."""
         if len(node.value) > MOST_DIGITS:
             raise _Refused(f"a number of {len(node.value)} digits, expected at most {MOST_DIGITS}")
         return int(super().construct_yaml_int(node))
+
+
+def _refuse_repeated_keys(node: yaml.Node | None) -> None:
+    """Raise an error for a mapping with a key twice, of which the first value would be lost."""
+    found = set()
+    for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+        if isinstance(key, yaml.ScalarNode):
+            if (key.tag, key.value) in found:
+                raise _Refused(
+                    f"found the key {key.value[:50]!r} twice, again in line {key.start_mark.line + 1}; remove one"
+                )
+            found.add((key.tag, key.value))
 
 
 _REPLACED = ("tag:yaml.org,2002:bool", "tag:yaml.org,2002:timestamp")

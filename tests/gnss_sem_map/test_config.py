@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from gnss_sem_map import config
 from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.files.structured import parse_yaml
 
 
 def sections(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
@@ -55,6 +56,33 @@ def test_every_setting_is_printed_under_its_description(tmp_path: Path) -> None:
             assert " ".join(str(field.description).split()) in above[name], f"{model.__name__}.{name}"
             count += 1
     assert sum(len(found) for found in above.values()) == count
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["classes: urban\nclasses: vehicles\n", "a: {b: 1, c: 2, b: 3}", '"b": 1\nb: 1\n', "- a\n- {1: 2, 1: 3}"],
+)
+def test_a_key_that_is_there_twice_is_refused(text: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"found the key '\w+' twice, again in line \d"):
+        parse_yaml(text)
+    file = tmp_path / "config.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"config\.yaml: not YAML \(found the key '\w+' twice"):
+        config.load(file)
+
+
+def test_merged_keys_may_be_replaced() -> None:
+    assert parse_yaml("a: &a {b: 1}\nc: &c {<<: *a, b: 2}\nd: {<<: *c, b: 3}")["d"] == {"b": 3}
+
+
+def test_a_time_of_day_is_text() -> None:
+    assert parse_yaml("[12:30:45, 190:20:30.15, -1:30, 12, 0.5]") == [
+        "12:30:45",
+        "190:20:30.15",
+        "-1:30",
+        12,
+        0.5,
+    ]
 
 
 def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes
+from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_intensity
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
@@ -63,16 +63,24 @@ def no_times(where: str, names: list[str]) -> DataError:
 
 
 def read_cloud(
-    bag: Bag, messages: Messages, k: int, stamp: float, stamp_ns: int, times: str | None
+    bag: Bag,
+    messages: Messages,
+    k: int,
+    stamp: float,
+    stamp_ns: int,
+    times: str | None,
+    intensity_max: float | None = None,
 ) -> Points:
     """A sweep; `times` is the field of the points' times, COMPENSATED, or None for a known field.
 
+    `intensity_max` is the number for an intensity of 1; None: 1, and of an unsigned field its largest number.
     `stamp` s of the log, `stamp_ns` the same as Unix ns. Raises DataError for a damaged cloud, and PointTimesError for
     times that are not of one sweep.
     """
     cloud, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     table = _table(cloud, where)
-    rows = _rows(table, where)
+    rows = _rows(table)
+    scale_intensity(rows, intensity_max or _largest_intensity(table))
     refuse_other_bytes(rows, where)
     if times == COMPENSATED:
         return Points(rows[:, :3], rows[:, 3], None)
@@ -114,9 +122,8 @@ def _table(cloud: Any, where: str) -> NDArray[Any]:
     return np.frombuffer(data, dtype, n)
 
 
-def _rows(table: NDArray[Any], where: str) -> NDArray[np.float32]:
-    """x, y, z in m and the intensity from 0 to 1 (n, 4), together in memory."""
-    names = table.dtype.names or ()
+def _rows(table: NDArray[Any]) -> NDArray[np.float32]:
+    """x, y, z in m and the intensity as the driver writes it (n, 4), together in memory."""
     wanted = ("x", "y", "z", "intensity")
     fields: dict[str, Any] = dict(table.dtype.fields or {})
     first = int(fields["x"][1])
@@ -128,13 +135,21 @@ def _rows(table: NDArray[Any], where: str) -> NDArray[np.float32]:
     rows = np.zeros((len(table), 4), np.float32)
     for column, name in enumerate(wanted[:3]):
         rows[:, column] = table[name]
-    found = next((name for name in INTENSITY_FIELDS if name in names), None)
+    found = _intensity_field(table)
     if found is not None:
-        kind = fields[found][0]
         rows[:, 3] = table[found]
-        if kind.kind == "u":
-            rows[:, 3] /= np.iinfo(kind).max
     return rows
+
+
+def _intensity_field(table: NDArray[Any]) -> str | None:
+    return next((name for name in INTENSITY_FIELDS if name in (table.dtype.names or ())), None)
+
+
+def _largest_intensity(table: NDArray[Any]) -> float:
+    """The number for an intensity of 1, by the type of the field: drivers that write floats differ."""
+    found = _intensity_field(table)
+    kind = None if found is None else table.dtype[found]
+    return float(np.iinfo(kind).max) if kind is not None and kind.kind == "u" else 1.0
 
 
 def _after(times: NDArray[Any], stamp: int) -> Array:

@@ -68,15 +68,12 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
 
 
 def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
-    """A rig.yaml with every topic that may be a sensor: where there are several of one kind, the others are to go."""
+    """A rig.yaml with every topic that may be a sensor; of several IMUs or receivers, all but the first as comments."""
     transforms = read_static_transforms(bag)
-    of = {
-        sensor: [topic for topic in topics if topic.taken_for == sensor and topic.messages]
-        for sensor in roles.KINDS
-    }
+    of = {sensor: _sensors(topics, sensor) for sensor in roles.KINDS}
     parts = [
-        "# Which topic of the bag is which sensor. Keep one LiDAR and one camera; the frames are those of /tf_static.",
-        "# What is not here is as its default: see docs/your_own_log.md.",
+        "# Which topic of the bag is which sensor. All LiDARs and cameras here are used: remove those you do not want.",
+        "# Frames are those of /tf_static; what is not here is as its default: see docs/your_own_log.md.",
     ]
     for key, sensor in (("imu", "IMU"), ("gnss", "receiver")):
         for k, topic in enumerate(of[sensor]):
@@ -91,11 +88,11 @@ def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
             )
     for key, sensor in (("lidars", "LiDAR"), ("cameras", "camera")):
         parts.append(f"{key}:" if of[sensor] else f"{key}: {{}}")
-        for topic in of[sensor]:
+        for name, topic in _named(of[sensor]).items():
             about: dict[str, Any] = {"topic": topic.name} | _stamps(topic)
             if sensor == "camera":
                 about["info"] = roles.info_beside(bag, topic.name)
-            parts += _noted(topic, _yaml({_name(topic): about}), indent="  ")
+            parts += _noted(topic, _yaml({name: about}), indent="  ")
     return "\n".join(parts) + "\n"
 
 
@@ -140,6 +137,30 @@ def _has_lever_arm(topic: Topic, imus: list[Topic], transforms: StaticTransforms
     if not imus:
         return False
     return topic.frame == imus[0].frame or transforms.between(imus[0].frame, topic.frame) is not None
+
+
+def _sensors(topics: tuple[Topic, ...], sensor: str) -> list[Topic]:
+    """Those with messages; of an image that is there twice the one with fewer notes, else the raw one."""
+    best: dict[str, Topic] = {}
+    for topic in topics:
+        if topic.taken_for == sensor and topic.messages:
+            image = topic.name.removesuffix("/compressed")
+            if image not in best or len(topic.notes) < len(best[image].notes):
+                best[image] = topic
+    return list(best.values())
+
+
+def _named(topics: list[Topic]) -> dict[str, Topic]:
+    """Sensors by name; a name that another one has gets a number."""
+    named: dict[str, Topic] = {}
+    for topic in topics:
+        name = first = _name(topic)
+        number = 1
+        while name in named:
+            number += 1
+            name = f"{first}_{number}"
+        named[name] = topic
+    return named
 
 
 def _name(topic: Topic) -> str:

@@ -27,43 +27,25 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD_BYTES = 9 + 40
 """Of a chunk record before its compression's name and its data."""
 FIRST_READ = 4096
+DAMAGED = (struct.error, TypeError, ValueError, KeyError, AssertionError, OSError, OverflowError, MemoryError)
+"""What damaged bytes raise, beside ReaderError: `rosbags` takes as much memory as a wrong length says."""
 
 
 class McapFile:
     """Messages of the topics of one file; raises DataError when its index is missing or damaged."""
 
     def __init__(self, path: Path, codec: str = "") -> None:
-        from rosbags.rosbag2 import Reader, ReaderError
+        from rosbags.rosbag2 import ReaderError
 
         self.path, self._codec = path, codec
         self._file = OpenFile(path)
-        reader = Reader(path)
         try:
-            reader.open()
-        except (ReaderError, struct.error, TypeError, ValueError, KeyError, AssertionError, OSError) as error:
+            channels, expected = self._read_summary()
+        except (ReaderError, *DAMAGED) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not closed ({_line(error)}); repair it: mcap recover"
                 f" {shown(path.name)} -o repaired.mcap"
             ) from None
-        try:
-            self.topics = {one.topic: one.msgtype for one in reader.connections}
-            channels = {one.id: one.topic for one in reader.connections}
-            summary = reader.storage.chunks  # type: ignore[attr-defined]  # of McapReader
-            expected = sum(one.msgcount for one in reader.connections)
-            self._starts = np.array([chunk.chunk_start_offset for chunk in summary], np.int64)
-            self._sizes = np.array(
-                [(chunk.compressed_size, chunk.uncompressed_size) for chunk in summary], np.int64
-            ).reshape(-1, 2)
-            self._codecs = [chunk.compression for chunk in summary]
-            self._spans = np.array(
-                [
-                    (chunk.chunk_start_offset + chunk.chunk_length, chunk.message_index_length)
-                    for chunk in summary
-                ],
-                np.int64,
-            ).reshape(-1, 2)
-        finally:
-            reader.close()
         self._chunks = Chunks(self._expanded)
         self._index = self._read_indexes(channels)
         indexed = sum(len(times) for times, _ in self._index.values())
@@ -87,6 +69,27 @@ class McapFile:
         if self._codec:
             return expand(data, self._codec, shown(self.path), most or MOST_BYTES)
         return data if most is None else data[:most]
+
+    def _read_summary(self) -> tuple[dict[int, str], int]:
+        """Topics by their channel, and the number of all messages; notes where the chunks are."""
+        from rosbags.rosbag2 import Reader
+
+        reader = Reader(self.path)
+        reader.open()
+        try:
+            self.topics = {one.topic: one.msgtype for one in reader.connections}
+            summary = reader.storage.chunks  # type: ignore[attr-defined]  # of McapReader
+            self._starts = np.array([chunk.chunk_start_offset for chunk in summary], np.int64)
+            sizes = [(chunk.compressed_size, chunk.uncompressed_size) for chunk in summary]
+            self._sizes = np.array(sizes, np.int64).reshape(-1, 2)
+            self._codecs = [chunk.compression for chunk in summary]
+            ends = [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary]
+            spans = [(end, chunk.message_index_length) for end, chunk in zip(ends, summary, strict=True)]
+            self._spans = np.array(spans, np.int64).reshape(-1, 2)
+            channels = {one.id: one.topic for one in reader.connections}
+            return channels, sum(one.msgcount for one in reader.connections)
+        finally:
+            reader.close()
 
     def _read_indexes(self, channels: dict[int, str]) -> dict[str, tuple[Ints, Ints]]:
         found: dict[str, list[tuple[int, NDArray[np.uint64]]]] = {}

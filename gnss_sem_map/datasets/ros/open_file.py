@@ -32,7 +32,7 @@ class OpenFile:
         """At most `size` bytes, fewer at the end of the file; raises DataError when it cannot be read."""
         parts: list[bytes] = []
         try:
-            while size > 0 and (part := os.pread(self._descriptor, size, start)):
+            while size > 0 and start < self.size and (part := os.pread(self._descriptor, size, start)):
                 parts.append(part)
                 start, size = start + len(part), size - len(part)
         except OSError as error:

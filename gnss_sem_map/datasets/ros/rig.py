@@ -71,6 +71,11 @@ class LidarTopic(_Topic):
         None,
         description="Field of the points' times, or `compensated`; default: time, t, offset_time or timestamp.",
     )
+    intensity_max: float | None = Field(
+        None,
+        gt=0,
+        description="Number for an intensity of 1; default: 1, and of an unsigned field its largest number.",
+    )
 
     _rigid = field_validator("T_imu_lidar")(lambda value: _checked(value))
 

@@ -25,7 +25,7 @@ def completed(bag: Bag, rig: Rig) -> Rig:
     """The rig with the sensors that it does not name: a topic is taken where there is one of its type.
 
     A rig that names LiDARs or cameras names all that are used. Raises DataError for topics that are not there or of
-    another type, and for several of one kind, which the log cannot hold.
+    another type, and for several of one kind where the rig does not say which of them are used.
     """
     update: dict[str, object] = {}
     if rig.imu is None:

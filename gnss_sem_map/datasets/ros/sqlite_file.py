@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.codecs import MOST_BYTES, expand
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, shown
+from gnss_sem_map.files.untrusted import is_file, shown, status
 
 Ints = NDArray[np.int64]
 DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError)
@@ -25,8 +25,9 @@ class SqliteFile:
     def __init__(self, path: Path, codec: str = "") -> None:
         self.path, self._codec, self._lock = path, codec, Lock()
         is_file(path)
+        _refuse_log(path.resolve())
         try:
-            # immutable: nothing is written beside it, not even a lock
+            # immutable: nothing is written beside it, not even a lock; a log of changes is not read
             self._database = sqlite3.connect(
                 f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False
             )
@@ -62,4 +63,16 @@ class SqliteFile:
         return DataError(
             f"{shown(self.path)}: truncated, damaged or no bag ({error}); repair it: sqlite3 {shown(self.path.name)}"
             " .recover | sqlite3 repaired.db3"
+        )
+
+
+def _refuse_log(path: Path) -> None:
+    """Raise DataError where messages are still in the write-ahead log, which is read only by who may write it."""
+    log = path.with_name(f"{path.name}-wal")
+    found = status(log)
+    if found is not None and found.st_size:
+        name = shown(path.name)
+        raise DataError(
+            f"{shown(log)}: found {found.st_size} bytes of messages that are not in {name} yet, expected a bag that was"
+            f' closed; end the recorder, then run: sqlite3 {name} "PRAGMA wal_checkpoint(TRUNCATE)"'
         )

@@ -133,12 +133,7 @@ class Sample:
     @cached_property
     def first_points(self) -> tuple[Points, float] | None:
         """The first scan that can be read, and its stamp."""
-        for scan in self.log.scans[:10]:
-            try:
-                return scan.read(), scan.stamp
-            except DataError:
-                continue
-        return None
+        return first_readable(self.log.scans)
 
     def deskewed(self, seen: Stretch) -> tuple[Array, Surfaces]:
         """A stretch with the times that its points were given, see `Stretch.deskewed`: computed once."""
@@ -214,6 +209,16 @@ class Sample:
         if stamps[0] < track.start - EXTRAPOLATE_S or stamps[1] > track.end + EXTRAPOLATE_S:
             return -1.0
         return _way(*track.at(stamps, EXTRAPOLATE_S))
+
+
+def first_readable(scans: tuple[Scan, ...]) -> tuple[Points, float] | None:
+    """The points and the stamp of the first of ten scans that can be read; None if there is none."""
+    for scan in scans[:10]:
+        try:
+            return scan.read(), scan.stamp
+        except DataError:
+            continue
+    return None
 
 
 def _way(a: Array, b: Array) -> float:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from gnss_sem_map.errors import DataError, PointTimesError
 from gnss_sem_map.evaluation.preflight import extrinsics, point_times, sweep_stamps
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
-from gnss_sem_map.evaluation.preflight.sample import Sample
+from gnss_sem_map.evaluation.preflight.sample import Sample, first_readable
 
-SCANS = "scans"
+SCANS, INTENSITY = "scans", "intensity"
+STEP = 1 / 255
+"""Of intensities in the map."""
 
 
 def check(sample: Sample) -> Iterator[Finding]:
@@ -19,6 +23,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     if not sample.log.scans:
         return
     yield from _scans(sample)
+    yield _intensity(sample)
     yield from point_times.check(sample)
     yield from extrinsics.check(sample)
 
@@ -44,6 +49,33 @@ def _scans(sample: Sample) -> Iterator[Finding]:
         )
     else:
         yield green(SCANS, found)
+
+
+def _intensity(sample: Sample) -> Finding:
+    """Whether intensities are from 0 to 1: nothing else tells their scale."""
+    found = []
+    for log in sample.log.by_lidar:
+        first = sample.first_points if log.scans is sample.log.scans else first_readable(log.scans)
+        values = np.zeros(0) if first is None else first[0].intensity
+        values = values[np.isfinite(values) & (values > 0)]
+        if len(values):
+            found.append((float(np.median(values)), float(values.max()), log.lidar))
+    if not found:
+        return green(INTENSITY, "not observable: no point has one")
+    wrong = [one for one in found if not STEP / 2 < one[0] <= 1]
+    middle, largest, name = (wrong or found)[0]
+    evidence = (
+        f"{f'of {name} ' if name else ''}half of those above 0 are above {middle:.3g}, up to {largest:.3g};"
+        " expected 0 to 1"
+    )
+    if not wrong:
+        return green(INTENSITY, evidence)
+    return amber(
+        INTENSITY,
+        evidence,
+        "intensities have another scale: in the map most are all the same",
+        "set intensity_max of this LiDAR in rig.yaml or log.yaml: what its driver writes for 1, most often 255",
+    )
 
 
 def _why_unreadable(error: DataError) -> tuple[str, str]:

@@ -51,6 +51,23 @@ def test_a_table_log_gives_the_same_points(small_drive: Street, tmp_path: Path) 
     )
 
 
+def test_intensities_of_a_table_log_have_the_scale_that_it_says(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    before = open_drive(drive).scans[0].read()
+    for path in (drive / "lidar").glob("*.bin"):
+        rows = np.fromfile(path, "<f4").reshape(-1, 5)
+        rows[:, 3] *= 255
+        rows.tofile(path)
+    about = json.loads((drive / "log.yaml").read_text())
+    (drive / "log.yaml").write_text(json.dumps(about | {"intensity_max": 255}))
+    after = open_drive(drive).scans[0].read()
+    np.testing.assert_allclose(after.intensity, before.intensity, rtol=1e-6)
+    np.testing.assert_array_equal(after.xyz, before.xyz)
+    (drive / "log.yaml").write_text("intensity_max: -1\n")
+    with pytest.raises(DataError, match=r"log\.yaml: intensity_max: Input should be greater than 0"):
+        open_drive(drive)
+
+
 def test_an_odometry_sequence_gives_the_same_points_in_its_first_lidar_frame(
     small_drive: Street, tmp_path: Path
 ) -> None:

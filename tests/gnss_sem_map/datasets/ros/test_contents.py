@@ -16,6 +16,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.contents import Topic, contents_of, suggested_rig
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.structured import parse_yaml
 
 
 def topics_of(bag: Path) -> dict[str, Topic]:
@@ -74,6 +75,35 @@ def test_the_suggested_rig_has_all_that_may_be_a_sensor(tmp_path: Path) -> None:
     (path / "rig.yaml").write_text(text.replace("  rear:\n    topic: /rear/points\n", ""))
     alone = open_drive(path)
     assert (len(alone.scans), alone.others) == (10, ())
+
+
+def cameras_of(bag: Path) -> dict[str, str]:
+    text = suggested_rig(Bag(bag), contents_of(Bag(bag)))
+    return {name: about["topic"] for name, about in parse_yaml(text)["cameras"].items()}
+
+
+def test_an_image_that_is_recorded_raw_and_compressed_is_one_camera(tmp_path: Path) -> None:
+    rig = ros.with_camera()
+    for name, encoding in (("left", "rgb8"), ("right", "bayer_rggb8")):
+        pixels = np.zeros((4, 6, 3) if encoding == "rgb8" else (4, 6), np.uint8)
+        rig.image(START_NS, pixels, encoding, topic=f"/{name}/image_raw")
+        rig.compressed(START_NS, b"", f"/{name}/image_raw/compressed")
+    assert cameras_of(ros.write(tmp_path / "drive", rig)) == {
+        "left": "/left/image_raw",
+        "right": "/right/image_raw/compressed",  # the encoding of the raw one is not read
+    }
+
+
+def test_every_sensor_has_a_name_of_its_own(tmp_path: Path) -> None:
+    rig = ros.with_camera()
+    for topic in ("/cam/image_raw", "/cam/image_rect", "/cam/image_rect_color", "/cam_2/image_raw"):
+        rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8", topic=topic)
+    assert cameras_of(ros.write(tmp_path / "drive", rig)) == {
+        "cam": "/cam/image_raw",
+        "cam_2": "/cam/image_rect",
+        "cam_3": "/cam/image_rect_color",
+        "cam_2_2": "/cam_2/image_raw",
+    }
 
 
 def test_the_command_writes_a_rig_once(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import ros
 from ros import START_NS, rig_yaml, sweep
 
 from gnss_sem_map.datasets import detect_format, open_drive
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import SensorLog
 
 TIMES = np.linspace(-0.05, 0.05, 64)
@@ -111,6 +112,24 @@ def test_the_times_of_points_of_every_driver(tmp_path: Path, name: str, kind: st
     assert points.stamps is not None
     start = 0.05 if kind == "<u4" else 0.0
     np.testing.assert_allclose(points.stamps - scan.stamp, TIMES + start, atol=5e-7)
+
+
+@pytest.mark.parametrize("kind", ["<f4", "u1", "<u2"])
+def test_intensities_have_the_scale_that_the_rig_says(tmp_path: Path, kind: str) -> None:
+    fields = [(name, "<f4") for name in "xyz"]
+    table = np.ones(5, [*fields, ("intensity", kind), ("time", "<f4")])
+    table["intensity"], table["time"] = [0, 1, 17, 100, 200], 0.0
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/points"]
+    rig.cloud(START_NS, table)
+    bag = ros.write(tmp_path / "drive", rig)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/points", "intensity_max": 200}})
+    points = open_drive(bag).scans[0].read()
+    np.testing.assert_allclose(points.intensity, np.array([0, 1, 17, 100, 200]) / 200, rtol=1e-6)
+    np.testing.assert_array_equal(points.rows.reshape(-1, 4)[:, 3], points.intensity)
+    rig_yaml(bag, lidars={"lidar": {"topic": "/points", "intensity_max": 0}})
+    with pytest.raises(DataError, match=r"lidars\.lidar\.intensity_max: Input should be greater than 0"):
+        open_drive(bag)
 
 
 def test_a_cloud_with_gaps_between_its_fields(tmp_path: Path) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ import ros
 from ros import START_NS, rig_yaml, sweep, with_camera
 
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.errors import DataError, PointTimesError
 
 TIMES = np.linspace(-0.05, 0.05, 64)
@@ -30,6 +33,20 @@ def damaged(bag: Path, change: Callable[[bytearray], bytes | bytearray]) -> None
     file.write_bytes(change(bytearray(file.read_bytes())))
 
 
+def chunk_index(content: bytearray, at: int) -> int:
+    """Where the first record of a chunk is in the summary of an MCAP file."""
+    while content[at] != 0x08:
+        at += 9 + int(struct.unpack_from("<Q", content, at + 1)[0])
+    return at
+
+
+def read_all(file: Path) -> None:
+    bag = Bag(file)
+    for topic in bag.kinds:
+        for _ in bag.each(bag.messages(topic)):
+            pass
+
+
 @pytest.mark.parametrize("storage", ["mcap", "db3", "bag"])
 def test_a_truncated_bag_is_refused_with_its_repair(tmp_path: Path, storage: str) -> None:
     name = "drive.bag" if storage == "bag" else "drive"
@@ -37,6 +54,26 @@ def test_a_truncated_bag_is_refused_with_its_repair(tmp_path: Path, storage: str
     damaged(bag, lambda content: content[: len(content) // 3])
     with pytest.raises(DataError, match=r"truncated.*(mcap recover|rosbag reindex|sqlite3)"):
         open_drive(bag).scans[-1].read()
+
+
+def test_messages_that_are_in_a_log_beside_the_bag_are_not_lost(tmp_path: Path) -> None:
+    recorded = next(ros.write(tmp_path / "recorded", ros.drive(), "db3").glob("*.db3"))
+    file, log = tmp_path / "killed.db3", tmp_path / "killed.db3-wal"
+    with closing(sqlite3.connect(recorded)) as recorder:
+        recorder.execute("PRAGMA journal_mode=WAL")
+        recorder.execute("INSERT INTO messages (topic_id, timestamp, data) SELECT 1, 0, zeroblob(9)")
+        recorder.commit()
+        shutil.copy(recorded, file)  # as after a recorder that was killed: one that ends empties the log
+        shutil.copy(recorded.with_name(f"{recorded.name}-wal"), log)
+    with pytest.raises(DataError, match=r'killed.db3-wal: .*sqlite3 killed.db3 "PRAGMA wal_checkpoint'):
+        open_drive(file)
+    (tmp_path / "link.db3").symlink_to(file)
+    with pytest.raises(DataError, match=r"killed\.db3-wal"):
+        open_drive(tmp_path / "link.db3")
+    with closing(sqlite3.connect(file)) as database:
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        log.touch()  # an empty one holds nothing
+        assert len(Bag(file).messages("/imu")) + len(Bag(file).messages("/fix")) == 207
 
 
 def test_an_unindexed_ros1_bag_is_refused(tmp_path: Path) -> None:
@@ -57,6 +94,29 @@ def test_an_mcap_that_was_not_closed_is_refused(plain: Path, tmp_path: Path) -> 
     (tmp_path / "open.mcap").write_bytes(content[:-40])
     with pytest.raises(DataError, match=r"not closed.*mcap recover open.mcap"):
         open_drive(tmp_path / "open.mcap")
+
+
+@pytest.mark.parametrize(
+    ("record", "at", "number"),
+    [
+        pytest.param(0x08, 9 + 16, 2**64 - 1, id="a place that 64 bits with a sign do not hold"),
+        pytest.param(0x08, 1, 2**62, id="a record that no memory holds"),
+        pytest.param(0x07, 9 + 6 + 8, 2**63 - 1, id="a message beyond the largest place of a file"),
+    ],
+)
+def test_a_wild_number_in_an_mcap_is_refused(
+    plain: Path, tmp_path: Path, record: int, at: int, number: int
+) -> None:
+    content = bytearray(next(plain.glob("*.mcap")).read_bytes())
+    [summary] = struct.unpack_from("<Q", content, len(content) - 37 + 9)
+    start = chunk_index(content, summary)
+    if record == 0x07:  # the index of messages is behind its chunk
+        start = sum(struct.unpack_from("<QQ", content, start + 9 + 16))
+    assert content[start] == record
+    struct.pack_into("<Q", content, start + at, number)
+    (tmp_path / "wild.mcap").write_bytes(content)
+    with pytest.raises(DataError, match=r"wild\.mcap: .*damaged.*mcap recover"):
+        read_all(tmp_path / "wild.mcap")
 
 
 @pytest.mark.integration

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +125,19 @@ def test_a_lever_arm_in_mm_is_named(town: SensorLog) -> None:
 )
 def test_wrong_point_times_are_named(town: SensorLog, change: Callable[[Array], Array], says: str) -> None:
     assert says in mistakes(with_times(town, change))
+
+
+@pytest.mark.parametrize("scale", [255.0, 1 / 65535])
+def test_intensities_of_another_scale_are_named(town: SensorLog, scale: float) -> None:
+    def changed(k: int) -> Points:
+        points = town.scans[k].read()
+        assert points.intensity.any()
+        return replace(points, intensity=points.intensity * np.float32(scale))
+
+    scans = tuple(replace(scan, read=partial(changed, k)) for k, scan in enumerate(town.scans))
+    [found] = not_green(replace(town, scans=scans))
+    assert (found.check, found.level) == ("intensity", Level.AMBER)
+    assert "set intensity_max" in found.remedy
 
 
 @pytest.mark.parametrize("name", ["start", "end", "stamp"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,16 @@ def test_removal_is_scored_on_moving_vehicles_and_everything_static() -> None:
     assert (found["DA"], found["SA"], found["SA_vehicle"]) == (3 / 4, 4 / 5, 1 / 2)
     assert found["AA"] == pytest.approx((3 / 4 * 4 / 5) ** 0.5)
     assert dynamic(np.zeros((3, 2), np.int64))["AA"] is None
+
+
+def test_a_class_set_without_vehicles_has_no_moving_ones() -> None:
+    names = tuple(name for name in URBAN.names if name != "vehicle")
+    kept = {source: name for source, name in URBAN.sources["semantic_kitti"].items() if name in names}
+    still = replace(
+        URBAN, names=names, semantic_kitti_ids=ids(40, 48, 50, 70), sources={"semantic_kitti": kept}
+    )
+    found = dynamic(dynamic_counts(ids(1, 1, 0), ids(252, 10, 40), Tables.of(still), "here"))
+    assert (found["DA"], found["SA"], found["SA_vehicle"], found["moving_points"]) == (None, 1 / 2, None, 0)
 
 
 def test_a_calibrated_confidence_has_no_calibration_error_and_a_boast_has_its_size() -> None:

@@ -281,12 +281,12 @@ class Run:
             amend_all(self.folder, Path(folder))
         return self.folder / format_.file
 
-    def drive(self) -> SensorLog:
-        """The log of the run's drive; raises DataError if it was moved or removed."""
+    def drive(self, place: Path | None = None) -> SensorLog:
+        """The log of the run's drive, which is at `place` if it was moved; raises DataError if it is not there."""
         inputs = inputs_of(self.folder)
-        if "drive" not in inputs:
+        if place is None and "drive" not in inputs:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
-        log = open_drive(Path(inputs["drive"])).between(inputs.get("frames"))
+        log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
     def _refuse_merged(self, what: str) -> None:

@@ -197,7 +197,8 @@ def _source_of(name: str, folder: Path) -> Source:
     """What a drive of a finished map was made from."""
     inputs = inputs_of(folder)
     drive = str(inputs.get("drive", folder / name))
-    return Source(drive, inputs.get("segmenter"), inputs.get("frames"), called=name)
+    segmenter, frames, drive_format = (inputs.get(key) for key in ("segmenter", "frames", "drive_format"))
+    return Source(drive, segmenter, frames, drive_format, called=name)
 
 
 def _correction_of(folder: Path) -> str:

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _UPPER = np.triu_indices(6)
 _COVARIANCE_COLUMNS = [f"cov_{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
+AROUND_S = 0.1
 MOST_BYTES, MOST_ROWS, MOST_COLUMNS = 1 << 30, 5_000_000, 100
 _METADATA = {
     "frame": "pose of the imu frame (x forward, y left, z up) in the map frame (east, north, up)",
@@ -107,6 +108,11 @@ class Trajectory:
     def position_stddevs(self) -> Array:
         """Standard deviations of the positions along east, north, up, (k, 3) m."""
         return np.sqrt(np.diagonal(self.position_covariances, axis1=1, axis2=2))
+
+    def during(self, first: float, last: float) -> "Trajectory":
+        """The poses from `first` to `last` s, and those within 0.1 s around; all of them where there are none."""
+        inside = (self.stamps >= first - AROUND_S) & (self.stamps <= last + AROUND_S)
+        return self[inside] if inside.any() else self
 
     def moved(self, T: Array) -> "Trajectory":
         """The same trajectory in another map frame, T = T_other_map (4, 4); covariances are in imu axes and stay."""

@@ -68,9 +68,9 @@ def calibrate(
     segmenter: Segmenter = None,
 ) -> None:
     """Measure the confusion model of the network; use it with --set calibration=FILE."""
-    from gnss_sem_map.evaluation.fit_sensor_model import calibrate as measure
     from gnss_sem_map.files.atomic import replacing
     from gnss_sem_map.labels.sensor_model import check_replaceable
+    from gnss_sem_map.runs.calibrating import calibrate as measure
 
     if len(truth) != len(run_folders):
         raise typer.BadParameter(f"found {len(truth)} for {len(run_folders)} runs", param_hint="--truth")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_merged, print_run, progress_bars
+from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars
 from gnss_sem_map.cli.options import Crs, Device, Geoid, Json, Set, delivered_in
 
 Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
@@ -30,10 +30,13 @@ def refine(
 
     finished = Run.open(run)
     again = finished.refine(delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid), out)
-    if again.is_merged and not as_json:
-        print_merged(again.about, again.folder)
+    about = again.about
+    if "drives" in about:
+        print_many(about, again.folder, as_json)
+    elif again.is_merged and not as_json:
+        print_merged(about, again.folder)
     else:
-        print_run(again.about, again.folder, as_json, ("refinement", "export"))
+        print_run(about, again.folder, as_json, ("refinement", "export"))
 
 
 def relabel(

@@ -111,6 +111,10 @@ def run(
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
+    is_of_many = len(found) > 1 or align_to is not None
+    if is_of_many and segmenter is None:
+        typer.echo(no_segmenter_message(str(found[0])), err=True)
+        raise typer.Exit(1)
     if dry_run:
         sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
         with claimed_run(
@@ -118,15 +122,12 @@ def run(
         ):
             print_plan(sources, settings, workers or default_workers())
         return
-    if len(found) > 1 or align_to is not None:
-        if segmenter is None:
-            typer.echo(no_segmenter_message(str(found[0])), err=True)
-            raise typer.Exit(1)
+    if is_of_many:
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)
         _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, align_to, as_json)
         return
     [drive] = found
-    with claimed_run(out, places_read(drive, settings, segmenter, config)):
+    with claimed_run(out, places_read(drive, settings, segmenter, config), is_resumable=True):
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.images:
             typer.echo(no_segmenter_message(str(drive)), err=True)

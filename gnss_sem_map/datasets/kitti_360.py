@@ -33,7 +33,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import MOST_YAML_BYTES, parse_yaml
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Scan, SensorLog, Skip
-from gnss_sem_map.sensor_log.cameras import Camera, Distortion, is_rigid, lidar_to_camera
+from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
 
 Array = NDArray[np.float64]
 
@@ -192,11 +192,8 @@ def _calibration(folder: Path, names: list[str]) -> Calibration:
 
 def _rigid(row: Array, where: str) -> Array:
     """A (4, 4) transform from twelve numbers, row by row."""
-    T = np.vstack([row.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-    if not is_rigid(T):
-        fault = kitti_calibration.rotation_fault(T[:3, :3])
-        raise DataError(f"{where}: {fault}, expected a rotation to 1e-3 in a rigid transform; check the file")
-    return kitti_calibration.exact(T)
+    T = row.reshape(3, 4)
+    return kitti_calibration.exact(kitti_calibration.transform(T[:, :3], T[:, 3], where))
 
 
 def _rectified(file: Path, number: str) -> tuple[Array, Array, tuple[int, int]]:

@@ -117,7 +117,9 @@ def dynamic_counts(
         )
     ids = truth & 0xFFFF
     moving = np.isin(ids, list(MOVING_IDS))
-    vehicle = tables.truth[ids] == tables.label_set.index("vehicle")
+    names = tables.label_set.names
+    # a class set without vehicles: none is counted as one
+    vehicle = tables.truth[ids] == (names.index("vehicle") if "vehicle" in names else len(names))
     row = np.where(moving, 0, np.where(vehicle, 1, 2))
     counted = np.where(moving, vehicle, ids > 1)  # 0 unlabelled, 1 outlier
     cells = 2 * row[counted] + (removed[counted] != 0)

@@ -46,7 +46,7 @@ def score_run(
     """
     _check_scorable(out)
     label_set = label_set or open_label_set(config.load(out / "config.yaml").classes)
-    metrics = _known_metrics(out) | _score_points(out, truth, label_set, restrict_to)
+    metrics = read_json(out / "metrics.json") | _score_points(out, truth, label_set, restrict_to)
     path = truth / "trajectory_lidar.tum"
     if is_file(path):
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
@@ -77,11 +77,6 @@ def _check_scorable(out: Path) -> None:
         )
 
 
-def _known_metrics(out: Path) -> dict[str, Any]:
-    """Metrics of the run itself, without truth."""
-    return read_json(out / "metrics.json")
-
-
 def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
     tables = metrics.Tables.of(label_set)
     count = len(label_set.names)
@@ -92,7 +87,6 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
         where = f"{out / 'labels' / name}.label"
         predicted = read_labels(out / "labels" / f"{name}.label")
         before = read_labels(out / "labels_raw" / f"{name}.label")
-        moved += metrics.dynamic_counts(read_labels(out / "removed" / f"{name}.label"), true, tables, where)
         if restrict_to is not None:
             chosen = read_labels(restrict_to / f"{name}.label")
             if len(chosen) != len(true):
@@ -100,6 +94,7 @@ def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path
                     f"{shown(restrict_to / name)}.label: found {len(chosen)} labels for {len(true)} points"
                 )
             true = np.where(chosen & 0xFFFF != 0, true, 0).astype(np.uint32)
+        moved += metrics.dynamic_counts(read_labels(out / "removed" / f"{name}.label"), true, tables, where)
         refined += metrics.confusion(predicted, true, tables, where)
         raw += metrics.confusion(before, true, tables, where)
         confidence = read_confidence(out / "confidence" / f"{name}.bin")

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.evaluation.changes import ChangedObject
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.longitudes import DEGREE_DIGITS, HEIGHT_DIGITS, near
 from gnss_sem_map.export.point_cloud import colours, las_header
 from gnss_sem_map.files.atomic import link_or_copy, replacing
 from gnss_sem_map.labels.label_set import LabelSet
 
-DEGREE_DIGITS = 9
 CHANGES = "changes"
 GEOJSON, LAZ = f"{CHANGES}.geojson", f"{CHANGES}.laz"
 APPEARED, VANISHED = 1, 2
@@ -110,13 +110,14 @@ def _feature(change: Change, frame: LocalFrame, label_set: LabelSet) -> dict[str
     thing = change.thing
     closed = box_corners(thing.centre, thing.size, thing.yaw)[[0, 1, 2, 3, 0]]
     lat_deg, lon_deg, alt_m = frame.to_geodetic(closed)
-    ring = np.column_stack([lon_deg, lat_deg]).round(DEGREE_DIGITS).tolist()
+    # a box across the 180 degree meridian is not cut: a few metres of it lie beyond 180
+    ring = np.column_stack([near(lon_deg, lon_deg[0]), lat_deg]).round(DEGREE_DIGITS).tolist()
     return {
         "type": "Feature",
         "geometry": {
             "type": "Polygon",
             "coordinates": [
-                [[*place, alt] for place, alt in zip(ring, alt_m.round(3).tolist(), strict=True)]
+                [[*place, alt] for place, alt in zip(ring, alt_m.round(HEIGHT_DIGITS).tolist(), strict=True)]
             ],
         },
         "properties": change.about(label_set),

@@ -26,7 +26,7 @@ from gnss_sem_map.export.point_cloud import LAZ_SCALE_M, las_header, las_points
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.voxels.attributes import Attributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET, Tile
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_OFFSET, Tile, morton_codes
 
 if TYPE_CHECKING:
     import copclib
@@ -238,19 +238,12 @@ def _largest_cubes(piece: SemanticMap) -> NDArray[np.int64]:
     """(v,) log2 of the edge, in voxels, of the largest cube of the Morton order in which a voxel comes first."""
     x, y, z = np.add(piece.voxels.indices.astype(np.int64), [0, 0, Z_OFFSET]).T
     mask = (1 << TILE_BITS) - 1
-    codes = _spread(x & mask) | _spread(y & mask) << 1 | _spread(z) << 2
+    codes = morton_codes(x & mask, y & mask, z)
     order = np.argsort(codes, kind="stable")
     differ = codes[order[1:]] ^ codes[order[:-1]]
     cubes = np.full(len(codes), TILE_BITS, np.int64)
     cubes[order[1:]] = np.minimum((np.frexp(differ.astype(np.float64))[1] - 1) // 3, TILE_BITS)
     return cubes
-
-
-def _spread(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers of up to 16 bits with two zeros between their bits: halves move apart, then quarters and so on."""
-    for step, kept in ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249)):
-        numbers = (numbers | numbers << step) & kept
-    return numbers
 
 
 def _config(octree: _Octree, georeference: Georeference, header: laspy.LasHeader) -> copclib.CopcConfigWriter:

@@ -19,11 +19,12 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.longitudes import DEGREE_DIGITS, box_around, line_through
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.files.untrusted import is_file, shown
 
 PARQUET, GEOJSON = "objects.parquet", "objects.geojson"
-DEGREE_DIGITS, DIGITS = 9, 3
+DIGITS = 3
 WGS84_3D_EPSG = 4979
 TRACK = {
     "stamp_s": pa.float64(),
@@ -68,8 +69,8 @@ class DriveOfMovers:
 def write_movers(movers: Sequence[Mover], drive: DriveOfMovers, folder: Path) -> None:
     """Write `objects.parquet` (GeoParquet 1.1) and, where the map is georeferenced, `objects.geojson` (RFC 7946).
 
-    Geometry is the track, WGS 84 with heights above the ellipsoid; without a georeference it is in the frame of the
-    map, and the CRS is null. Raises DataError when a file cannot be written.
+    Geometry is the track, WGS 84 with heights above the ellipsoid, cut at the 180 degree meridian; without a
+    georeference it is in the frame of the map, and the CRS is null. Raises DataError when a file cannot be written.
     """
     rows = [_row(number, mover, drive) for number, mover in enumerate(movers, 1)]
     _write(pa.Table.from_pylist(rows, pa.schema(COLUMNS)), drive.frame is not None, folder)
@@ -132,8 +133,8 @@ def _places(mover: Mover, frame: LocalFrame | None) -> dict[str, Any]:
     if frame is None:
         return {"geometry": shapely.to_wkb(shapely.LineString(mover.positions.round(DIGITS)), byte_order=1)}
     lat_deg, lon_deg, alt_m = frame.to_geodetic(mover.positions)
+    line = line_through(lon_deg, lat_deg, alt_m)
     lat_deg, lon_deg, alt_m = lat_deg.round(DEGREE_DIGITS), lon_deg.round(DEGREE_DIGITS), alt_m.round(DIGITS)
-    line = shapely.LineString(np.column_stack([lon_deg, lat_deg, alt_m]))
     places: dict[str, Any] = {"geometry": shapely.to_wkb(line, byte_order=1), "utm_epsg": frame.utm_epsg}
     utm = Georeference(frame).from_map(mover.positions[[0, -1]]).round(DIGITS)
     for end, row, at in (("start", 0, utm[0]), ("end", -1, utm[1])):
@@ -146,11 +147,13 @@ def _places(mover: Mover, frame: LocalFrame | None) -> dict[str, Any]:
 
 def _write(table: pa.Table, is_georeferenced: bool, folder: Path) -> None:
     shapes = shapely.from_wkb(table["geometry"].to_pylist())
-    about: dict[str, Any] = {"encoding": "WKB", "geometry_types": ["LineString Z"] if len(table) else []}
+    types = sorted({f"{shape.geom_type} Z" for shape in shapes})
+    about: dict[str, Any] = {"encoding": "WKB", "geometry_types": types}
     about["crs"] = CRS.from_epsg(WGS84_3D_EPSG).to_json_dict() if is_georeferenced else None
     if len(table):
         at = shapely.get_coordinates(shapes, include_z=True)
-        about["bbox"] = [*at.min(axis=0).tolist(), *at.max(axis=0).tolist()]
+        flat = [*at.min(axis=0).tolist(), *at.max(axis=0).tolist()]
+        about["bbox"] = box_around(at) if is_georeferenced else flat
     geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": about}}
     with replacing(folder / PARQUET) as file:
         pq.write_table(table.replace_schema_metadata({"geo": json.dumps(geo)}), file, compression="zstd")
@@ -161,14 +164,12 @@ def _write(table: pa.Table, is_georeferenced: bool, folder: Path) -> None:
             file.write(json.dumps({"type": "FeatureCollection", "features": features}).encode())
 
 
-def _feature(row: Mapping[str, Any], line: shapely.LineString) -> dict[str, Any]:
+def _feature(row: Mapping[str, Any], line: shapely.Geometry) -> dict[str, Any]:
     """A row as GeoJSON has it: the track as a line, its times and speeds as lists beside it."""
     track = row["track"]
     properties = {name: _plain(value) for name, value in row.items() if name != "track"}
     properties |= {f"track_{name}": [_plain(place[name]) for place in track] for name in TRACK}
-    coordinates = shapely.get_coordinates(line, include_z=True).tolist()
-    geometry = {"type": "LineString", "coordinates": coordinates}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+    return {"type": "Feature", "geometry": line.__geo_interface__, "properties": properties}
 
 
 def _plain(value: Any) -> Any:

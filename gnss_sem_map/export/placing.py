@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.export.longitudes import near
 
 ORDER = 3
 """Of the map plane: 10 km from the centre of a map, what it leaves out is below 1 mm. Heights enter linearly."""
@@ -20,7 +21,8 @@ def fitted_placing(georeference: Georeference, low: ArrayLike, high: ArrayLike) 
     """Easting, northing, height (m), latitude and longitude (degrees) in the box between two corners (3,) m of the map.
 
     `coefficients` has a row for each of the five: the value is the sum of its numbers times x^i y^j z^k, with i, j, k
-    from `powers` and x, y, z from `centre` in units of `half`. None where the geoid does not cover the box.
+    from `powers` and x, y, z from `centre` in units of `half`. Longitudes go on beyond 180 degrees. None where the
+    geoid does not cover the box.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     centre, half = (low + high) / 2, np.maximum((high - low) / 2, 1.0)
@@ -28,6 +30,7 @@ def fitted_placing(georeference: Georeference, low: ArrayLike, high: ArrayLike) 
     unit = np.stack(np.meshgrid(steps, steps, [-1.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 3)
     p_map = centre + unit * half
     lat_deg, lon_deg, _ = georeference.frame.to_geodetic(p_map)
+    lon_deg = near(lon_deg, georeference.frame.lon_deg)
     places = np.column_stack([georeference.from_map(p_map), lat_deg, lon_deg])
     if not np.isfinite(places).all():
         return None

@@ -62,6 +62,8 @@ ENOUGH_POINTS = 200
 """Of a bin of a reliability curve: the share of fewer is chance."""
 MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
+FIRST_DATE_S = datetime(1980, 1, 1, tzinfo=UTC).timestamp()
+"""Stamps before are no Unix time, but seconds since some moment: no drive with GNSS is as old."""
 TITLES = {"accuracy": "accuracy", "iou": "IoU"}
 MAPS = {"map": "before refinement", "refined": "after refinement"}
 
@@ -133,8 +135,8 @@ def _tracks(folder: Path, run: Mapping[str, Any]) -> dict[str, Track]:
 
 def _facts(run: Mapping[str, Any]) -> list[str]:
     facts = []
-    if run.get("epoch_ns") is not None:
-        facts.append(f"{datetime.fromtimestamp(run['epoch_ns'] / 1e9, UTC):%d %B %Y, %H:%M:%S} UTC")
+    if (began := _beginning(run)) is not None:
+        facts.append(f"{began:%d %B %Y, %H:%M:%S} UTC")
     origin = run.get("local_frame")
     if origin:
         facts.append(
@@ -145,6 +147,13 @@ def _facts(run: Mapping[str, Any]) -> list[str]:
     if delivery := run.get("delivery"):
         facts.append(f"files in {delivery['crs']} (EPSG:{delivery['epsg']}), heights {delivery['heights']}")
     return facts
+
+
+def _beginning(run: Mapping[str, Any]) -> datetime | None:
+    """The time of the first scan; None where the stamps of the drive are no dates."""
+    first_s, _ = run.get("scans_s") or (0.0, 0.0)
+    unix_s = (run.get("epoch_ns") or 0) / 1e9 + first_s
+    return datetime.fromtimestamp(unix_s, UTC) if unix_s >= FIRST_DATE_S else None
 
 
 def _picture(path: Path) -> str:

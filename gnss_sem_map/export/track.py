@@ -36,8 +36,7 @@ def read_track(path: Path, scans_s: tuple[float, float] | None = None) -> Track:
     """Read a `trajectory.parquet`, the part with scans if it is known; raises MeasurementError."""
     trajectory = Trajectory.load(path)
     if scans_s is not None:
-        inside = (trajectory.stamps >= scans_s[0] - 0.1) & (trajectory.stamps <= scans_s[1] + 0.1)
-        trajectory = trajectory[inside] if inside.any() else trajectory
+        trajectory = trajectory.during(*scans_s)
     steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
     kept = trajectory[np.unique(np.linspace(0, len(trajectory) - 1, MOST_POSES).astype(np.intp))]
     horizontal = vertical = None

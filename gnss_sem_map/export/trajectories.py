@@ -12,9 +12,9 @@ from pyproj import CRS
 from factor_graphs import tum
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.longitudes import box_around, line_through
 from gnss_sem_map.files.atomic import replacing
 
-DEGREE_DIGITS = 9  # 0.1 mm of latitude
 WGS84_3D_EPSG = 4979
 
 
@@ -45,19 +45,13 @@ def write_kitti(trajectory: Trajectory, path: Path | str) -> None:
 def write_geojson(trajectory: Trajectory, frame: LocalFrame, path: Path | str) -> None:
     """Write the track as a GeoJSON feature (RFC 7946): lon, lat, height above the ellipsoid, and the stamps.
 
-    A trajectory of one pose becomes a point, as a line needs two. Raises DataError when the file cannot be
-    written.
+    A trajectory of one pose becomes a point. The ends where a line is cut at the 180 degree
+    meridian are no poses, and have no stamps. Raises DataError when the file cannot be written.
     """
     lat_deg, lon_deg, alt_m = frame.to_geodetic(trajectory.positions)
-    degrees = np.column_stack([lon_deg, lat_deg]).round(DEGREE_DIGITS).tolist()
-    coordinates = [[*lon_lat, alt] for lon_lat, alt in zip(degrees, alt_m.round(3).tolist(), strict=True)]
-    if len(coordinates) > 1:
-        geometry = {"type": "LineString", "coordinates": coordinates}
-    else:
-        geometry = {"type": "Point", "coordinates": coordinates[0]}
     feature = {
         "type": "Feature",
-        "geometry": geometry,
+        "geometry": line_through(lon_deg, lat_deg, alt_m).__geo_interface__,
         "properties": {"name": "trajectory", "stamps_s": trajectory.stamps.round(9).tolist()},
     }
     with replacing(path) as file:
@@ -75,7 +69,7 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     import pyarrow.parquet as pq
 
     lat_deg, lon_deg, alt_m = frame.to_geodetic(trajectory.positions)
-    points = shapely.points(np.column_stack([lon_deg, lat_deg, alt_m]))
+    places = np.column_stack([lon_deg, lat_deg, alt_m])
     forward = trajectory.T_map_imu[:, :2, 0]
     columns = {
         "time": pa.array(
@@ -89,7 +83,7 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     if trajectory.covariances is not None:
         names = (f"stddev_{axis}_m" for axis in ("east", "north", "up"))
         columns |= dict(zip(names, trajectory.position_stddevs.T, strict=True))
-    columns["geometry"] = pa.array(shapely.to_wkb(points, byte_order=1).tolist(), pa.binary())
+    columns["geometry"] = pa.array(shapely.to_wkb(shapely.points(places), byte_order=1).tolist(), pa.binary())
     about = {
         "version": "1.1.0",
         "primary_column": "geometry",
@@ -98,7 +92,7 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
                 "encoding": "WKB",
                 "geometry_types": ["Point Z"],
                 "crs": CRS.from_epsg(WGS84_3D_EPSG).to_json_dict(),
-                "bbox": [f(c) for f in (np.min, np.max) for c in (lon_deg, lat_deg, alt_m)],
+                "bbox": box_around(places),
             }
         },
     }

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_BITS, Tile, local_keys
+from gnss_sem_map.voxels.tile_files import TILE_BITS, Z_BITS, Tile, local_keys, morton_codes
 from gnss_sem_map.voxels.tiles import TiledMap
 
 COLUMNS = 1 << TILE_BITS
@@ -81,9 +80,7 @@ def visit_nodes(tiled_map: TiledMap, visit: Callable[[Node], None], most_voxels:
 def _of_tile(corner: Tile, piece: SemanticMap) -> Node:
     keys = local_keys(piece.voxels.keys)
     x, y, z = keys >> (TILE_BITS + Z_BITS), keys >> Z_BITS & (COLUMNS - 1), keys & ((1 << Z_BITS) - 1)
-    order = np.argsort(
-        _spread(x) | _spread(y) << np.uint64(1) | _spread(z) << np.uint64(2)
-    )  # no two are equal
+    order = np.argsort(morton_codes(x, y, z))  # no two are equal
     labels = np.where(piece.labels < 0, len(piece.voxels.label_set.names), piece.labels)
     ranks = piece.shown.astype(np.uint64) << np.uint64(32) | piece.voxels.hits
     return Node(
@@ -96,20 +93,6 @@ def _of_tile(corner: Tile, piece: SemanticMap) -> Node:
         ranks=ranks[order],
         quadrants=(len(piece), 0, 0, 0),
     )
-
-
-def _spread(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """Values below 2^21 with two zero bits before each bit: three of them interleave to a place in Z-order."""
-    spread = values.astype(np.uint64)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
-    return spread
 
 
 def _coarser(node: Node) -> Node:

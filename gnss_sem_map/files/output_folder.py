@@ -25,7 +25,7 @@ from gnss_sem_map.files import ownership, work_folder
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems without locks: there we continue without a lock."""
 FIRST_WORDS = "gnss-sem-map writes"
-RESUMABLE = "the intermediate results are kept: `gnss-sem-map run ... --resume` continues"
+RESUMABLE = "the intermediate results are kept: the same command with --resume continues"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +52,14 @@ def claimed(
     out: Path,
     inputs: Iterable[Path | str | None] = (),
     by_name: Callable[[str], bool] = lambda name: False,
+    is_resumable: bool = False,
 ) -> Iterator[Claim]:
     """Claim an output folder, and check before any work that results can be written there.
 
     What a killed command left in the work folder is put right: the old result is moved back, an unfinished new one is
-    removed. Intermediate results stay until the run is complete. Raises DataError when another command writes there,
-    when what is there is not ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
+    removed. Intermediate results stay until the run is complete; an error says so if the command `is_resumable`: if it
+    has --resume. Raises DataError when another command writes there, when what is there is not ours, when it is, holds
+    or lies in one of the `inputs`, and when it may not be changed.
     """
     real = real_path(out)
     if real in _HELD:
@@ -79,7 +81,7 @@ def claimed(
         try:
             yield claim
         except BaseException as error:
-            if work_folder.holds_work(claim.work):
+            if is_resumable and work_folder.holds_work(claim.work):
                 error.add_note(RESUMABLE)
             raise
         finally:

@@ -21,11 +21,12 @@ def read_run(out: Path) -> dict[str, Any]:
 
 
 def inputs_of(out: Path) -> dict[str, str]:
-    """The drive, the segmenter and the frames that a run was made of, as far as it names them; raises DataError."""
+    """What a run was made of, see `Source.inputs`, as far as its run.json names it; raises DataError."""
     inputs = read_run(out).get("inputs", {})
     if not isinstance(inputs, dict):
         raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: found {type(inputs).__name__})")
-    found = {name: inputs[name] for name in ("drive", "segmenter", "frames") if inputs.get(name) is not None}
+    names = ("drive", "segmenter", "frames", "drive_format")
+    found = {name: inputs[name] for name in names if inputs.get(name) is not None}
     wrong = [name for name, value in found.items() if not isinstance(value, str) or not value]
     if wrong:
         raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: {wrong[0]} is no text)")

@@ -82,7 +82,8 @@ def run(
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
     source = source_of(drive, segmenter, frames, drive_format, device)
-    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, source.segmenter)) as claim:
+    places = run_folder.places_read(drive, settings, source.segmenter)
+    with run_folder.claimed_run(out, places, is_resumable=True) as claim:
         log = log or source.open_log()
         run_folder.georeference_of(settings, origin or log.frame)
         refuse_inputs(claim.out, sorted(log.folders))
@@ -280,12 +281,12 @@ class Run:
             amend_all(self.folder, Path(folder))
         return self.folder / format_.file
 
-    def drive(self) -> SensorLog:
-        """The log of the run's drive; raises DataError if it was moved or removed."""
+    def drive(self, place: Path | None = None) -> SensorLog:
+        """The log of the run's drive, which is at `place` if it was moved; raises DataError if it is not there."""
         inputs = inputs_of(self.folder)
-        if "drive" not in inputs:
+        if place is None and "drive" not in inputs:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
-        log = open_drive(Path(inputs["drive"])).between(inputs.get("frames"))
+        log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
     def _refuse_merged(self, what: str) -> None:

@@ -100,7 +100,7 @@ def run_drives(
     drives = [_absolute(drive) for drive in drives]
     _check_distinct([(drive.name, drive) for drive in drives])
     with (
-        run_folder.claimed_run(out, [*drives, align_to]) as claim,
+        run_folder.claimed_run(out, [*drives, align_to], is_resumable=True) as claim,
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
@@ -134,7 +134,7 @@ def add_drive(
     drive = _absolute(drive)
     known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
     _check_distinct([*known, (drive.name, drive)])
-    with run_folder.claimed_run(out, [drive]) as claim:
+    with run_folder.claimed_run(out, [drive], is_resumable=True) as claim:
         about = _changed(out, there, [how.source(drive)], settings, frame, how, claim, progress)
     return ManyDrives(out, about)
 
@@ -148,7 +148,10 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
     if not stay:
         raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
     with run_folder.claimed_run(out) as claim:
-        about = _changed(out, stay, [], settings, frame, HowMapped(force=True), claim, progress)
+        try:
+            about = _changed(out, stay, [], settings, frame, HowMapped(force=True), claim, progress)
+        finally:
+            work_folder.remove_drives(claim.work)  # nothing resumes a removal
     return ManyDrives(out, about)
 
 
@@ -194,7 +197,8 @@ def _source_of(name: str, folder: Path) -> Source:
     """What a drive of a finished map was made from."""
     inputs = inputs_of(folder)
     drive = str(inputs.get("drive", folder / name))
-    return Source(drive, inputs.get("segmenter"), inputs.get("frames"), called=name)
+    segmenter, frames, drive_format = (inputs.get(key) for key in ("segmenter", "frames", "drive_format"))
+    return Source(drive, segmenter, frames, drive_format, called=name)
 
 
 def _correction_of(folder: Path) -> str:

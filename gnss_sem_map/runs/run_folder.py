@@ -73,9 +73,11 @@ def is_run_file(name: str) -> bool:
 
 
 @contextmanager
-def claimed_run(out: Path, inputs: Iterable[Path | str | None] = ()) -> Iterator[Claim]:
+def claimed_run(
+    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False
+) -> Iterator[Claim]:
     """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
-    with claimed(out, inputs, is_run_file) as claim, leaving_all():
+    with claimed(out, inputs, is_run_file, is_resumable) as claim, leaving_all():
         yield claim
 
 
@@ -105,7 +107,8 @@ def write_run(
         if write_labels:
             labelled = LabelledDrive(folder, mapped.log, mapped.trajectory)
             write_point_labels(folder, [labelled], refined.kerbs, settings)
-        track = _while_mapping(mapped.trajectory, mapped.log)
+        scans = mapped.log.scans
+        track = mapped.trajectory.during(scans[0].stamp, scans[-1].stamp)
         write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
     about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
     write_about(folder, settings, about, metrics_of(mapped))
@@ -157,7 +160,7 @@ def write_again(
         if log is not None:
             labelled = LabelledDrive(folder, log, trajectory, known_raw)
             write_point_labels(folder, [labelled], refined.kerbs, settings)
-        write_map_files(folder, [between(trajectory, first, last)], str(about["name"]), settings.delivery)
+        write_map_files(folder, [trajectory.during(first, last)], str(about["name"]), settings.delivery)
     tracked = about["map"]["refinement"]
     about |= changed | {
         "seconds": about["seconds"] | seconds_of(stats),
@@ -211,16 +214,6 @@ def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics
     _write_json(folder / "run.json", about)
     _write_json(folder / "metrics.json", metrics)
     write_report(folder, about, metrics)
-
-
-def _while_mapping(trajectory: Trajectory, log: SensorLog) -> Trajectory:
-    """The part of the trajectory with scans, for pictures of the map."""
-    return between(trajectory, log.scans[0].stamp, log.scans[-1].stamp)
-
-
-def between(trajectory: Trajectory, first: float, last: float) -> Trajectory:
-    inside = (trajectory.stamps >= first - 0.1) & (trajectory.stamps <= last + 0.1)
-    return Trajectory(trajectory.stamps[inside], trajectory.T_map_imu[inside]) if inside.any() else trajectory
 
 
 def write_trajectory_run(

@@ -44,6 +44,7 @@ class Source:
             "drive": str(Path(self.drive).resolve()),
             "segmenter": self.segmenter,
             "frames": self.frames,
+            "drive_format": self.drive_format,
         }
 
     def open_log(self, with_imu: bool = True) -> SensorLog:

@@ -9,7 +9,6 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.runs.run_folder import between
 
 TRACKS = "tracks"
 """Folder of a merged run, which has no drives and no trajectory of its own."""
@@ -22,11 +21,11 @@ def tracks_of(run: Path) -> list[Trajectory]:
     if is_folder(run / TRACKS):
         return [Trajectory.load(path) for path in sorted((run / TRACKS).glob("*.parquet"))]
     first, last = read_run(run)["scans_s"]
-    return [between(Trajectory.load(run / "trajectory.parquet"), first, last)]
+    return [Trajectory.load(run / "trajectory.parquet").during(first, last)]
 
 
 def keep_tracks(run: Path, tracks: Iterable[Trajectory]) -> None:
-    """Write the tracks of a merged run."""
+    """Write the tracks of a merged run, their poses alone."""
     (run / TRACKS).mkdir()
     for number, track in enumerate(tracks):
-        track.save(run / TRACKS / f"{number:04d}.parquet")
+        Trajectory(track.stamps, track.T_map_imu).save(run / TRACKS / f"{number:04d}.parquet")

@@ -108,7 +108,7 @@ class CachedLabels:
     def _read_ids(self, path: Path, size: tuple[int, int] | None) -> NDArray[np.uint8]:
         import cv2
 
-        ids = read_class_ids(path)
+        ids = read_ids(path)
         check_size(ids.shape, size, str(path))
         if cv2.LUT(ids, self._unknown.view(np.uint8)).any():  # many times faster than indexing
             unknown = np.unique(ids[self._unknown[ids]]).tolist()
@@ -135,11 +135,6 @@ def read_probabilities(
         except ValueError:
             raise DataError(f"{shown(path)}: class_names are no text") from None
         return checked_probabilities(stored.read(), len(names), shown(path)), names
-
-
-def read_class_ids(path: Path) -> NDArray[np.uint8]:
-    """The ids (h, w) of a label image; raises DataError unless it is an 8-bit image of one channel."""
-    return read_ids(path)
 
 
 def _label_files(folder: Path, cameras: Sequence[str]) -> tuple[dict[tuple[str, int], Path], str]:

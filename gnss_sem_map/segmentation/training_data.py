@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.files.pictures import read_picture
+from gnss_sem_map.files.pictures import read_ids, read_picture
 from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
-from gnss_sem_map.segmentation.cached import read_class_ids
 
 IGNORE = 255
 """Label of pixels that are ignored in training."""
@@ -59,7 +58,7 @@ class LabelledImages:
         """RGB pixels (h, w, 3) and truth (h, w); raises DataError for damaged files, other sizes and unknown ids."""
         image_file, label_file = self.pairs[index]
         pixels = read_picture(image_file, needs_colour=True)
-        ids = read_class_ids(label_file)
+        ids = read_ids(label_file)
         if pixels.shape[:2] != ids.shape:
             raise DataError(
                 f"{label_file}: found {ids.shape} pixels, expected {pixels.shape[:2]} as in {image_file.name}"

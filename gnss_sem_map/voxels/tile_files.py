@@ -209,3 +209,24 @@ def global_keys(tile: Tile, local: NDArray[np.uint32]) -> NDArray[np.int64]:
     first = pack(np.array([[tile[0] << TILE_BITS, tile[1] << TILE_BITS, -Z_OFFSET]]))
     x, y, z = wide >> (TILE_BITS + Z_BITS), wide >> Z_BITS & mask, wide & ((1 << Z_BITS) - 1)
     return np.asarray(first + (x << 2 * AXIS_BITS | y << AXIS_BITS | z), np.int64)
+
+
+def morton_codes(
+    x: NDArray[np.integer], y: NDArray[np.integer], z: NDArray[np.integer]
+) -> NDArray[np.uint64]:
+    """Places in Morton order (Z-order) of voxels by their indices, each (v,) and from 0 to 2^21 - 1."""
+    return np.asarray(_spread(x) | _spread(y) << np.uint64(1) | _spread(z) << np.uint64(2))
+
+
+def _spread(values: NDArray[np.integer]) -> NDArray[np.uint64]:
+    """Values with two zero bits before each bit: halves move apart, then quarters and so on."""
+    spread = values.astype(np.uint64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
+    return spread

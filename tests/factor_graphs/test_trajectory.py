@@ -152,3 +152,11 @@ def test_in_another_frame_it_is_the_same_motion(seed, velocities, covariances):
         np.testing.assert_array_equal(moved.covariances, t.covariances)
     else:
         assert moved.covariances is None
+
+
+def test_a_part_of_it_goes_a_little_beyond_its_ends_and_is_never_empty():
+    t = some(k=30)
+    part = t.during(t.stamps[5] + 0.1, t.stamps[20] - 0.1)
+    np.testing.assert_array_equal(part.T_map_imu, t[5:21].T_map_imu)
+    np.testing.assert_array_equal(part.covariances, t[5:21].covariances)
+    assert t.during(t.end + 1, t.end + 2) is t

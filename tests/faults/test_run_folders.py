@@ -15,9 +15,9 @@ from faults.harness import gnss_sem_map
 
 from gnss_sem_map import config
 from gnss_sem_map.errors import SemMapError
-from gnss_sem_map.evaluation.fit_sensor_model import calibrate
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.mapping.merging import merge_runs
+from gnss_sem_map.runs.calibrating import calibrate
 from gnss_sem_map.voxels import tiles
 
 RAW_IDS = {street.ROAD: 40, street.SIDEWALK: 48, street.VEHICLE: 10, street.BUILDING: 50}

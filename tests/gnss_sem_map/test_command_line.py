@@ -64,8 +64,17 @@ def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_pa
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(small_drive: Street, tmp_path: Path) -> None:
-    words = ("run", small_drive.drive, "-o", tmp_path / "new")
+@pytest.mark.parametrize("has_images", [True, False])
+def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(
+    has_images: bool, small_drive: Street, tmp_path: Path
+) -> None:
+    """A map of several drives is refused without one also where these have no images."""
+    drives = [small_drive.drive]
+    if not has_images:
+        date = shutil.copytree(small_drive.drive.parent, tmp_path / small_drive.drive.parent.name)
+        drives = 2 * [date / small_drive.drive.name]
+        shutil.rmtree(drives[0] / "image_02")
+    words = ("run", *drives, "-o", tmp_path / "new")
     run, dry = program(*words), program(*words, "--dry-run")
     assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
     assert run.returncode == 1

@@ -51,7 +51,8 @@ function described(node, number, place, label, confidence, origin) {
   return [what, ...delivered(metres), `map: east ${east} m, north ${north} m, up ${up} m`];
 }
 
-// Easting, northing, height, latitude and longitude are polynomials of the place in the map, see `placing.py`.
+// Easting, northing, height, latitude and longitude are polynomials of the place in the map, see `placing.py`; that of
+// longitude goes on beyond 180 degrees.
 function delivered(metres) {
   if (!meta.placing) return [];
   const { centre, half, powers, coefficients, crs, heights } = meta.placing;
@@ -59,7 +60,7 @@ function delivered(metres) {
   const terms = powers.map(power => power.reduce((product, p, k) => product * at[k] ** p, 1));
   const [easting, northing, height, lat, lon] = coefficients.map(row => row.reduce((sum, c, i) => sum + c * terms[i], 0));
   return [`${crs}: ${written(easting)} E, ${written(northing)} N`,
-          `height ${written(height)} m ${heights}`, `WGS 84: ${lat.toFixed(6)}°, ${lon.toFixed(6)}°`];
+          `height ${written(height)} m ${heights}`, `WGS 84: ${lat.toFixed(6)}°, ${(lon - 360 * Math.round(lon / 360)).toFixed(6)}°`];
 }
 
 function measure(on) {

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.special import softmax
-from street import NAMES, Street
+from street import NAMES, Street, write_table_log
 from typer.testing import CliRunner
 
 from gnss_sem_map.cli import app
@@ -21,13 +21,17 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.label_files import label_files
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.evaluation.fit_sensor_model import calibrate, fit_temperature, measure
+from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration, read
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
+from gnss_sem_map.runs.calibrating import calibrate, drive_and_map
+from gnss_sem_map.runs.run_settings import write_settings
 from gnss_sem_map.segmentation import Segmenter, open_segmenter
-from gnss_sem_map.sensor_log import Image
+from gnss_sem_map.sensor_log import Image, Lidar
+from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 URBAN = open_label_set()
@@ -151,6 +155,43 @@ def test_truth_of_another_drive_is_refused(confused: Drive, truth: Path, tmp_pat
         blank[name].write_bytes(b"\0" * path.stat().st_size)
     with pytest.raises(DataError, match="no point has both a pixel and a true class"):
         measure(confused, voxels, blank)
+
+
+def test_truth_of_several_lidars_is_told_apart_by_their_names(confused: Drive, truth: Path) -> None:
+    """Two LiDARs that see the same: the network errs twice as often."""
+    log, voxels, files = confused.log, mapped(confused), label_files(truth)
+    other = Lidar("right", log.calibration.T_imu_lidar, log.scans)
+    both = replace(confused, log=replace(log, lidar="left", others=(other,)))
+    one, _ = measure(confused, voxels, files)
+    named = {f"{lidar}/{name}": path for lidar in ("left", "right") for name, path in files.items()}
+    two, _ = measure(both, voxels, named)
+    np.testing.assert_array_equal(two.answers, 2 * one.answers)
+    with pytest.raises(DataError, match="no truth for scan right/"):
+        measure(both, voxels, {name: path for name, path in named.items() if name.startswith("left")})
+
+
+def test_scans_are_read_as_the_run_read_them(small_drive: Street, confused: Drive, tmp_path: Path) -> None:
+    """Those of its frames, as late as its settings say, and in the format that it was told."""
+    place, out = write_table_log(tmp_path, small_drive), tmp_path / "out"
+    out.mkdir()
+    inputs = {
+        "drive": str(place), "segmenter": f"labels:{small_drive.labels}", "frames": "0:2", "drive_format": "table",
+    }  # fmt: skip
+    (out / "run.json").write_text(json.dumps({"inputs": inputs}))
+    write_settings(out, Settings.model_validate({"sensors": {"lidar_time_offset_s": 0.5}}))
+    confused.trajectory.save(out / "trajectory.parquet")
+    voxels = mapped(confused)
+    tiles.write(SemanticMap.of(voxels), out / "map", confused.log.frame)
+    plain = [scan.stamp for scan in open_drive(place).scans]
+    drive, found = drive_and_map(out, None, None)
+    assert [scan.stamp for scan in drive.log.scans] == pytest.approx([stamp + 0.5 for stamp in plain[:2]])
+    np.testing.assert_array_equal(found.keys, voxels.keys)
+    (out / "run.json").write_text(json.dumps({"inputs": inputs | {"drive_format": "rosbag"}}))
+    with pytest.raises(DataError):
+        drive_and_map(out, None, None)
+    (out / "run.json").write_text(json.dumps({"inputs": inputs, "merged": ["a", "b"]}))
+    with pytest.raises(DataError, match="merged of a and b, expected a run of one drive"):
+        drive_and_map(out, None, None)
 
 
 @pytest.mark.slow

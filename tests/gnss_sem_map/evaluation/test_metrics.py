@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from sklearn.metrics import jaccard_score, precision_score
 
+from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import metrics
 from gnss_sem_map.evaluation.metrics import Tables, confusion, dynamic, dynamic_counts, semantics
+from gnss_sem_map.evaluation.score_run import score_run
+from gnss_sem_map.files import ownership
 from gnss_sem_map.labels.label_set import open_label_set
 
 URBAN = open_label_set()
@@ -138,6 +142,35 @@ def test_removal_is_scored_on_moving_vehicles_and_everything_static() -> None:
     assert (found["DA"], found["SA"], found["SA_vehicle"]) == (3 / 4, 4 / 5, 1 / 2)
     assert found["AA"] == pytest.approx((3 / 4 * 4 / 5) ** 0.5)
     assert dynamic(np.zeros((3, 2), np.int64))["AA"] is None
+
+
+def test_a_class_set_without_vehicles_has_no_moving_ones() -> None:
+    names = tuple(name for name in URBAN.names if name != "vehicle")
+    kept = {source: name for source, name in URBAN.sources["semantic_kitti"].items() if name in names}
+    still = replace(
+        URBAN, names=names, semantic_kitti_ids=ids(40, 48, 50, 70), sources={"semantic_kitti": kept}
+    )
+    found = dynamic(dynamic_counts(ids(1, 1, 0), ids(252, 10, 40), Tables.of(still), "here"))
+    assert (found["DA"], found["SA"], found["SA_vehicle"], found["moving_points"]) == (None, 1 / 2, None, 0)
+
+
+def test_restricted_to_some_points_every_figure_is_of_these_alone(tmp_path: Path) -> None:
+    files = {
+        "run.json": b"{}", "metrics.json": b"{}", "map/map.json": b"{}",
+        "config.yaml": Settings().to_yaml().encode(),
+        "labels/0.label": ids(40, 48, 0, 0), "labels_raw/0.label": ids(40, 48, 0, 0),
+        "removed/0.label": ids(0, 0, 1, 0), "confidence/0.bin": np.ones(4, "<f2"), "looks/0.bin": np.ones(4, np.uint8),
+        "truth/0.label": ids(40, 40, 252, 252), "some/0.label": ids(40, 0, 10, 0),
+    }  # fmt: skip
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(bytes(content))
+    ownership.write_list(tmp_path)
+    everything = score_run(tmp_path, tmp_path / "truth")
+    assert (everything["semantics"]["refined"]["mean_iou"], everything["dynamic"]["DA"]) == (1 / 2, 1 / 2)
+    found = score_run(tmp_path, tmp_path / "truth", restrict_to=tmp_path / "some")
+    assert (found["semantics"]["refined"]["mean_iou"], found["dynamic"]["DA"]) == (1.0, 1.0)
+    assert found["dynamic"]["moving_points"] == 1
 
 
 def test_a_calibrated_confidence_has_no_calibration_error_and_a_boast_has_its_size() -> None:

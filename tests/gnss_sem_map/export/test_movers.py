@@ -9,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from pyproj import Transformer
 
+from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.dynamics.constant_velocity import smooth
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
@@ -86,6 +87,22 @@ def test_the_geojson_says_the_same(mover, karlsruhe, tmp_path) -> None:
     for name in ("speed_mps", "speed_stddev_mps", "length_m", "class", "evidence", "points", "drive"):
         assert properties[name] == table[name]
     assert len(properties["track_stamp_s"]) == len(feature["geometry"]["coordinates"])
+
+
+def test_a_track_across_the_180_degree_meridian_is_cut_there(mover, tmp_path) -> None:
+    fiji = LocalFrame(-17.0, 180.0 - 4.0 / 106_500, 100.0)
+    write_movers([mover], DriveOfMovers("monday", EPOCH_NS, fiji), tmp_path)
+    (feature,) = json.loads((tmp_path / "objects.geojson").read_text())["features"]
+    east, west = (np.array(line) for line in feature["geometry"]["coordinates"])
+    assert (east[-1, 0], west[0, 0]) == (180, -180)
+    assert east[:, 0].min() > 179.999
+    assert west[:, 0].max() < -179.999
+    lat, alt = (np.array([line[axis] for line in (east[-1], west[0])]) for axis in (1, 2))
+    assert (np.ptp(lat), np.ptp(alt)) == (0, 0)
+    geo = json.loads(pq.read_schema(tmp_path / "objects.parquet").metadata[b"geo"])["columns"]["geometry"]
+    assert geo["geometry_types"] == ["MultiLineString Z"]
+    assert (geo["bbox"][0], geo["bbox"][3]) == (east[0, 0], west[-1, 0])
+    geopandas.read_parquet(tmp_path / "objects.parquet")
 
 
 def test_without_a_georeference_it_is_in_the_frame_of_the_map(mover, tmp_path) -> None:

@@ -139,6 +139,25 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
     assert "3 parts of the recording could not be used: 114 files missing" in page.verdict
 
 
+@pytest.mark.parametrize(
+    ("epoch_ns", "first_s", "date"),
+    [
+        (1317042272349659964, 2.0, "26 September 2011, 13:04:34 UTC"),
+        (0, 1_700_000_000.5, "14 November 2023, 22:13:20 UTC"),
+        (0, 0.0, None),
+        (0, 5000.0, None),
+    ],
+)
+def test_the_date_is_that_of_the_first_scan_where_stamps_are_dates(
+    epoch_ns: int, first_s: float, date: str | None, tmp_path: Path
+) -> None:
+    """Those of KITTI odometry are seconds since the first scan, and tell no date."""
+    write_report(tmp_path, {"epoch_ns": epoch_ns, "scans_s": [first_s, first_s + 1]}, {})
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert ("UTC" in text) == (date is not None)
+    assert (date or "not georeferenced") in text
+
+
 def test_what_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
     verdict = report(tmp_path, {"name": "x"}, {}).verdict
     for missing in ("driven length", "mapped area", "accuracy of the positions", "accuracy of the classes"):

@@ -2,10 +2,12 @@
 
 import json
 import warnings
+from itertools import pairwise
 from pathlib import Path
 
 import geopandas
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from pyproj import Geod
 from scipy.spatial.transform import Rotation
@@ -136,3 +138,28 @@ def test_geopandas_reads_the_geoparquet_back(
     np.testing.assert_allclose(table["stddev_up_m"], uncertain.position_stddevs[:, 2])
     east = np.arctan2(*uncertain.T_map_imu[:, :2, 0].T)
     np.testing.assert_allclose(np.sin(np.radians(table["heading_deg"])), np.sin(east), atol=1e-9)
+
+
+def test_a_track_across_the_180_degree_meridian_is_cut_there(track: Trajectory, tmp_path: Path) -> None:
+    """As RFC 7946 asks, sections 3.1.9 and 5.2: else it is a line around the Earth."""
+    middle = track.positions[len(track) // 2]
+    fiji = LocalFrame(-17.0, 180.0 - middle[0] / 106_000, 100.0)
+    write_geojson(track, fiji, tmp_path / "trajectory.geojson")
+    (feature,) = json.loads((tmp_path / "trajectory.geojson").read_text())["features"]
+    assert feature["geometry"]["type"] == "MultiLineString"
+    lines = [np.array(line) for line in feature["geometry"]["coordinates"]]
+    assert len(lines) > 1
+    for line in lines:
+        assert np.ptp(line[:, 0]) < 0.1
+    for before, after in pairwise(lines):
+        assert (before[-1, 0], before[-1, 1:].tolist()) == (-after[0, 0], after[0, 1:].tolist())
+        assert abs(before[-1, 0]) == 180
+        neighbours = np.sort([before[-2, 1:], after[1, 1:]], axis=0)
+        np.testing.assert_array_equal(before[-1, 1:].clip(*neighbours), before[-1, 1:])
+    cuts = 2 * (len(lines) - 1)
+    assert sum(map(len, lines)) - cuts == len(track) == len(feature["properties"]["stamps_s"])
+    write_geoparquet(track, fiji, 0, tmp_path / "track.parquet")
+    geo = json.loads(pq.read_schema(tmp_path / "track.parquet").metadata[b"geo"])
+    west, _, _, east, _, _ = geo["columns"]["geometry"]["bbox"]
+    assert 179.9 < west < 180
+    assert -180 < east < -179.9

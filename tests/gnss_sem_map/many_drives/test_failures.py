@@ -25,8 +25,9 @@ from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.runs import finished_run, many_drives
-from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
+from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -173,12 +174,18 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     out, calls = shutil.copytree(made["ab"], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr(many_drives, "write_drives", stopped)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt) as removing:
+            remove_drive(out, "b")
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        with pytest.raises(KeyboardInterrupt) as adding:
             add_drive(out, drives.by_name["c"], how)
+    assert not hasattr(removing.value, "__notes__"), "nothing resumes a removal"
+    assert adding.value.__notes__ == [RESUMABLE]
+    calls.clear()
     assert products(out) == products(made["ab"])
     add_drive(out, drives.by_name["c"], replace(how, resume=True))
     assert_same(out, made["abc"])
-    assert len(calls) == 1
+    assert calls == []
 
 
 def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(

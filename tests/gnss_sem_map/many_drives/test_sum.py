@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from maps_of_drives import SETTINGS, assert_same
 from street_drives import Drives
+from typer.testing import CliRunner
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.run_json import read_run
@@ -98,7 +100,9 @@ def test_a_map_of_many_drives_that_is_refined_again_keeps_its_drives(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
     out = shutil.copytree(made["ab"], tmp_path / "out")
-    Run.open(out).refine(SETTINGS)
+    done = CliRunner().invoke(app, ["refine", str(out)])
+    assert done.exit_code == 0, done.output
+    assert re.fullmatch(rf"2 drives, \d+ voxels; results in {re.escape(str(out))}\n.*", done.output, re.S)
     assert_same(out, made["ab"])
     add_drive(out, drives.by_name["c"], how)
     assert_same(out, made["abc"])

@@ -213,3 +213,11 @@ def test_the_pieces_by_tile_are_the_map(tmp_path: Path) -> None:
         np.testing.assert_array_equal(piece.indices[:, :2] >> 9, np.tile(tile, (len(piece), 1)))
     keys = np.concatenate([piece.keys for piece in pieces.values()])
     np.testing.assert_array_equal(np.sort(keys), voxels.keys)
+
+
+def test_morton_codes_interleave_the_bits_of_indices() -> None:
+    indices = np.random.default_rng(0).integers(0, 1 << 21, (50, 3))
+    indices[0] = (1 << 21) - 1
+    bits = [[value >> bit & 1 for bit in range(21)] for value in indices.T]
+    expected = sum(bits[axis][bit] << 3 * bit + axis for bit in range(21) for axis in range(3))
+    np.testing.assert_array_equal(tile_files.morton_codes(*indices.T), expected)

@@ -144,7 +144,7 @@ def classify_motion(
             continue
         beside = _beside(members, segments, hits, misses)
         if not whole.displaced:  # else it may have come to stand there
-            beside += [n for n in members if n not in beside and is_occupied(hits[n], misses[n])]
+            beside = sorted({*beside, *(n for n in members if is_occupied(hits[n], misses[n]))})
         if whole.motion in GONE and beside:
             objects.append(
                 _tracked_object(beside, segments, Motion.PARKED, 0.0, "beside something that moved")

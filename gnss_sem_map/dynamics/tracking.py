@@ -12,6 +12,8 @@ from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 
 LONGEST_GAP = 5
 """A track ends after more scans than this without a segment."""
+LONGEST_GAP_S = 1.5
+"""A track ends when the sensor pauses for longer: the next car at the place is another one."""
 NEW_SHARE = 0.3
 """Weight of a new step in the velocity of a track (exponential smoothing)."""
 FASTEST_M_S = 45.0
@@ -91,7 +93,8 @@ def track(segments: list[Segment], gate_m: float, mostly_free: NDArray[np.bool_]
         by_scan.setdefault(segment.scan, []).append(number)
     alive: list[Track] = []
     for scan, numbers in by_scan.items():
-        alive = [t for t in alive if t.last is not None and scan - t.last.scan <= LONGEST_GAP + 1]
+        stamp = segments[numbers[0]].stamp
+        alive = [t for t in alive if t.last is not None and _goes_on(t.last, scan, stamp)]
         free, taken = set(numbers), set()
         for number, row in _nearest_first(segments, numbers, alive, gate_m):
             if number in free and row not in taken:
@@ -110,6 +113,11 @@ def track(segments: list[Segment], gate_m: float, mostly_free: NDArray[np.bool_]
             tracks.append(started)
             alive.append(started)
     return tracks
+
+
+def _goes_on(last: Segment, scan: int, stamp: float) -> bool:
+    """Whether a track with this last segment may go on in a scan: none goes on after a pause of the sensor."""
+    return scan - last.scan <= LONGEST_GAP + 1 and stamp - last.stamp <= LONGEST_GAP_S
 
 
 def _fast_pairs(

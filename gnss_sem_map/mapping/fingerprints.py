@@ -38,9 +38,9 @@ def of_log(log: SensorLog, labels_from: str = "") -> str:
 
 
 def of_matches(log: SensorLog, trajectory: Trajectory, settings: Settings) -> str:
-    """Digest of everything that decides the matches of LiDAR odometry."""
+    """Digest of everything that decides the matches of LiDAR odometry, this version too."""
     said = [
-        log.name, settings.trajectory.scan_matching.model_dump_json(),
+        VERSION, log.name, settings.trajectory.scan_matching.model_dump_json(),
         [(scan.name, scan.number, scan.stamp, _state(scan)) for scan in log.scans],
     ]  # fmt: skip
     return _digest(said, [trajectory.stamps, trajectory.T_map_imu, log.calibration.T_imu_lidar])
@@ -50,7 +50,7 @@ def of_map(drive: Drive, labels_from: str) -> str:
     """Digest of everything that decides the map, this version too."""
     log, settings, trajectory = drive.log, drive.settings, drive.trajectory
     said = [
-        VERSION, log.name, labels_from, _classes(drive), settings.classes,
+        VERSION, log.name, log.epoch_ns, labels_from, _classes(drive), settings.classes,
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
         _scans(log), _images(log), _states(labels_from), _cameras(log),

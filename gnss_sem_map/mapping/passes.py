@@ -83,7 +83,8 @@ def bind_passes(
     if base is not None:
         revisits += register_to_base(base, len(drives), passes, settings)
         condensed, names = [*condensed, CondensedDrive.fixed()], [*names, base.name]
-    del passes  # with the local maps that they keep
+    for one in passes:
+        one.maps.forget()
     corrections: list[Correction | None] = [None] * len(names)
     table: list[TwoPasses] = []
     warnings: list[str] = []

@@ -38,11 +38,16 @@ class LocalMaps:
         scans = np.array([scan.stamp for scan in log.scans])
         way = way_along(trajectory, scans)
         lattice = np.arange(0.0, way[-1] + SWEEP_M, SWEEP_M)
-        self._lattice = np.unique(np.abs(way[None] - lattice[:, None]).argmin(axis=1))
-        self._nearest = np.abs(scans[self._lattice][None] - stamps[:, None]).argmin(axis=1)
+        self._lattice = np.unique(nearest(way, lattice))
+        self._nearest = nearest(scans[self._lattice], stamps)
         self._sweep = lru_cache(KEPT_SWEEPS)(self._read)
         self.at = lru_cache(KEPT_MAPS)(self._made)
         """The local map of a place: points, each with its plane, m; empty where no sweep can be read."""
+
+    def forget(self) -> None:
+        """Let go of the sweeps and maps that are kept."""
+        self._sweep.cache_clear()
+        self.at.cache_clear()
 
     def _made(self, place: int) -> small_gicp.PointCloud:
         first = max(int(self._nearest[place]) - SWEEPS // 2, 0)
@@ -59,6 +64,17 @@ class LocalMaps:
             return usable_points_in_map(some, scan.stamp, self._trajectory, T_imu_lidar)[0]
         except (DataError, MeasurementError):  # reported when the map is built
             return np.empty((0, 3))
+
+
+def nearest(values: Array, wanted: Array) -> NDArray[np.intp]:
+    """The place of the value nearest to each wanted one, (w,): the first of equal ones.
+
+    `values` (n,) do not decrease.
+    """
+    after = np.searchsorted(values, wanted).clip(max=len(values) - 1)
+    before = np.maximum(after - 1, 0)
+    is_after = np.abs(values[after] - wanted) < np.abs(values[before] - wanted)
+    return np.searchsorted(values, values[np.where(is_after, after, before)])
 
 
 def cloud_of(points: Array) -> small_gicp.PointCloud:

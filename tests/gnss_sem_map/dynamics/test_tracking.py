@@ -1,5 +1,7 @@
 """Tracks, and the motion states that follow from hits and misses."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from gnss_sem_map.dynamics.motion_state import MotionSettings, classify_motion
@@ -27,6 +29,16 @@ def test_a_track_survives_five_scans_out_of_sight_and_not_six():
         scans = [*range(10), *range(10 + gap, 20 + gap)]
         segments = [segment(scan, scan * 0.5) for scan in scans]
         assert len(track(segments, 1.5, np.zeros(len(segments), bool))) == count
+
+
+def test_no_track_lasts_through_a_pause_of_the_sensor():
+    """A car stands where another one stood a minute before; one comes fast, and another one is far away then."""
+    for before, after, mostly_free in (((0.0, 0.0), (0.0, 0.0), False), ((0.0,), (2000.0,), True)):
+        count = len(before)
+        segments = [segment(scan, x) for scan, x in enumerate((*before, *after))]
+        segments[count:] = [replace(each, stamp=each.stamp + 60.0) for each in segments[count:]]
+        found = track(segments, 1.5, np.full(len(segments), mostly_free))
+        assert [len(t.segments) for t in found] == [count, count]
 
 
 def test_on_a_highway_a_fleeting_segment_is_followed_as_far_as_it_drives_and_a_standing_one_is_not():

@@ -37,6 +37,10 @@ PAPER: dict[str, float | bool] = {
 """What `fusion: paper` sets. The floor is the least that keeps one observation from deciding for ever."""
 
 
+FILES = (("calibration",), ("classes",), ("delivery", "geoid"))
+"""Settings that name a file; classes without an ending are a shipped set."""
+
+
 class DeliverySettings(BaseModel):
     """Coordinates of the files that a map is exported to; the map itself stays in its own frame."""
 
@@ -102,6 +106,12 @@ class Settings(BaseModel):
                 )
         return content
 
+    @property
+    def files(self) -> list[Path]:
+        """The files that are named."""
+        classes = Path(self.classes) if Path(self.classes).suffix else None
+        return [file for file in (self.calibration, classes, self.delivery.geoid) if file is not None]
+
     def changed(self, *overrides: str) -> Settings:
         """These settings with some `section.name=value` changed; raises ConfigError."""
         return parse(Settings, overrides, self.model_dump(mode="json"))
@@ -121,15 +131,25 @@ def _plain(content: Any) -> Any:
 def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
     """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one.
 
-    A calibration that the file names is found from the file's folder, one of the overrides from the working folder.
+    Files that the file names are found from its folder, those of the overrides from the working folder.
     """
     content = _read(file) if file is not None else {}
-    if file is not None and isinstance(content.get("calibration"), str):
-        content["calibration"] = str(file.parent / content["calibration"])
-    settings = parse(Settings, overrides, content, str(file) if file else "--set")
-    # a worker may have another working folder
-    absolute = settings.calibration and settings.calibration.absolute()
-    return settings.model_copy(update={"calibration": absolute})
+    if file is not None:
+        _with_files(content, file.parent)
+    named = parse(Settings, overrides, content, str(file) if file else "--set").model_dump(exclude_unset=True)
+    _with_files(named, Path.cwd())  # a worker may have another working folder
+    return Settings.model_validate(named)
+
+
+def _with_files(content: Any, folder: Path) -> None:
+    """Find the files that settings name, those in FILES, from a folder."""
+    for *sections, name in FILES:
+        section = content
+        for part in sections:
+            section = section.get(part) if isinstance(section, dict) else None
+        said = section.get(name) if isinstance(section, dict) else None
+        if isinstance(said, str | Path) and (Path(said).suffix or name != "classes"):
+            section[name] = str(folder.absolute() / said)
 
 
 def parse(

@@ -272,8 +272,12 @@ def _parents(out: Path) -> Iterator[None]:
 def locked(out: Path) -> Iterator[None]:
     """Lock an output folder with `.OUT.lock`, which names the process. The lock of a dead process is ignored.
 
-    Raises DataError when another command writes there, or the lock cannot be written.
+    What this process has claimed is locked already. Raises DataError when another command writes there, or the lock
+    cannot be written.
     """
+    if out in _HELD:
+        yield
+        return
     path = out.with_name(f".{out.name}.lock")
     try:
         file = _lock(path, out)

@@ -114,24 +114,37 @@ def amend_all(folder: Path, source: Path) -> None:
 @contextmanager
 def _amending(folder: Path, states: Mapping[str, str]) -> Iterator[None]:
     """List files that are written next; raises DataError for what we did not write, and for OSErrors."""
-    listed = read_list(folder)
     try:
-        if listed is not None:
-            listed = dict(listed)
+        for place, inside in _with_lists(folder):
+            listed = dict(read_list(place) or {})
             for name, state in states.items():
-                known = listed.get(name, [])
+                known = listed.get(inside + name, [])
                 if os.path.lexists(folder / name) and state_of(folder / name) not in known:
                     raise DataError(
                         f"{folder / name}: was not written by us, or was changed since; move it away"
                     )
-                listed[name] = list(dict.fromkeys([*known, state]))[-3:]
-            _write_marker(folder, listed)
+                listed[inside + name] = list(dict.fromkeys([*known, state]))[-3:]
+            _write_marker(place, listed)
         yield
     except OSError as error:
         place = folder / next(iter(states)) if len(states) == 1 else folder
         raise DataError(
             f"{place}: cannot be written ({error.strerror}); free the disk or see to its rights"
         ) from None
+
+
+def _with_lists(folder: Path) -> Iterator[tuple[Path, str]]:
+    """The folders whose list holds the files of this one: itself, and a map of several drives around it.
+
+    Each with what precedes the names of the files in its list.
+    """
+    if read_list(folder) is not None:
+        yield folder, ""
+    real = folder.resolve()
+    for parent in real.parents:
+        inside = f"{real.relative_to(parent).as_posix()}/"
+        if inside in (read_list(parent) or {}):
+            yield parent, inside
 
 
 def write_whole(path: Path, content: bytes) -> None:

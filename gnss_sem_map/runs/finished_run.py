@@ -24,7 +24,7 @@ from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.export.georeference import check_delivery
 from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
+from gnss_sem_map.files.output_folder import locked, new_folder, real_path, refuse_inputs
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
@@ -262,10 +262,12 @@ class Run:
         )  # fmt: skip
         if to is None:
             written = []
-            for done, name in enumerate(chosen, 1):
-                written.append(self._amended(known[name], exported))
-                progress("export", done, len(chosen))
+            with locked(real_path(self.folder)):
+                for done, name in enumerate(chosen, 1):
+                    written.append(self._amended(known[name], exported))
+                    progress("export", done, len(chosen))
             return written
+        refuse_inputs(real_path(Path(to)), [self.folder])
         files = [Path(to) / known[name].file for name in chosen]
         if there := [file for file in files if file.exists()]:
             raise DataError(f"{shown(there[0])}: exists; move it away or choose another folder")

@@ -82,12 +82,12 @@ def claimed_run(
 
 
 def places_read(
-    drive: Path, settings: Settings, segmenter: str | None = None, config: Path | None = None
+    drive: Path, settings: Settings | None = None, segmenter: str | None = None, config: Path | None = None
 ) -> list[Path | str | None]:
-    """All inputs of a run that are known before the drive is opened."""
+    """All inputs of a run that are known before the drive is opened; without settings, they are those of the output."""
     place = (segmenter or "").partition(":")[2].partition("?")[0]
-    classes = settings.classes if Path(settings.classes).suffix else None
-    return [drive, config, place or None, settings.calibration, classes]
+    named = [] if settings is None else settings.files
+    return [drive, config, place or None, *named]
 
 
 def write_run(

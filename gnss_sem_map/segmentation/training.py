@@ -338,7 +338,7 @@ def _claim(out: Path) -> None:
         strange = sorted(
             {path.name for path in out.iterdir()} - {STATE, NETWORK, LOG, f"{STATE}.part", MARKER}
         )
-        ours = (out / STATE).exists() or (out / MARKER).exists()
+        ours = (out / STATE).exists() or ((out / MARKER).exists() and not strange)  # a run has a list, too
         if any(out.iterdir()) and not ours:
             raise ConfigError(
                 f"{out}: holds {(strange or [NETWORK])[0]} and no training; choose an empty folder"

@@ -28,7 +28,7 @@ def test_what_is_printed_reads_back_as_the_same_settings(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "classes", ["urban", 'a: #b\'s "c".yaml', "x" * 200 + " y" * 100, "two\n\nlines ", "\u0085é"]
+    "classes", ["urban", 'a: #b\'s "c" yaml', "x" * 200 + " y" * 100, "two\n\nlines ", "\u0085é"]
 )
 def test_any_text_reads_back(classes: str, tmp_path: Path) -> None:
     file = tmp_path / "config.yaml"
@@ -90,6 +90,19 @@ def test_the_command_line_wins_over_the_file(tmp_path: Path) -> None:
     file.write_text("mapping: {voxel_size_m: 0.5, farthest_m: 60}\n")
     settings = config.load(file, ["mapping.voxel_size_m=0.25"])
     assert (settings.mapping.voxel_size_m, settings.mapping.farthest_m) == (0.25, 60)
+
+
+def test_files_that_a_file_names_lie_beside_it_and_others_where_we_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path)
+    file = Path("there/settings.yaml")
+    file.write_text("classes: my.yaml\ncalibration: cal.yaml\ndelivery: {geoid: ../grid.tif}\n")
+    settings = config.load(file, ["calibration=other.yaml"])
+    found = [tmp_path / "other.yaml", tmp_path / "there/my.yaml", tmp_path / "there/../grid.tif"]
+    assert settings.files == found
+    assert config.load(None, ["classes=urban"]).files == []
 
 
 def test_off_and_false_switch_off(tmp_path: Path) -> None:

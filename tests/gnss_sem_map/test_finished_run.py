@@ -17,6 +17,7 @@ from street import Street
 
 from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.mapping.evidence import write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
@@ -166,6 +167,16 @@ def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Ru
     before = (finished.folder / "map.ply").read_bytes()
     [ply] = finished.export(["ply"])
     assert ply.read_bytes() == before
+
+
+def test_it_is_exported_neither_into_itself_nor_while_another_command_writes_it(finished: Run) -> None:
+    with pytest.raises(DataError, match=r"inside: lies in .*, which is read; choose an -o outside$"):
+        finished.export(["laz"], finished.folder / "inside")
+    with (
+        locked(finished.folder),
+        pytest.raises(DataError, match=r"gnss-sem-map writes it now .*; wait for it"),
+    ):
+        finished.export(["laz"])
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:

@@ -25,7 +25,9 @@ from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.output_folder import RESUMABLE
+from gnss_sem_map.files.ownership import foreign, write_list
 from gnss_sem_map.runs import finished_run, many_drives
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import Source
@@ -228,6 +230,33 @@ def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed
     assert mapped_again(image, image.read_bytes()) == ["a", "b"]
     assert mapped_again(row, f"{float(latitude) + 1e-7:.12f} {rest}".encode()) == ["b"]
     assert mapped_again(image, image.read_bytes()) == ["a"]
+
+
+def test_labels_in_a_result_that_would_be_replaced_are_not_removed(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out = shutil.copytree(made["ab"], tmp_path / "out")
+    shutil.copytree(Path(drives.labels.partition(":")[2].format(drive="a")), out / "labels/a")
+    write_list(out)
+    with pytest.raises(
+        DataError, match=r"out: is or holds .*out/labels/a, which is read; choose another -o$"
+    ):
+        mapped("ab", drives, out, replace(how, segmenter=f"labels:{out}/labels/{{drive}}"))
+    assert (out / "labels/a").is_dir()
+
+
+def test_a_drive_of_a_map_can_be_scored_and_the_map_stays_ours(
+    drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    places = [drives.by_name["a"], drives.by_name["b"]]
+    run_drives(places, tmp_path / "out", SETTINGS, how, write_labels=True)
+    one = tmp_path / "out/drives/a"
+    score_run(one, one / "labels")
+    assert foreign(tmp_path / "out") is None
+    (one / "metrics.json").write_text("{}")
+    assert foreign(tmp_path / "out") == "drives/a/metrics.json"
+    with pytest.raises(DataError, match=r"a/metrics.json: was not written by us, or was changed since"):
+        score_run(one, one / "labels")
 
 
 def test_two_drives_of_one_name_are_refused(drives: Drives, how: HowMapped, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.files.ownership import write_list
+from gnss_sem_map.files.ownership import MARKER, write_list
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.segmentation.training import (
@@ -141,6 +141,15 @@ def test_a_folder_with_a_training_is_neither_overwritten_nor_mixed(streets: Any,
         run(streets, tmp_path)
     with pytest.raises(ConfigError, match=r"other settings .*'steps': \(4, 6\)"):
         run(streets, tmp_path, CALM.model_copy(update={"steps": 6}), resume=True)
+
+
+def test_a_folder_that_holds_a_run_is_no_place_for_a_training(streets: Any, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/run.json").write_text("{}")
+    write_list(tmp_path / "out")
+    with pytest.raises(ConfigError, match=r"out: holds run.json and no training; choose an empty folder$"):
+        run(streets, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [MARKER, "run.json"]
 
 
 def test_it_learns_the_streets_and_the_file_opens_as_a_segmenter(streets: Any, tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ class Rows:
         """The rows of a LiDAR, by the points (n, 3) m of some of its scans, in its own axes, as they were measured."""
         counts = np.zeros(CELLS, np.int64)
         for points in scans:
-            x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+            x, y, z = returns(points).T
             cells = (np.degrees(np.arctan2(z, np.hypot(x, y))) - LOWEST_DEG) / CELL_DEG
             counts += np.bincount(cells.astype(np.int64), minlength=CELLS)
         around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, NEAR), 2 * NEAR + 1)

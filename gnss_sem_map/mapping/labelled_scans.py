@@ -151,8 +151,9 @@ class LabelledScan:
 
     @property
     def labels(self) -> NDArray[np.int8]:
-        """(m,) class that the images give each point, c for `other`, -1 if none shows it."""
+        """(m,) class that the images give each point, c for `other`, -1 if none shows it or its pixel is void."""
         of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED).astype(np.int8)  # -1 is the last
+        of_pixel[:-1][~self.classes.any(axis=1)] = UNLABELLED
         return of_pixel.take(self.pixels)
 
 

@@ -64,7 +64,7 @@ def test_a_point_does_not_move_for_what_else_the_sweep_holds() -> None:
         np.testing.assert_array_equal(points_in_map(points[some], 0.45, trajectory, T_IMU_LIDAR), whole[some])
 
 
-@pytest.mark.parametrize("junk", [0.0, -1e9, 1e300, np.nan])
+@pytest.mark.parametrize("junk", [0.0, 1.3, -1e9, 1e300, np.nan])
 def test_stamps_of_points_that_are_left_out_may_be_anything(junk: float) -> None:
     points, trajectory = sweep(), turning()
     whole = points_in_map(points, 0.45, trajectory, T_IMU_LIDAR)
@@ -72,6 +72,17 @@ def test_stamps_of_points_that_are_left_out_may_be_anything(junk: float) -> None
     xyz, stamps = points.xyz.copy(), np.array(points.stamps)
     xyz[out], stamps[out] = np.nan, junk
     damaged = Points(xyz, points.intensity, stamps)
+    p_map, valid = usable_points_in_map(damaged, 0.45, trajectory, T_IMU_LIDAR)
+    np.testing.assert_array_equal(valid, ~out)
+    np.testing.assert_array_equal(p_map, whole[~out])
+
+
+@pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf])
+def test_a_point_without_a_stamp_is_left_out(junk: float) -> None:
+    points, trajectory = sweep(), turning()
+    whole = points_in_map(points, 0.45, trajectory, T_IMU_LIDAR)
+    out = np.random.default_rng(3).random(len(whole)) < 0.2
+    damaged = Points(points.xyz, points.intensity, np.where(out, junk, np.array(points.stamps)))
     p_map, valid = usable_points_in_map(damaged, 0.45, trajectory, T_IMU_LIDAR)
     np.testing.assert_array_equal(valid, ~out)
     np.testing.assert_array_equal(p_map, whole[~out])

@@ -90,12 +90,15 @@ def coordinates(rows, i):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_usable(rows, stamps, nearest_m, farthest_m, valid):
-    """Mark the points (n,) that are finite and in range, and whose stamps are finite; `stamps` (n,) s, or empty."""
+    """Mark the points (n,) that are finite and in range, and whose stamps are finite; `stamps` (n,) s, or empty.
+
+    A point at zero is no return, whatever the range: so some drivers write that nothing came back.
+    """
     nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
     for i in range(len(valid)):
         x, y, z = coordinates(rows, i)
         square = x * x + y * y + z * z
-        valid[i] = (square >= nearest) & (square <= farthest)
+        valid[i] = (square > 0) & (square >= nearest) & (square <= farthest)
     for i in range(len(stamps)):
         valid[i] &= np.isfinite(stamps[i])
 

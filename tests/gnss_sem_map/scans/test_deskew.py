@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.scans.deskew import points_in_map, usable_points_at_stamp, usable_points_in_map
+from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.sensor_log import Points
 
 T_IMU_LIDAR = np.eye(4)
@@ -75,6 +76,15 @@ def test_stamps_of_points_that_are_left_out_may_be_anything(junk: float) -> None
     p_map, valid = usable_points_in_map(damaged, 0.45, trajectory, T_IMU_LIDAR)
     np.testing.assert_array_equal(valid, ~out)
     np.testing.assert_array_equal(p_map, whole[~out])
+
+
+def test_a_row_of_zeros_is_no_point_whatever_the_range() -> None:
+    points = sweep(100)
+    xyz = np.where(np.arange(100)[:, None] % 3 == 0, np.float32(0), points.xyz)
+    zeros = Points(xyz, points.intensity, points.stamps)
+    _, valid = usable_points_in_map(zeros, 0.45, turning(), T_IMU_LIDAR, nearest_m=0.0)
+    np.testing.assert_array_equal(valid, np.arange(100) % 3 > 0)
+    np.testing.assert_array_equal(thinned(zeros, 0.5, 0, 80).xyz, thinned(points[valid], 0.5, 0, 80).xyz)
 
 
 @pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf])

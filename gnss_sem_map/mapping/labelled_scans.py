@@ -32,6 +32,7 @@ from gnss_sem_map.scans.projection import (
     View,
     class_image,
     exposure_stamp,
+    image_exposed_at,
     view_at,
     visible,
 )
@@ -281,7 +282,7 @@ class _Read:
         self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats
     ) -> None:
         self._log, self._segmenter, self._stats = log, segmenter, stats
-        self._within_s = settings.labelling.image_within_s
+        self._labelling = settings.labelling
         self._label_set = open_label_set(settings.classes)
 
     def __call__(self, scan: Scan) -> tuple[Points | None, list[Labelled]]:
@@ -296,7 +297,7 @@ class _Read:
         return points, [one for one in seen if one is not None]
 
     def _labelled(self, camera: Camera, scan: Scan, segmenter: Segmenter) -> Labelled | None:
-        image = self._log.image_at(scan.stamp, self._within_s, camera.name)
+        image = image_exposed_at(scan.stamp, self._log, camera, self._labelling)
         if image is None:
             of = f" of {camera.name}" if camera.name else ""
             self._stats.skips.append(

@@ -22,7 +22,7 @@ def returns_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
     """The returns (m, 3) m among the rows (n, 3) of a scan; drivers write NaN or zeros where nothing came back."""
     p_lidar = points.astype(np.float64)
     ranges = np.linalg.norm(p_lidar, axis=1)
-    return p_lidar[(ranges >= NEAREST_M) & (ranges < np.inf)]
+    return np.asarray(p_lidar[(ranges >= NEAREST_M) & (ranges < np.inf)])
 
 
 def reach_of_vehicle(scans: Sequence[NDArray[np.floating]]) -> float:

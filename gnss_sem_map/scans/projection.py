@@ -14,7 +14,7 @@ from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import LabelImage, shrink_of
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.sensor_log import Calibration, Image
+from gnss_sem_map.sensor_log import Calibration, Image, SensorLog
 from gnss_sem_map.sensor_log.cameras import Camera
 
 NEAREST_DEPTH_M = 0.5
@@ -49,7 +49,7 @@ class LabellingSettings(BaseModel):
         description="Ignore pixels that are most probably `other`; by default the other classes share their vote.",
     )
     image_within_s: float = Field(
-        0.06, gt=0, description="Largest time difference between a scan and its image."
+        0.06, gt=0, description="Largest time difference between a scan and the exposure of its image."
     )
     camera_time_offset_s: float | None = Field(
         None,
@@ -135,10 +135,22 @@ def class_image(
     return ClassImage(np.minimum(summed, 255).astype(np.uint8), shrink)
 
 
+def exposure_offset_s(camera: Camera, settings: LabellingSettings) -> float:
+    """Moment of exposure minus image stamp, s."""
+    given = settings.camera_time_offset_s
+    return camera.time_offset_s if given is None else given
+
+
 def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSettings) -> float:
     """Moment at which the image was exposed, s."""
-    offset = settings.camera_time_offset_s
-    return image.stamp + (calibration.camera(image.camera).time_offset_s if offset is None else offset)
+    return image.stamp + exposure_offset_s(calibration.camera(image.camera), settings)
+
+
+def image_exposed_at(
+    stamp: float, log: SensorLog, camera: Camera, settings: LabellingSettings
+) -> Image | None:
+    """The image of a camera exposed nearest in time to `stamp`, or None when none was within `image_within_s`."""
+    return log.image_at(stamp - exposure_offset_s(camera, settings), settings.image_within_s, camera.name)
 
 
 def view_at(

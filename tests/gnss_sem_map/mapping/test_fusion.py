@@ -19,7 +19,7 @@ from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.scans.projection import class_image
+from gnss_sem_map.scans.projection import class_image, image_exposed_at
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 from gnss_sem_map.sensor_log import Image, Skip, file_of
@@ -48,7 +48,7 @@ def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_sca
     drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
     settings, stats = drive.settings, RunStats()
-    late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0})
+    late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0, "image_within_s": 4000.0})
     found = build_maps(replace(drive, settings=settings.model_copy(update={"labelling": late})), stats).static
     np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
     np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
@@ -134,7 +134,7 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
             drive.nearest_m, settings.mapping.farthest_m,
         )  # fmt: skip
         np.testing.assert_array_equal(seen.p_map, p_map)
-        image = log.image_at(seen.scan.stamp, settings.labelling.image_within_s)
+        image = image_exposed_at(seen.scan.stamp, log, log.calibration.camera(), settings.labelling)
         assert image is not None
         assert drive.segmenter is not None
         classes = class_image(

@@ -41,7 +41,7 @@ from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan
 from gnss_sem_map.mapping.raw_map import write_raw
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.scans.projection import ClassImage, class_image
+from gnss_sem_map.scans.projection import ClassImage, class_image, image_exposed_at
 from gnss_sem_map.segmentation import open_segmenter
 from gnss_sem_map.sensor_log import Calibration, Image, Points, Scan, SensorLog
 from gnss_sem_map.voxels import tiles
@@ -81,7 +81,8 @@ def open_job(drive: Path, spec: str, scans: int) -> Drive:
     trajectory = log.given or log.reference
     if trajectory is None:
         raise SystemExit(f"{drive}: has no trajectory of its own")
-    with_image = [scan for scan in log.scans if log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)]
+    camera = log.calibration.camera()
+    with_image = [scan for scan in log.scans if image_exposed_at(scan.stamp, log, camera, SETTINGS.labelling)]
     evenly = with_image[:: max(len(with_image) // scans, 1)][:scans]
     return Drive(_only(log, evenly), trajectory, segmenter, SETTINGS)
 
@@ -92,7 +93,7 @@ def _only(log: SensorLog, scans: Sequence[Scan]) -> SensorLog:
 
 def image_of(job: Drive, scan: Scan) -> tuple[Image, ClassImage]:
     """The image of a scan, decoded."""
-    image = job.log.image_at(scan.stamp, SETTINGS.labelling.image_within_s)
+    image = image_exposed_at(scan.stamp, job.log, job.log.calibration.camera(), SETTINGS.labelling)
     assert image is not None
     assert job.segmenter is not None
     look = job.segmenter.kept if isinstance(job.segmenter, KeepsLabels) else job.segmenter

@@ -15,6 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.scans.own_vehicle import returns_of
+
 CELL_DEG = 0.42
 """Height of a cell: a little finer than the 64 beams of an HDL-64E."""
 CELLS, LOWEST_DEG = 430, -215 * CELL_DEG
@@ -44,7 +46,7 @@ class Rows:
         """The rows of a LiDAR, by the points (n, 3) m of some of its scans, in its own axes, as they were measured."""
         counts = np.zeros(CELLS, np.int64)
         for points in scans:
-            x, y, z = points[np.isfinite(points).all(axis=1)].astype(np.float64).T
+            x, y, z = returns_of(points).T
             cells = (np.degrees(np.arctan2(z, np.hypot(x, y))) - LOWEST_DEG) / CELL_DEG
             counts += np.bincount(cells.astype(np.int64), minlength=CELLS)
         around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, NEAR), 2 * NEAR + 1)

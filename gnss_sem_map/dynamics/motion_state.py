@@ -13,6 +13,7 @@ from scipy.special import betaincc
 
 from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.dynamics.own_motion import motion_of
+from gnss_sem_map.dynamics.range_images import FARTHEST_M
 from gnss_sem_map.dynamics.seen_through import PERSON_M
 from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
@@ -75,6 +76,7 @@ class MotionSettings(BaseModel):
     farthest_m: float = Field(
         default=40.0,
         gt=0,
+        le=FARTHEST_M,
         description="Scans farther than this are evidence only where no nearer one looks, m.",
     )
     window_scans: int = Field(
@@ -83,7 +85,9 @@ class MotionSettings(BaseModel):
         description="A scan is decided with so many scans before and after it; two such windows are mapped, and"
         " saved for --resume, at a time.",
     )
-    farthest_object_m: float = Field(default=80.0, gt=0, description="Largest range of objects, m.")
+    farthest_object_m: float = Field(
+        default=80.0, gt=0, le=FARTHEST_M, description="Largest range of objects, m."
+    )
     grow_m: float = Field(
         default=0.35, ge=0, description="Points above ground this close to a moving segment belong to it, m."
     )

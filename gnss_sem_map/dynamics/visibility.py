@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.machine import threads
+from gnss_sem_map.scans.own_vehicle import returns_of
 from gnss_sem_map.scans.prefetch import prefetch
 
 THREADS = min(threads(), 4)
@@ -134,7 +135,7 @@ def share_seen_through(scans: Sequence[NDArray[np.floating]], rows: Rows) -> flo
     """
     misses, asked = 0, 0
     for points in scans:
-        p_lidar = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        p_lidar = returns_of(points)
         ranges = np.linalg.norm(p_lidar, axis=1)
         some = BEFORE * p_lidar[(ranges > ASKED_M[0]) & (ranges < ASKED_M[1])][::ASKED_EVERY]
         seen = KeyframeScans.of([RangeImage.of(p_lidar, np.eye(4), rows)])

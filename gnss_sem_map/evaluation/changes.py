@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from gnss_sem_map.dynamics.range_images import FARTHEST_M
 from gnss_sem_map.dynamics.visibility import WIDE_RATIO, hits_and_misses
 from gnss_sem_map.mapping.raw_map import RawMap
 from gnss_sem_map.voxels.dbscan import dbscan
@@ -38,7 +39,9 @@ class ChangeSettings(BaseModel):
         gt=0,
         description="and least ratio of them to those that hit it; in its own session, of hits to misses.",
     )
-    farthest_m: float = Field(40.0, gt=0, description="Scans farther than this are no evidence.")
+    farthest_m: float = Field(
+        40.0, gt=0, le=FARTHEST_M, description="Scans farther than this are no evidence."
+    )
     least_points: int = Field(
         2, ge=1, description="A voxel with fewer points is no more than part of an object."
     )

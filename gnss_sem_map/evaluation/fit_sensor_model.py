@@ -78,9 +78,9 @@ def _points(
         )
     true = tables.truth[entries[seen.valid] & 0xFFFF].astype(np.int64)
     row = voxels.indices_of(seen.keys)
-    use = (true >= 0) & (seen.pixels >= 0) & (row >= 0)
-    use[use] = seen.classes[seen.pixels[use]].any(axis=1)  # a void pixel has no predicted class
-    return true[use], seen.labels[use].astype(np.int64), row[use]
+    labels = seen.labels.astype(np.int64)
+    use = (true >= 0) & (labels >= 0) & (row >= 0)
+    return true[use], labels[use], row[use]
 
 
 def fit_temperature(

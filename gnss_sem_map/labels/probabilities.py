@@ -40,16 +40,19 @@ LARGEST_SHRINK = 16
 """Probabilities may be this many times smaller than the image."""
 
 
-def check_size(shape: tuple[int, ...], image_size: tuple[int, int] | None, where: str) -> None:
-    """Raise DataError unless (h, w, ...) is the image's (width, height), or that divided and rounded down."""
-    if image_size is None:
-        return
+def shrink_of(shape: tuple[int, ...], image_size: tuple[int, int], where: str) -> int:
+    """Pixels of an image (width, height) along each axis per pixel of its labels (h, w, ...), 1 to LARGEST_SHRINK.
+
+    Raises DataError unless (h, w) is the image's size divided by such a number and rounded down.
+    """
     width, height = image_size
-    if not any(shape[:2] == (height // k, width // k) for k in range(1, LARGEST_SHRINK + 1)):
-        raise DataError(
-            f"{where}: found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; expected that, or it"
-            f" divided by 2 to {LARGEST_SHRINK} and rounded down"
-        )
+    for shrink in range(1, LARGEST_SHRINK + 1):
+        if shape[:2] == (height // shrink, width // shrink):
+            return shrink
+    raise DataError(
+        f"{where}: found {shape[1]} x {shape[0]} pixels for an image of {width} x {height}; expected that, or it"
+        f" divided by 2 to {LARGEST_SHRINK} and rounded down"
+    )
 
 
 def check_shape(shape: tuple[int, ...], dtype: np.dtype[Any], count: int, where: str) -> None:

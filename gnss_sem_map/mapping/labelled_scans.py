@@ -32,6 +32,7 @@ from gnss_sem_map.scans.projection import (
     View,
     class_image,
     exposure_stamp,
+    image_exposed_at,
     view_at,
     visible,
 )
@@ -151,8 +152,9 @@ class LabelledScan:
 
     @property
     def labels(self) -> NDArray[np.int8]:
-        """(m,) class that the images give each point, c for `other`, -1 if none shows it."""
+        """(m,) class that the images give each point, c for `other`, -1 if none shows it or its pixel is void."""
         of_pixel = np.append(self.classes.argmax(axis=1), UNLABELLED).astype(np.int8)  # -1 is the last
+        of_pixel[:-1][~self.classes.any(axis=1)] = UNLABELLED
         return of_pixel.take(self.pixels)
 
 
@@ -164,8 +166,9 @@ def labelled_scans(drive: Drive, stats: RunStats | None = None) -> Iterator[Labe
 
 def label_each_scan(drive: Drive, scans: Sequence[Scan], stats: RunStats) -> Iterator[LabelledScan | None]:
     """Every scan, or None for one that cannot be used; the reason is in `stats`."""
-    read, looks = _Read(drive.log, drive.segmenter, drive.settings, stats), Looks(drive, stats)
-    for scan, (points, images) in prefetch(read, scans, under_way=READ_AHEAD):
+    read, looks = _Read(drive.log, drive.segmenter, drive.settings), Looks(drive, stats)
+    for scan, (points, images, skips) in prefetch(read, scans, under_way=READ_AHEAD):
+        stats.skips += skips  # here, so that their order is that of the scans
         yield None if points is None else _see(drive, scan, points, images, looks, stats)
 
 
@@ -274,34 +277,29 @@ def map_points(points: Points, scan: Scan, drive: Drive) -> tuple[NDArray[np.flo
 
 
 class _Read:
-    """Reads a scan and segments its images; what is missing is counted."""
+    """Reads a scan and segments its images; what is missing is returned as skips."""
 
-    def __init__(
-        self, log: SensorLog, segmenter: Segmenter | None, settings: Settings, stats: RunStats
-    ) -> None:
-        self._log, self._segmenter, self._stats = log, segmenter, stats
-        self._within_s = settings.labelling.image_within_s
+    def __init__(self, log: SensorLog, segmenter: Segmenter | None, settings: Settings) -> None:
+        self._log, self._segmenter = log, segmenter
+        self._labelling = settings.labelling
         self._label_set = open_label_set(settings.classes)
 
-    def __call__(self, scan: Scan) -> tuple[Points | None, list[Labelled]]:
+    def __call__(self, scan: Scan) -> tuple[Points | None, list[Labelled], list[Skip]]:
         try:
             points = scan.read()
         except DataError as error:
-            self._stats.skips.append(Skip("scan", f"frame {self._log.frame_of(scan)}", str(error)))
-            return None, []
+            return None, [], [Skip("scan", f"frame {self._log.frame_of(scan)}", str(error))]
         if self._segmenter is None:
-            return points, []
+            return points, [], []
         seen = [self._labelled(camera, scan, self._segmenter) for camera in self._log.cameras]
-        return points, [one for one in seen if one is not None]
+        skips = [one for one in seen if isinstance(one, Skip)]
+        return points, [one for one in seen if not isinstance(one, Skip)], skips
 
-    def _labelled(self, camera: Camera, scan: Scan, segmenter: Segmenter) -> Labelled | None:
-        image = self._log.image_at(scan.stamp, self._within_s, camera.name)
+    def _labelled(self, camera: Camera, scan: Scan, segmenter: Segmenter) -> Labelled | Skip:
+        image = image_exposed_at(scan.stamp, self._log, camera, self._labelling)
         if image is None:
             of = f" of {camera.name}" if camera.name else ""
-            self._stats.skips.append(
-                Skip("labels", f"frame {self._log.frame_of(scan)}", f"no image{of} near its stamp")
-            )
-            return None
+            return Skip("labels", f"frame {self._log.frame_of(scan)}", f"no image{of} near its stamp")
         try:
             seen = segmenter.kept(image) if isinstance(segmenter, KeepsLabels) else segmenter(image)
             where = f"labels of image {image.frame}"
@@ -309,5 +307,4 @@ class _Read:
         except WriteError:
             raise
         except DataError as error:  # only this image has no labels
-            self._stats.skips.append(Skip("labels", f"frame {image.frame}", str(error)))
-            return None
+            return Skip("labels", f"frame {image.frame}", str(error))

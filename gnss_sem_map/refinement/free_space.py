@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from gnss_sem_map.dynamics.range_images import FARTHEST_M
 from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
@@ -33,6 +34,7 @@ class FreeSpaceSettings(StepSettings):
     farthest_m: float = Field(
         default=80.0,
         gt=0,
+        le=FARTHEST_M,
         description="Scans farther than this are no evidence, m; farther than for objects, which need an outline.",
     )
 

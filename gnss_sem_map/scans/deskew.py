@@ -38,7 +38,7 @@ class Knots:
 def points_in_map(
     points: Points, stamp: float, trajectory: Trajectory, T_imu_lidar: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The finite points (m, 3) m of one sweep in the map frame; see `usable_points_in_map`."""
+    """The usable points (m, 3) m of one sweep in the map frame; see `usable_points_in_map`."""
     return usable_points_in_map(points, stamp, trajectory, T_imu_lidar)[0]
 
 
@@ -50,7 +50,7 @@ def usable_points_in_map(
     nearest_m: float = 0.0,
     farthest_m: float = np.inf,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The finite points of one sweep that are in range, in the map frame (m, 3) m, and their mask (n,) (eq. 1).
+    """The usable points of one sweep in the map frame (m, 3) m, and their mask (n,) (eq. 1); see `kernels.mark_usable`.
 
     Raises MeasurementError when the sweep leaves the trajectory by more than 0.15 s.
     """
@@ -104,17 +104,15 @@ def knots_of(
     if points.stamps is None:
         T_map_lidar = trajectory.at([stamp], EXTRAPOLATE_S)[:, :3] @ T_imu_lidar
         return np.empty(0), Knots(0, np.concatenate([T_map_lidar, np.zeros_like(T_map_lidar)], axis=2))
-    first, last = points.stamps.min(initial=np.inf), points.stamps.max(initial=-np.inf)
-    if not last - first <= LONGEST_SWEEP_S:
-        valid = np.empty(len(points.xyz), np.bool_)
-        kernels.mark_usable(points.rows, nearest_m, farthest_m, valid)
-        used = points.stamps[valid]
-        first, last = used.min(initial=np.inf), used.max(initial=-np.inf)
-        if last - first > LONGEST_SWEEP_S:
-            raise MeasurementError(
-                f"the sweep takes {last - first:.6g} s, expected at most {LONGEST_SWEEP_S:g}; are its times in s?"
-            )
-    if not first <= last:  # no point is usable
+    valid = np.empty(len(points.xyz), np.bool_)
+    kernels.mark_usable(points.rows, points.stamps, nearest_m, farthest_m, valid)
+    used = points.stamps[valid]
+    first, last = used.min(initial=np.inf), used.max(initial=-np.inf)
+    if last - first > LONGEST_SWEEP_S:
+        raise MeasurementError(
+            f"the sweep takes {last - first:.6g} s, expected at most {LONGEST_SWEEP_S:g}; are its times in s?"
+        )
+    if not len(used):  # no point is usable
         return points.stamps, Knots(0, np.zeros((1, 3, 8)))
     numbers = np.arange(np.floor(first * KNOTS_PER_S), np.floor(last * KNOTS_PER_S) + 2)
     T_map_lidar = trajectory.at(numbers / KNOTS_PER_S, EXTRAPOLATE_S + 1 / KNOTS_PER_S)[:, :3] @ T_imu_lidar

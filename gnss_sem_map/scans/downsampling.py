@@ -6,7 +6,7 @@ import numpy as np
 from numba import int64, njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.scans.kernels import coordinates
+from gnss_sem_map.scans.kernels import coordinates, mark_usable
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, slot_of
 from gnss_sem_map.voxels.kernels import pack_keys
@@ -61,15 +61,15 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
 
     Consecutive points of a scan are often in the same cube: a key that repeats the one before needs no look-up.
     """
-    nearest, farthest, is_timed = nearest_m * nearest_m, farthest_m * farthest_m, len(stamps) > 0
+    usable, is_timed = np.empty(len(means), np.bool_), len(stamps) > 0
+    mark_usable(rows, stamps, nearest_m, farthest_m, usable)
     bits, count, row, previous, stamp = LEAST_BITS, 0, 0, int64(-1), 0.0
     table = np.full(1 << bits, -1, np.int32)
     keys, counts = np.empty(len(means), np.int64), np.empty(len(means), np.int64)
     for i in range(len(means)):
-        x, y, z = coordinates(rows, i)
-        square = x * x + y * y + z * z
-        if not (square >= nearest and square <= farthest):
+        if not usable[i]:
             continue
+        x, y, z = coordinates(rows, i)
         if is_timed:
             stamp = stamps[i]
         key = _key(x / edge_m, y / edge_m, z / edge_m, stamp * SLOTS_PER_S)

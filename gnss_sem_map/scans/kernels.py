@@ -24,7 +24,7 @@ def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, 
 
     `rows` (4 n,) are the points as in the file; `stamps` (n,) s, or empty for a sweep with one pose; `poses` (k, 3, 8),
     see `_move`, are those of knots with the rate `knots_per_s`, numbered from stamp zero. Writes `valid` (n,), the mask
-    of the points that are finite and in range, and `p_map` (3 m,) m, their positions.
+    of the usable points, see `mark_usable`, and `p_map` (3 m,) m, their positions.
     """
     count, block, knots = 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
     for start in range(0, len(valid), BLOCK):
@@ -76,11 +76,10 @@ def _move_block(
     """Transform the usable points of the block from `start` into the first columns of `block`; returns their number."""
     end = min(start + BLOCK, len(valid))
     here, usable = rows[COLUMNS * start : COLUMNS * end], valid[start:end]
-    mark_usable(here, nearest_m, farthest_m, usable)
-    if len(stamps) > 0:
-        then = stamps[start:end]
-        for i in range(len(then)):
-            knots[i] = then[i] * knots_per_s - first_knot
+    then = stamps[start:end]
+    mark_usable(here, then, nearest_m, farthest_m, usable)
+    for i in range(len(then)):
+        knots[i] = then[i] * knots_per_s - first_knot
     return _transform(here, usable, knots, poses, block)
 
 
@@ -90,13 +89,18 @@ def coordinates(rows, i):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_usable(rows, nearest_m, farthest_m, valid):
-    """Mark the points (n,) that are finite and in range."""
+def mark_usable(rows, stamps, nearest_m, farthest_m, valid):
+    """Mark the points (n,) that are finite and in range, and whose stamps are finite; `stamps` (n,) s, or empty.
+
+    A point at zero is no return, whatever the range: so some drivers write that nothing came back.
+    """
     nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
     for i in range(len(valid)):
         x, y, z = coordinates(rows, i)
         square = x * x + y * y + z * z
-        valid[i] = (square >= nearest) & (square <= farthest)
+        valid[i] = (square > 0) & (square >= nearest) & (square <= farthest)
+    for i in range(len(stamps)):
+        valid[i] &= np.isfinite(stamps[i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

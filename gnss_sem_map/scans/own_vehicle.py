@@ -18,6 +18,13 @@ CELL_M, LEAST_SHARE = 0.2, 0.7
 and again, stay below half."""
 
 
+def returns_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The returns (m, 3) m among the rows (n, 3) of a scan; drivers write NaN or zeros where nothing came back."""
+    p_lidar = points.astype(np.float64)
+    ranges = np.linalg.norm(p_lidar, axis=1)
+    return np.asarray(p_lidar[(ranges >= NEAREST_M) & (ranges < np.inf)])
+
+
 def reach_of_vehicle(scans: Sequence[NDArray[np.floating]]) -> float:
     """Range, m, up to which the points (n, 3) m of some scans of a drive may be of the vehicle.
 
@@ -25,7 +32,7 @@ def reach_of_vehicle(scans: Sequence[NDArray[np.floating]]) -> float:
     """
     cells = [np.empty(0, np.int64)]
     for points in scans:
-        p_lidar = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        p_lidar = returns_of(points)
         cells.append(np.unique(keys_of(p_lidar[np.linalg.norm(p_lidar, axis=1) < FARTHEST_M], CELL_M)))
     keys, times = np.unique(np.concatenate(cells), return_counts=True)
     own = (unpack(keys[times > LEAST_SHARE * len(scans)]) + 0.5) * CELL_M

@@ -11,14 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.labels.probabilities import LabelImage
+from gnss_sem_map.labels.probabilities import LabelImage, shrink_of
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
-from gnss_sem_map.sensor_log import Calibration, Image
+from gnss_sem_map.sensor_log import Calibration, Image, SensorLog
 from gnss_sem_map.sensor_log.cameras import Camera
 
 NEAREST_DEPTH_M = 0.5
-LARGEST_SHRINK = 8
 
 
 class LabellingSettings(BaseModel):
@@ -50,7 +49,7 @@ class LabellingSettings(BaseModel):
         description="Ignore pixels that are most probably `other`; by default the other classes share their vote.",
     )
     image_within_s: float = Field(
-        0.06, gt=0, description="Largest time difference between a scan and its image."
+        0.06, gt=0, description="Largest time difference between a scan and the exposure of its image."
     )
     camera_time_offset_s: float | None = Field(
         None,
@@ -116,15 +115,15 @@ def class_image(
     """Sum the classes of a network, by name, into those of the map, and find the scale to the camera image.
 
     `probabilities` (h, w, s): uint8 as round(255 p), or floating in 0..1; (h, w) the camera image's size or that size
-    divided by an integer and rounded down. Raises DataError for another size, ConfigError for an unknown class name.
+    divided and rounded down, see `shrink_of`. Raises DataError for another size, ConfigError for an unknown class name.
     """
     if isinstance(probabilities, LabelImage):
-        return ClassImage(probabilities, _shrink(probabilities.ids.shape, image_size, where))
+        return ClassImage(probabilities, shrink_of(probabilities.ids.shape, image_size, where))
     if probabilities.ndim != 3 or probabilities.shape[2] != len(class_names):
         raise DataError(
             f"{where}: found shape {probabilities.shape}, expected (h, w, {len(class_names)}) for {list(class_names)}"
         )
-    shrink = _shrink(probabilities.shape[:2], image_size, where)
+    shrink = shrink_of(probabilities.shape, image_size, where)
     wanted = (*label_set.names, "other")
     if probabilities.dtype == np.uint8 and tuple(class_names) == wanted:
         return ClassImage(np.asarray(probabilities, np.uint8), shrink)
@@ -136,21 +135,22 @@ def class_image(
     return ClassImage(np.minimum(summed, 255).astype(np.uint8), shrink)
 
 
-def _shrink(shape: tuple[int, ...], image_size: tuple[int, int], where: str) -> int:
-    width, height = image_size
-    for shrink in range(1, LARGEST_SHRINK + 1):
-        if shape == (height // shrink, width // shrink):
-            return shrink
-    raise DataError(
-        f"{where}: found {shape[1]} x {shape[0]} pixels for a camera of {width} x {height};"
-        f" expected that size, or it divided by 2 to {LARGEST_SHRINK} and rounded down"
-    )
+def exposure_offset_s(camera: Camera, settings: LabellingSettings) -> float:
+    """Moment of exposure minus image stamp, s."""
+    given = settings.camera_time_offset_s
+    return camera.time_offset_s if given is None else given
 
 
 def exposure_stamp(image: Image, calibration: Calibration, settings: LabellingSettings) -> float:
     """Moment at which the image was exposed, s."""
-    offset = settings.camera_time_offset_s
-    return image.stamp + (calibration.camera(image.camera).time_offset_s if offset is None else offset)
+    return image.stamp + exposure_offset_s(calibration.camera(image.camera), settings)
+
+
+def image_exposed_at(
+    stamp: float, log: SensorLog, camera: Camera, settings: LabellingSettings
+) -> Image | None:
+    """The image of a camera exposed nearest in time to `stamp`, or None when none was within `image_within_s`."""
+    return log.image_at(stamp - exposure_offset_s(camera, settings), settings.image_within_s, camera.name)
 
 
 def view_at(

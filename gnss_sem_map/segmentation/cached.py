@@ -13,7 +13,7 @@ from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.files.pictures import read_ids
 from gnss_sem_map.files.untrusted import inside, is_folder, shown
 from gnss_sem_map.labels.label_set import OTHER, UNLABELLED, LabelSet, taxonomy
-from gnss_sem_map.labels.probabilities import LabelImage, check_shape, check_size, checked_probabilities
+from gnss_sem_map.labels.probabilities import LabelImage, check_shape, checked_probabilities, shrink_of
 from gnss_sem_map.segmentation import MissingLabels
 from gnss_sem_map.sensor_log import Image
 
@@ -109,7 +109,8 @@ class CachedLabels:
         import cv2
 
         ids = read_ids(path)
-        check_size(ids.shape, size, str(path))
+        if size is not None:
+            shrink_of(ids.shape, size, str(path))
         if cv2.LUT(ids, self._unknown.view(np.uint8)).any():  # many times faster than indexing
             unknown = np.unique(ids[self._unknown[ids]]).tolist()
             raise DataError(
@@ -129,7 +130,8 @@ def read_probabilities(
                 f"{shown(path)}: found class_names of {named.dtype} {named.shape}, expected a list of names"
             )
         check_shape(stored.shape, stored.dtype, named.shape[0], shown(path))
-        check_size(stored.shape, expected_size, shown(path))
+        if expected_size is not None:
+            shrink_of(stored.shape, expected_size, shown(path))
         try:
             names = tuple(map(str, named.read()))
         except ValueError:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.labels.probabilities import check_size, checked_probabilities
+from gnss_sem_map.labels.probabilities import checked_probabilities, shrink_of
 from gnss_sem_map.segmentation.classes import named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels
 from gnss_sem_map.sensor_log import Image
@@ -46,7 +46,7 @@ class PythonSegmenter:
         except Exception as error:  # the user's function may raise anything
             raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
         seen = checked_probabilities(answer, len(self.class_names), where)
-        check_size(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
+        shrink_of(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
         return seen
 
 

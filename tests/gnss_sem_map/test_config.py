@@ -128,6 +128,9 @@ def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
         ("mapping.voxel_size_m=wide", "mapping.voxel_size_m: .*number"),
         ("mapping.voxel_size_m.x=1", "mapping.voxel_size_m: .*number"),
         ("mapping", "expected section.name=value"),
+        ("dynamics.farthest_m=651", "dynamics.farthest_m: .*less than or equal to 650"),
+        ("dynamics.farthest_object_m=651", "dynamics.farthest_object_m: .*less than or equal to 650"),
+        ("refinement.free_space.farthest_m=651", "free_space.farthest_m: .*less than or equal to 650"),
         ("classes.x=1", "classes: .*string"),
     ],
 )

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
 from gnss_sem_map.evaluation.preflight.depth_edges import Change, Edges
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.scans.projection import NEAREST_DEPTH_M
+from gnss_sem_map.scans.projection import NEAREST_DEPTH_M, exposure_offset_s
 
 Array = NDArray[np.float64]
 NAME = "camera against LiDAR"
@@ -284,8 +284,7 @@ def _named(sample: CameraSample, best: Best, found: str) -> Finding:
     found += f", {best.gain:.2f} more with the change (+- {best.gain / best.sigmas:.2f})"
     if family is TIME:
         word = "late" if value < 0 else "early"
-        given = sample.drive.settings.labelling.camera_time_offset_s
-        offset = (sample.camera.time_offset_s if given is None else given) + value
+        offset = exposure_offset_s(sample.camera, sample.drive.settings.labelling) + value
         setting = (
             f"time_offset_s of {sample.camera.name}"
             if sample.camera.name

@@ -12,7 +12,7 @@ from factor_graphs.errors import FactorGraphError
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.depth_edges import Edges, View, depth_edges, edge_strength
 from gnss_sem_map.evaluation.preflight.sample import Sample
-from gnss_sem_map.scans.projection import exposure_stamp
+from gnss_sem_map.scans.projection import exposure_stamp, image_exposed_at
 from gnss_sem_map.sensor_log import Image, Scan
 from gnss_sem_map.sensor_log.cameras import Camera
 
@@ -67,8 +67,7 @@ class CameraSample:
         drive, views, images = self.drive, [], []
         T_imu_lidar = drive.log.calibration.T_imu_lidar
         for scan in scans:
-            within_s = drive.settings.labelling.image_within_s
-            image = drive.log.image_at(scan.stamp, within_s, self.camera.name)
+            image = image_exposed_at(scan.stamp, drive.log, self.camera, drive.settings.labelling)
             if image is None:
                 continue
             try:

@@ -58,7 +58,7 @@ def _clock(sample: CameraSample) -> Finding:
         np.abs(exposed[np.maximum(after - 1, 0)] - scans),
         np.abs(exposed[np.minimum(after, len(exposed) - 1)] - scans),
     )
-    share = float((nearest <= settings.image_within_s + abs(exposed[0] - images[0].stamp)).mean())
+    share = float((nearest <= settings.image_within_s).mean())
     found = (
         f"{share:.0%} of the scans have an image within {settings.image_within_s:g} s;"
         f" images are of {exposed[0]:.1f} to {exposed[-1]:.1f} s, scans of {scans[0]:.1f} to {scans[-1]:.1f} s"

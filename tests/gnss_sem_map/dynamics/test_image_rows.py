@@ -112,6 +112,15 @@ def test_a_lidar_that_saw_nothing_has_no_rows():
     assert len(rows.of_return) == len(rows.around) == CELLS
 
 
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+def test_rows_without_a_return_hide_no_ring_whatever_the_driver_writes(nothing):
+    seen = sphere(EVEN_16)
+    cloud = np.concatenate([seen, np.full((20 * len(seen), 3), nothing)])
+    rows = Rows.of([cloud])
+    np.testing.assert_array_equal(rows.seen, Rows.of([seen]).seen)
+    assert share_seen_through([cloud], rows) == share_seen_through([seen], rows)
+
+
 @pytest.mark.parametrize(
     ("points", "low", "high"), [(50_000, 0.9, 1.0), (9_000, 0.3, 0.8), (3_000, 0.0, 0.25)]
 )

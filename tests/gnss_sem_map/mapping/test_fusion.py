@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,12 +18,12 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
+from gnss_sem_map.mapping.labelled_scans import Drive, label_each_scan, labelled_scans
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.scans.projection import class_image
+from gnss_sem_map.scans.projection import class_image, image_exposed_at
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
-from gnss_sem_map.sensor_log import Image, Skip, file_of
+from gnss_sem_map.sensor_log import Image, Points, Skip, file_of
 
 URBAN = open_label_set()
 
@@ -48,7 +49,7 @@ def test_images_exposed_outside_the_trajectory_cost_the_labels_and_never_the_sca
     drive: Drive, at_once: tuple[Maps, RunStats]
 ) -> None:
     settings, stats = drive.settings, RunStats()
-    late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0})
+    late = settings.labelling.model_copy(update={"camera_time_offset_s": 3600.0, "image_within_s": 4000.0})
     found = build_maps(replace(drive, settings=settings.model_copy(update={"labelling": late})), stats).static
     np.testing.assert_array_equal(found.keys, at_once[0].static.keys)
     np.testing.assert_array_equal(found.hits, at_once[0].static.hits)
@@ -86,6 +87,25 @@ def test_an_image_that_cannot_be_segmented_costs_its_own_labels_only(
         parts = ("points left out", "points unlabelled", "points labelled")
         assert counts["points"] == sum(counts[part] for part in parts)
         assert 0 < counts["points labelled"] < at_once[1].counts["points labelled"]
+
+
+def test_what_is_left_out_is_listed_in_the_order_of_the_scans(drive: Drive) -> None:
+    """A thread that reads ahead finds the one, and the thread that deskews the other."""
+
+    class Hopeless:
+        class_names = ("road", "other")
+
+        def __call__(self, image: Image) -> NDArray[np.uint8]:
+            raise DataError("this network is broken")
+
+    nothing = Points(np.full((5, 3), np.nan, np.float32), np.zeros(5, np.float32), None)
+    scans = [replace(scan, read=lambda: nothing) for scan in drive.log.scans]
+    stats = RunStats()
+    for _ in label_each_scan(replace(drive, segmenter=Hopeless()), scans, stats):
+        time.sleep(0.02)  # the reader is ahead
+    assert [(skip.what, skip.where) for skip in stats.skips] == [
+        (what, f"frame {scan.number}") for scan in scans for what in ("labels", "scan")
+    ]
 
 
 def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive) -> None:
@@ -134,7 +154,7 @@ def test_the_whole_chain_equals_plain_numpy_bit_for_bit(drive: Drive, at_once: t
             drive.nearest_m, settings.mapping.farthest_m,
         )  # fmt: skip
         np.testing.assert_array_equal(seen.p_map, p_map)
-        image = log.image_at(seen.scan.stamp, settings.labelling.image_within_s)
+        image = image_exposed_at(seen.scan.stamp, log, log.calibration.camera(), settings.labelling)
         assert image is not None
         assert drive.segmenter is not None
         classes = class_image(

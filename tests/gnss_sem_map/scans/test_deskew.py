@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.scans.deskew import points_in_map, usable_points_at_stamp, usable_points_in_map
+from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.sensor_log import Points
 
 T_IMU_LIDAR = np.eye(4)
@@ -64,7 +65,7 @@ def test_a_point_does_not_move_for_what_else_the_sweep_holds() -> None:
         np.testing.assert_array_equal(points_in_map(points[some], 0.45, trajectory, T_IMU_LIDAR), whole[some])
 
 
-@pytest.mark.parametrize("junk", [0.0, -1e9, 1e300, np.nan])
+@pytest.mark.parametrize("junk", [0.0, 1.3, -1e9, 1e300, np.nan])
 def test_stamps_of_points_that_are_left_out_may_be_anything(junk: float) -> None:
     points, trajectory = sweep(), turning()
     whole = points_in_map(points, 0.45, trajectory, T_IMU_LIDAR)
@@ -72,6 +73,26 @@ def test_stamps_of_points_that_are_left_out_may_be_anything(junk: float) -> None
     xyz, stamps = points.xyz.copy(), np.array(points.stamps)
     xyz[out], stamps[out] = np.nan, junk
     damaged = Points(xyz, points.intensity, stamps)
+    p_map, valid = usable_points_in_map(damaged, 0.45, trajectory, T_IMU_LIDAR)
+    np.testing.assert_array_equal(valid, ~out)
+    np.testing.assert_array_equal(p_map, whole[~out])
+
+
+def test_a_row_of_zeros_is_no_point_whatever_the_range() -> None:
+    points = sweep(100)
+    xyz = np.where(np.arange(100)[:, None] % 3 == 0, np.float32(0), points.xyz)
+    zeros = Points(xyz, points.intensity, points.stamps)
+    _, valid = usable_points_in_map(zeros, 0.45, turning(), T_IMU_LIDAR, nearest_m=0.0)
+    np.testing.assert_array_equal(valid, np.arange(100) % 3 > 0)
+    np.testing.assert_array_equal(thinned(zeros, 0.5, 0, 80).xyz, thinned(points[valid], 0.5, 0, 80).xyz)
+
+
+@pytest.mark.parametrize("junk", [np.nan, np.inf, -np.inf])
+def test_a_point_without_a_stamp_is_left_out(junk: float) -> None:
+    points, trajectory = sweep(), turning()
+    whole = points_in_map(points, 0.45, trajectory, T_IMU_LIDAR)
+    out = np.random.default_rng(3).random(len(whole)) < 0.2
+    damaged = Points(points.xyz, points.intensity, np.where(out, junk, np.array(points.stamps)))
     p_map, valid = usable_points_in_map(damaged, 0.45, trajectory, T_IMU_LIDAR)
     np.testing.assert_array_equal(valid, ~out)
     np.testing.assert_array_equal(p_map, whole[~out])

@@ -64,6 +64,14 @@ def test_a_thinned_sweep_has_the_means_of_its_usable_points(is_timed: bool) -> N
         np.testing.assert_allclose(found.stamps, expected[:, 4], rtol=0, atol=1e-12)
 
 
+def test_a_point_without_a_stamp_is_in_no_mean() -> None:
+    points = sweep()
+    assert points.stamps is not None
+    is_timed = np.arange(len(points.stamps)) % 7 > 0
+    found = thinned(replace(points, stamps=np.where(is_timed, points.stamps, np.nan)), 0.65, 0.5, 60.0)
+    np.testing.assert_array_equal(found.xyz, thinned(points[is_timed], 0.65, 0.5, 60.0).xyz)
+
+
 def test_a_sweep_without_usable_points_is_empty_when_thinned() -> None:
     assert len(thinned(sweep(), 0.5, 1e4, 1e5).xyz) == 0
     assert len(thinned(sweep(0), 0.5, 1.0, 80.0).xyz) == 0

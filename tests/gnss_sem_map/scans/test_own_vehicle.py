@@ -31,7 +31,7 @@ def test_what_is_passed_now_and_then_is_not(passed: int) -> None:
     scans = [*parked, *[np.full((5, 3), np.nan)] * (SCANS - passed)]
     assert reach_of_vehicle(scans) == NEAREST_M
     no_return = np.zeros((50, 3))
-    assert reach_of_vehicle([np.concatenate([points, no_return]) for points in scans]) < 0.7
+    assert reach_of_vehicle([np.concatenate([points, no_return]) for points in scans]) == NEAREST_M
 
 
 def test_a_vehicle_that_stands_does_not_tell_itself_from_what_is_around() -> None:

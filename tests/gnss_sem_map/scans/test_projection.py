@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,9 +20,10 @@ from gnss_sem_map.scans.projection import (
     LabellingSettings,
     class_image,
     exposure_stamp,
+    image_exposed_at,
     pixels_seen,
 )
-from gnss_sem_map.sensor_log import Calibration, Image
+from gnss_sem_map.sensor_log import Calibration, Image, SensorLog
 from gnss_sem_map.sensor_log.cameras import Camera
 
 URBAN = open_label_set()
@@ -153,11 +155,11 @@ def test_a_label_image_says_the_same_as_the_probabilities_of_its_ids() -> None:
 
 def test_a_label_map_of_another_size_is_refused() -> None:
     names = (*URBAN.names, "other")
-    for shape, shrink in (((96, 300), 1), ((48, 150), 2), ((32, 100), 3), ((12, 37), 8)):
+    for shape, shrink in (((96, 300), 1), ((48, 150), 2), ((32, 100), 3), ((12, 37), 8), ((6, 18), 16)):
         assert class_image(np.zeros((*shape, 6), np.uint8), names, URBAN, (300, 96), "here").shrink == shrink
-    for shape in ((96, 299), (95, 300), (300, 96), (6, 18)):
+    for shape in ((96, 299), (95, 300), (300, 96), (5, 17)):
         with pytest.raises(
-            DataError, match=f"here: found {shape[1]} x {shape[0]} pixels for a camera of 300 x 96"
+            DataError, match=f"here: found {shape[1]} x {shape[0]} pixels for an image of 300 x 96"
         ):
             class_image(np.zeros((*shape, 6), np.uint8), names, URBAN, (300, 96), "here")
     with pytest.raises(DataError, match=r"expected \(h, w, 6\)"):
@@ -172,3 +174,14 @@ def test_the_moment_of_exposure_is_the_drive_s_unless_set() -> None:
     image = Image(3, 10.0, lambda: np.zeros((1, 1, 3), np.uint8))
     assert exposure_stamp(image, CAMERA, SETTINGS) == pytest.approx(9.9915)
     assert exposure_stamp(image, CAMERA, LabellingSettings(camera_time_offset_s=0.25)) == pytest.approx(10.25)
+
+
+@pytest.mark.parametrize(("offset_s", "number"), [(0.0, 2), (0.08, 1), (-0.08, 3), (0.5, None)])
+def test_the_image_of_a_scan_is_the_one_exposed_nearest_to_it(offset_s: float, number: int | None) -> None:
+    images = tuple(Image(k, 0.1 * k, lambda: np.zeros((1, 1, 3), np.uint8)) for k in range(5))
+    camera = replace(CAMERA.camera(), time_offset_s=offset_s)
+    calibration = Calibration(street.T_IMU_LIDAR, (camera,))
+    log = SensorLog("drive", 0, calibration, (), images, given=standing(np.eye(4)))
+    found = image_exposed_at(0.2, log, camera, SETTINGS)
+    assert (None if found is None else found.number) == number
+    assert image_exposed_at(0.2, log, camera, LabellingSettings(camera_time_offset_s=0.08)) is images[1]

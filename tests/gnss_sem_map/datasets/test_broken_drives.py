@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import street
 from street import Street
@@ -65,6 +66,14 @@ def test_a_damaged_image_and_one_of_another_size_are_named_when_read(copy: Path)
     street.cv2.imwrite(str(path), small)
     with pytest.raises(DataError, match="found 300 x 40 pixels, expected 300 x 96"):
         log.images[2].read()
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_image_of_16_bits_is_refused_and_not_made_white(copy: Path, channels: int) -> None:
+    values = np.linspace(0, 40950, 300 * 96 * channels).astype(np.uint16)
+    street.cv2.imwrite(str(copy / "image_02/data/0000000002.png"), values.reshape(96, 300, channels))
+    with pytest.raises(DataError, match=r"0000000002\.png: found uint16 .*expected 8 bits a channel"):
+        open_drive(copy).images[2].read()
 
 
 def test_a_folder_that_is_no_drive_says_what_a_drive_looks_like(tmp_path: Path) -> None:

@@ -322,7 +322,8 @@ class SensorLog:
 
 
 def _later(scan: Scan, offset_s: float) -> Scan:
-    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s))
+    sweep = None if scan.sweep is None else (scan.sweep[0] + offset_s, scan.sweep[1] + offset_s)
+    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s), sweep=sweep)
 
 
 def _read_later(scan: Scan, offset_s: float) -> Points:

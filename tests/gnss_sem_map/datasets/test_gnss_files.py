@@ -166,6 +166,26 @@ def test_nmea_over_midnight(tmp_path: Path) -> None:
     np.testing.assert_allclose(read(undated, drive).rows[:, 0], late)
 
 
+@pytest.mark.parametrize("ahead_s", [-43_200, 43_200, 46_800])
+def test_nmea_without_dates_in_local_time_is_of_the_day_of_the_drive(tmp_path: Path, ahead_s: int) -> None:
+    """New Zealand is 12 or 13 hours ahead, so the day there is another one in the morning."""
+    for hour in range(24):
+        start = START_NS + hour * 3600 * 10**9
+        local = [start + (ahead_s + k) * 10**9 for k in range(60)]
+        drive = (start, start + 60 * 10**9)
+        found = read(nmea(tmp_path, *map(gga, local)), drive, utc_offset_s=ahead_s)
+        np.testing.assert_array_equal(found.stamps_ns, start + np.arange(60) * 10**9)
+
+
+def test_nmea_without_dates_may_begin_hours_before_the_drive_or_end_hours_after_it(tmp_path: Path) -> None:
+    day = START_NS // (86_400 * 10**9) * 86_400 * 10**9
+    times = [day + k * 60 * 10**9 for k in range(24 * 60)]
+    path = nmea(tmp_path, *map(gga, times))
+    for hour in (0, 14, 23):
+        start = day + (hour * 3600 + 60) * 10**9
+        assert read(path, (start, start + 60 * 10**9)).stamps_ns.tolist() == times
+
+
 def test_nmea_that_is_no_fix_is_counted(tmp_path: Path) -> None:
     path = nmea(
         tmp_path, rmc(START_NS), gga(START_NS, quality=0), gga(START_NS, quality=6), gga(START_NS, sep=""),

@@ -78,7 +78,8 @@ def read_gnss_file(
         )
     accuracy = None if about.accuracy is None else _inside(folder, about.accuracy)
     ahead_ns = round(about.utc_offset_s * 1e9)
-    near_ns = None if drive_ns is None else sum(drive_ns) // 2 + ahead_ns  # the middle, by the clock of the file
+    # the middle of the drive by the clock of the file
+    near_ns = None if drive_ns is None else sum(drive_ns) // 2 + ahead_ns
     found = reader(path, near_ns, accuracy, about.stddevs_m is not None)
     stamps_ns = _on_unix_clock(found, about)
     if drive_ns is not None:

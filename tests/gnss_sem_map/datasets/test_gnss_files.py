@@ -107,6 +107,14 @@ def test_lines_of_no_solution_are_counted(tmp_path: Path) -> None:
         read(pos(tmp_path, ["nothing"]))
 
 
+@pytest.mark.parametrize("time", ["99999999999 0.000", "99999/01/01 00:00:00.000", "1500/01/01 00:00:00.000"])
+def test_lines_of_impossible_years_are_counted(tmp_path: Path, time: str) -> None:
+    wrong = f"{time} 49.0 8.4 160.0 1 9 0.01 0.01 0.02"
+    found = read(pos(tmp_path, [pos_row(START_NS + LEAP_NS), wrong]))
+    assert found.stamps_ns.tolist() == [START_NS]
+    assert [skip.frames for skip in found.skips] == [1]
+
+
 # ---- NMEA, written by pynmeagps
 
 

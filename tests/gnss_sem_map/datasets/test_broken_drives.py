@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -120,3 +121,22 @@ def test_a_broken_table_log_is_refused(
     (drive / name).write_text(content.replace(old, new, 1))
     with pytest.raises(DataError, match=says):
         open_drive(drive)
+
+
+@pytest.mark.parametrize("key", ["lidars", "cameras"])
+@pytest.mark.parametrize("name", ["../../secret", "/tmp", "front\n"])
+def test_a_sensor_of_a_table_log_is_in_a_folder_of_the_drive(
+    small_drive: Street, tmp_path: Path, key: str, name: str
+) -> None:
+    """Of the only one as well, whose name is not used otherwise."""
+    drive = street.write_table_log(tmp_path, small_drive)
+    eye = np.eye(4).tolist()
+    one = (
+        {"T_imu_lidar": eye}
+        if key == "lidars"
+        else {"T_imu_camera": eye, "K": np.eye(3).tolist(), "image_size": [9, 9]}
+    )
+    (drive / "log.yaml").write_text(json.dumps({key: {name: one}}))
+    with pytest.raises(DataError, match=rf"log\.yaml: {key}\..*expected a name of letters") as caught:
+        open_drive(drive)
+    assert "\n" not in str(caught.value)

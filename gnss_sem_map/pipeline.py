@@ -132,6 +132,7 @@ def run(
     `write` gets the trajectory before anything is mapped, and what the map does not need of it is not held any longer.
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
+    log.check_scans()
     log = log.in_our_conventions(settings.sensors)
     check_georeference(log, origin)
     stats = RunStats(skips=list(log.skips))

@@ -26,6 +26,7 @@ def print_plan(sources: Iterable[Source], settings: Settings, workers: int) -> N
             typer.echo(no_segmenter_message(source.drive), err=True)
             raise typer.Exit(1)
         source.open_network(settings, log)
+        log.check_scans()
         for line in _of_drive(source, log):
             typer.echo(line)
         cost = _cost(log, workers)

@@ -50,7 +50,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Lidar, Points, Scan, SensorLog, Skip
-from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
+from gnss_sem_map.sensor_log.cameras import Camera, Distortion, SensorName, lidar_to_camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
@@ -137,7 +137,7 @@ class LogFile(SensorConventions):
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
     T_imu_lidar: Matrix4 = Field(IDENTITY, description="LiDAR to IMU.")
-    lidars: dict[str, LidarFile] = Field(
+    lidars: dict[SensorName, LidarFile] = Field(
         {}, description="Several LiDARs by name, in place of T_imu_lidar; T_camera_lidar is of the first."
     )
     T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to the only camera.")
@@ -145,7 +145,7 @@ class LogFile(SensorConventions):
     image_size: tuple[int, int] | None = Field(None, description="Width and height of its images, px.")
     distortion: Distortion | None = Field(None, description="Of its lens; default: its images are rectified.")
     camera_time_offset_s: float = Field(0.0, description="Moment of its exposure minus image stamp.")
-    cameras: dict[str, CameraFile] = Field(
+    cameras: dict[SensorName, CameraFile] = Field(
         {}, description="Several cameras by name, in place of the keys above."
     )
     imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
@@ -223,7 +223,7 @@ def _about(path: Path) -> LogFile:
         return LogFile.model_validate(read_yaml(path) or {})
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place = " ".join(".".join(map(str, first["loc"])).split())
         raise DataError(
             f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; known keys are {sorted(LogFile.model_fields)}"
         ) from None

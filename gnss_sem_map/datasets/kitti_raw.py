@@ -184,7 +184,10 @@ def lidar_from_imu(date: Path) -> Array:
 
 
 def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
-    """Unix nanoseconds by frame number; blank lines are missing frames, stamps of impossible years are skipped."""
+    """Unix nanoseconds by frame number; blank lines are missing frames.
+
+    Stamps of impossible years are skipped, and those in a leap second, which Unix time does not have.
+    """
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing stamps; expected one line `date time` per frame")
     stamps, skips = {}, []
@@ -194,10 +197,10 @@ def stamps_ns(path: Path) -> tuple[dict[int, int], list[Skip]]:
             continue
         if STAMP.fullmatch(text) is None:
             raise _no_stamp(path, number, text)
-        if not FIRST_YEAR <= int(text[:4]) <= LAST_YEAR:
-            skips.append(
-                Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, no time of a drive")
-            )
+        is_leap_second = text[17:19] == "60"
+        if is_leap_second or not FIRST_YEAR <= int(text[:4]) <= LAST_YEAR:
+            why = "in a leap second" if is_leap_second else "no time of a drive"
+            skips.append(Skip("stamp", f"{shown(path)}: line {number + 1}", f"found {text}, {why}"))
             continue
         try:
             stamps[number] = int(np.datetime64(text.replace(" ", "T"), "ns").astype(np.int64))

@@ -29,6 +29,7 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
     Raises DataError for a file that is no LAS, has no coordinate system, or lies far from the origin.
     """
     import laspy
+    import lazrs
 
     parts: list[NDArray[np.float64]] = [np.empty((0, 3))]
     try:
@@ -46,7 +47,9 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
                 lon_deg, lat_deg, alt_m = to_wgs84.transform(some.x, some.y, some.z)
                 placed = frame.to_map(lat_deg, lon_deg, alt_m)
                 parts.append(one_per_cube(np.ascontiguousarray(placed[_is_near(placed)]), CUBE_M))
-    except (laspy.errors.LaspyException, ProjError, OSError, ValueError) as error:
+    except DataError:
+        raise
+    except (laspy.errors.LaspyException, lazrs.LazrsError, ProjError, OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise DataError(f"{shown(path)}: cannot be read as LAS or LAZ ({reason})") from None
     points = np.concatenate(parts)

@@ -21,6 +21,7 @@ from gnss_sem_map.files.untrusted import MOST_BYTES, open_file, shown
 
 MOST_MEMBERS = 100
 MOST_HEADER_BYTES = 10_000
+MOST_DIMENSIONS = 32
 CHUNK_BYTES = 1 << 18
 KINDS_OF_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 HEADER = re.compile(
@@ -30,10 +31,10 @@ HEADER = re.compile(
 """Format of the header that numpy writes; nothing in it is evaluated."""
 
 _ERRORS = (
-    zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, KeyError, IndexError, OverflowError,
-    RuntimeError, NotImplementedError,
+    zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError, IndexError,
+    OverflowError, RuntimeError, NotImplementedError,
 )  # fmt: skip
-"""Exceptions of `zipfile` for a damaged archive."""
+"""Exceptions of `zipfile` for a damaged archive, and of numpy for a type or a shape that it does not have."""
 
 
 class Archive:
@@ -61,7 +62,9 @@ class Archive:
         with self._damage(), self._members.open(entry) as file:
             dtype, is_fortran, shape, start = _header(file)
         size = math.prod(shape) * dtype.itemsize
-        if dtype.itemsize == 0 or size > most_bytes or start + size != entry.file_size:
+        # numpy limits empty arrays by their other sides
+        largest = math.prod(side or 1 for side in shape) * dtype.itemsize
+        if dtype.itemsize == 0 or largest > most_bytes or start + size != entry.file_size:
             raise DataError(
                 f"{shown(self._path)}: {name} is {dtype} {shape} in {entry.file_size} bytes, expected as many as that"
                 f" needs and at most {most_bytes}"
@@ -70,9 +73,9 @@ class Archive:
 
     def unpack(self, member: Member) -> NDArray[Any]:
         """The values of an array."""
-        values = np.empty(member.shape[::-1] if member.is_fortran else member.shape, member.dtype)
-        room = values.reshape(-1).view(np.uint8)
         with self._damage(), self._members.open(member.entry) as file:
+            values = np.empty(member.shape[::-1] if member.is_fortran else member.shape, member.dtype)
+            room = values.reshape(-1).view(np.uint8)
             file.read(member.start)
             done = 0
             while done < len(room):
@@ -137,6 +140,8 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]
     if found is None:
         raise ValueError("no plain array")
     shape = tuple(int(side) for side in found[3].replace(" ", "").split(",") if side)
+    if len(shape) > MOST_DIMENSIONS:
+        raise ValueError(f"{len(shape)} dimensions, at most {MOST_DIMENSIONS}")
     return np.dtype(found[1]), found[2] == "True", shape, 8 + words + length
 
 

@@ -37,8 +37,8 @@ def read_picture(
 ) -> NDArray[np.uint8]:
     """RGB pixels (h, w, 3) of a PNG or JPEG.
 
-    Raises DataError for a damaged one, one of another (width, height), and where `needs_colour` one of other than three
-    channels of 8 bits.
+    Raises DataError for a damaged one, one of more than 8 bits a channel, one of another (width, height), and where
+    `needs_colour` one of other than three channels.
     """
     return decoded_picture(shown(path), read_bytes(path, MOST_FILE_BYTES), size, needs_colour)
 
@@ -49,8 +49,12 @@ def decoded_picture(
     """RGB pixels (h, w, 3) of the content of a PNG or JPEG; `where` is its name in errors. See `read_picture`."""
     with _opened(where, content) as picture:
         _check_size(where, picture.size, size)
-        if needs_colour and (picture.mode not in ("RGB", "P") or _depth(content) > 8):
+        if needs_colour and picture.mode not in ("RGB", "P"):
             raise DataError(f"{where}: found {_described(picture, content)}, expected 8-bit colour")
+        if _depth(content) > 8:  # converted to RGB, whatever is above 255 would be white
+            raise DataError(
+                f"{where}: found {_described(picture, content)}, expected 8 bits a channel; convert the images first"
+            )
         return np.array(picture.convert("RGB"))
 
 

@@ -107,11 +107,6 @@ def _warn(drive: Drive, stats: RunStats) -> None:
 
 
 def _check(drive: Drive, stats: RunStats) -> None:
-    if not drive.log.scan_count:
-        raise DataError(
-            f"{drive.log.name}: has no LiDAR scan to map, or none that --frames names; for the trajectory alone:"
-            " gnss-sem-map trajectory"
-        )
     if not stats.counts["scans"]:
         why = _first_reason(stats, "scan")
         raise DataError(f"{drive.log.name}: none of {drive.log.scan_count} scans can be used{why}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight
 from gnss_sem_map.export.page import page as html_page
 from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.files.untrusted import open_file
 
 SUMMARIES = {
     Level.GREEN: "No check found a fault in this drive.",
@@ -15,13 +17,19 @@ SUMMARIES = {
     Level.RED: "A run stops here: the red findings would make a wrong map. Correct them, or run with --force.",
 }
 GENERATOR = b'<meta name="generator" content="gnss-sem-map">'
+HEAD_BYTES = 2000
+"""So much of a page is read to know it: another file may be a large one."""
 
 
 def check_writable(path: Path) -> None:
     """Raise DataError when `path` exists and is not a page of ours."""
     if path.is_dir():
         raise DataError(f"{path}: is a folder, expected a file to write; choose another -o")
-    if path.exists() and GENERATOR not in path.read_bytes()[:2000]:
+    if not path.exists():
+        return
+    with os.fdopen(open_file(path), "rb", buffering=0) as file:  # refuses pipes and devices
+        head = file.read(HEAD_BYTES)
+    if GENERATOR not in head:
         raise DataError(f"{path}: exists and is no page of gnss-sem-map; choose another -o or move it away")
 
 

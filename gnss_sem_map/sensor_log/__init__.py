@@ -271,6 +271,15 @@ class SensorLog:
         """The number of a scan in words, with its LiDAR where there are several."""
         return f"{scan.number} of {self.lidar}" if self.lidar else str(scan.number)
 
+    def check_scans(self) -> None:
+        """Raise DataError when the LiDAR that all else is relative to has no scan: then there is nothing to map."""
+        if not self.scans:
+            of = f" of {self.lidar}" if self.lidar else ""
+            raise DataError(
+                f"{self.name}: has no LiDAR scan{of} to map, or none that --frames names; for the trajectory alone:"
+                " gnss-sem-map trajectory"
+            )
+
     @property
     def scan_count(self) -> int:
         """Number of the scans of all LiDARs."""
@@ -322,7 +331,8 @@ class SensorLog:
 
 
 def _later(scan: Scan, offset_s: float) -> Scan:
-    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s))
+    sweep = None if scan.sweep is None else (scan.sweep[0] + offset_s, scan.sweep[1] + offset_s)
+    return replace(scan, stamp=scan.stamp + offset_s, read=partial(_read_later, scan, offset_s), sweep=sweep)
 
 
 def _read_later(scan: Scan, offset_s: float) -> Points:

@@ -16,11 +16,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from gnss_sem_map.errors import DataError
 
@@ -40,6 +40,16 @@ NEWTON_STEPS, NEWTON_STEP_RAD = 6, 1e-6
 LENS_EDGE = 1.05
 """How much farther out than along x a lens may show its last angle: it is bent sidewards, too."""
 WIDEST_DEG = {"brown": 89.5, "fisheye": 179.5, "mei": 179.5}
+
+
+def _checked_name(name: str) -> str:
+    if not re.fullmatch(NAME, name):
+        raise ValueError("expected a name of letters, digits, _ and -; a folder of the drive has it")
+    return name
+
+
+SensorName = Annotated[str, AfterValidator(_checked_name)]
+"""Name of a LiDAR or camera in a settings file: no path, so nothing outside of the drive is read."""
 
 
 class Distortion(BaseModel):

@@ -81,6 +81,15 @@ def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(
     assert "--segmenter none" in dry.stderr
 
 
+def test_a_dry_run_without_scans_ends_as_the_run_does(small_drive: Street, tmp_path: Path) -> None:
+    options = ("--frames", "900:", "--segmenter", "none", "-o", tmp_path / "new")
+    words = ("-q", "run", small_drive.drive, *options)
+    run, dry = program(*words), program(*words, "--dry-run")
+    assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
+    assert run.returncode == 1
+    assert "has no LiDAR scan to map" in dry.stderr
+
+
 def test_a_dry_run_counts_on_a_damaged_scan_being_skipped(small_drive: Street, tmp_path: Path) -> None:
     date = tmp_path / small_drive.drive.parent.name
     shutil.copytree(small_drive.drive.parent, date)

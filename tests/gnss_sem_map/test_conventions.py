@@ -110,6 +110,8 @@ def test_clocks_are_shifted_with_everything_that_they_stamp(log: SensorLog) -> N
     np.testing.assert_allclose(shifted.gnss.stamps, log.gnss.stamps - 1.0)
     for before, after in zip(log.scans, shifted.scans, strict=True):
         assert after.stamp == before.stamp + 0.25
+        assert before.sweep is not None
+        assert after.sweep == (before.sweep[0] + 0.25, before.sweep[1] + 0.25)
         was, now = before.read().stamps, after.read().stamps
         assert was is not None
         assert now is not None

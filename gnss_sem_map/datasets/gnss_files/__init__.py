@@ -77,7 +77,10 @@ def read_gnss_file(
             f"{shown(path)}: found the ending {path.suffix!r}, expected one of {', '.join(READERS)}"
         )
     accuracy = None if about.accuracy is None else _inside(folder, about.accuracy)
-    found = reader(path, None if drive_ns is None else drive_ns[0], accuracy, about.stddevs_m is not None)
+    ahead_ns = round(about.utc_offset_s * 1e9)
+    # the middle of the drive by the clock of the file
+    near_ns = None if drive_ns is None else sum(drive_ns) // 2 + ahead_ns
+    found = reader(path, near_ns, accuracy, about.stddevs_m is not None)
     stamps_ns = _on_unix_clock(found, about)
     if drive_ns is not None:
         _check_overlap(path, stamps_ns, drive_ns)

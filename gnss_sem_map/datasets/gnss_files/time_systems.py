@@ -32,6 +32,10 @@ def gps_of_utc_ns(stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def nearest(stamp_ns: NDArray[np.int64], period_ns: int, near_ns: int) -> NDArray[np.int64]:
-    """Times of a day or a week, ns from its start, moved by whole periods so that the first is nearest to a moment."""
-    shift = round((near_ns - int(stamp_ns[0])) / period_ns) * period_ns
+    """Times of a day or a week, ns from its start, moved by whole periods so that their middle is nearest to a moment.
+
+    Where that is the middle of a drive, they share as much time with it as they can.
+    """
+    middle_ns = (int(stamp_ns.min()) + int(stamp_ns.max())) // 2
+    shift = round((near_ns - middle_ns) / period_ns) * period_ns
     return np.asarray(stamp_ns + shift)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import street
 from street import Street
@@ -67,6 +69,14 @@ def test_a_damaged_image_and_one_of_another_size_are_named_when_read(copy: Path)
         log.images[2].read()
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_an_image_of_16_bits_is_refused_and_not_made_white(copy: Path, channels: int) -> None:
+    values = np.linspace(0, 40950, 300 * 96 * channels).astype(np.uint16)
+    street.cv2.imwrite(str(copy / "image_02/data/0000000002.png"), values.reshape(96, 300, channels))
+    with pytest.raises(DataError, match=r"0000000002\.png: found uint16 .*expected 8 bits a channel"):
+        open_drive(copy).images[2].read()
+
+
 def test_a_folder_that_is_no_drive_says_what_a_drive_looks_like(tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").write_text("")
     with pytest.raises(DataError, match=r"found \['holiday.jpg'\], expected .*oxts/"):
@@ -111,3 +121,22 @@ def test_a_broken_table_log_is_refused(
     (drive / name).write_text(content.replace(old, new, 1))
     with pytest.raises(DataError, match=says):
         open_drive(drive)
+
+
+@pytest.mark.parametrize("key", ["lidars", "cameras"])
+@pytest.mark.parametrize("name", ["../../secret", "/tmp", "front\n"])
+def test_a_sensor_of_a_table_log_is_in_a_folder_of_the_drive(
+    small_drive: Street, tmp_path: Path, key: str, name: str
+) -> None:
+    """Of the only one as well, whose name is not used otherwise."""
+    drive = street.write_table_log(tmp_path, small_drive)
+    eye = np.eye(4).tolist()
+    one = (
+        {"T_imu_lidar": eye}
+        if key == "lidars"
+        else {"T_imu_camera": eye, "K": np.eye(3).tolist(), "image_size": [9, 9]}
+    )
+    (drive / "log.yaml").write_text(json.dumps({key: {name: one}}))
+    with pytest.raises(DataError, match=rf"log\.yaml: {key}\..*expected a name of letters") as caught:
+        open_drive(drive)
+    assert "\n" not in str(caught.value)

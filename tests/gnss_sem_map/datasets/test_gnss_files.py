@@ -107,6 +107,14 @@ def test_lines_of_no_solution_are_counted(tmp_path: Path) -> None:
         read(pos(tmp_path, ["nothing"]))
 
 
+@pytest.mark.parametrize("time", ["99999999999 0.000", "99999/01/01 00:00:00.000", "1500/01/01 00:00:00.000"])
+def test_lines_of_impossible_years_are_counted(tmp_path: Path, time: str) -> None:
+    wrong = f"{time} 49.0 8.4 160.0 1 9 0.01 0.01 0.02"
+    found = read(pos(tmp_path, [pos_row(START_NS + LEAP_NS), wrong]))
+    assert found.stamps_ns.tolist() == [START_NS]
+    assert [skip.frames for skip in found.skips] == [1]
+
+
 # ---- NMEA, written by pynmeagps
 
 
@@ -164,6 +172,26 @@ def test_nmea_over_midnight(tmp_path: Path) -> None:
     np.testing.assert_allclose(read(first_gga, drive).rows[:, 0], late)
     undated = nmea(tmp_path, *map(gga, times))
     np.testing.assert_allclose(read(undated, drive).rows[:, 0], late)
+
+
+@pytest.mark.parametrize("ahead_s", [-43_200, 43_200, 46_800])
+def test_nmea_without_dates_in_local_time_is_of_the_day_of_the_drive(tmp_path: Path, ahead_s: int) -> None:
+    """New Zealand is 12 or 13 hours ahead, so the day there is another one in the morning."""
+    for hour in range(24):
+        start = START_NS + hour * 3600 * 10**9
+        local = [start + (ahead_s + k) * 10**9 for k in range(60)]
+        drive = (start, start + 60 * 10**9)
+        found = read(nmea(tmp_path, *map(gga, local)), drive, utc_offset_s=ahead_s)
+        np.testing.assert_array_equal(found.stamps_ns, start + np.arange(60) * 10**9)
+
+
+def test_nmea_without_dates_may_begin_hours_before_the_drive_or_end_hours_after_it(tmp_path: Path) -> None:
+    day = START_NS // (86_400 * 10**9) * 86_400 * 10**9
+    times = [day + k * 60 * 10**9 for k in range(24 * 60)]
+    path = nmea(tmp_path, *map(gga, times))
+    for hour in (0, 14, 23):
+        start = day + (hour * 3600 + 60) * 10**9
+        assert read(path, (start, start + 60 * 10**9)).stamps_ns.tolist() == times
 
 
 def test_nmea_that_is_no_fix_is_counted(tmp_path: Path) -> None:

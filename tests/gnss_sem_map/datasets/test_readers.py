@@ -144,6 +144,18 @@ def test_blank_stamp_lines_skip_their_frames_only(copy: Path, small_drive: Stree
     assert any(skip.reason == "no stamp for this frame" for skip in log.skips)
 
 
+def test_a_stamp_in_a_leap_second_skips_its_frame_only(copy: Path, small_drive: Street) -> None:
+    path = copy / "image_02/timestamps.txt"
+    lines = path.read_text().splitlines()
+    lines[3] = "2016-12-31 23:59:60.500000000"
+    path.write_text("\n".join(lines) + "\n")
+    log = open_drive(copy)
+    assert [image.number for image in log.images] == [n for n in small_drive.frames if n != 3]
+    [skip] = [skip for skip in log.skips if skip.what == "stamp"]
+    assert skip.where.endswith("timestamps.txt: line 4")
+    assert "in a leap second" in skip.reason
+
+
 def test_oxts_rows_that_are_damaged_or_repeated_are_left_out_and_counted(copy: Path) -> None:
     data = copy / "oxts/data"
     (data / "0000000003.txt").write_text("1 2 3\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation import MissingLabels, open_segmenter
 from gnss_sem_map.sensor_log import Image
@@ -134,6 +136,28 @@ def test_an_id_that_nobody_knows_is_named_with_its_file(tmp_path: Path) -> None:
 
 def npz(**arrays: np.ndarray) -> Callable[[Path], None]:
     return lambda folder: np.savez(folder / "0.npz", **arrays)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shape", "message"),
+    [
+        ("<f3", (0,), "damaged file, or no .npz of plain arrays"),
+        ("|u1", (0, 999_999_999_999_999_999, 99_999_999), "expected as many as that needs and at most"),
+        ("|u1", (0, *[1] * 70), "71 dimensions, at most 32"),
+    ],
+)
+def test_an_array_that_numpy_cannot_have_is_refused(
+    tmp_path: Path, kind: str, shape: tuple[int, ...], message: str
+) -> None:
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    with zipfile.ZipFile(tmp_path / "0.npz", "w") as members:
+        members.writestr("probabilities.npy", content)
+    with (
+        open_archive(tmp_path / "0.npz") as archive,
+        pytest.raises(DataError, match=rf"0\.npz: .*{message}"),
+    ):
+        archive.array("probabilities").read()
 
 
 GOOD = some_probabilities() / np.float32(255)

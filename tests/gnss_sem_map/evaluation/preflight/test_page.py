@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError, amber, green, red
 from gnss_sem_map.pipeline import run
-from gnss_sem_map.runs.check_page import write_check_page
+from gnss_sem_map.runs.check_page import check_writable, write_check_page
 
 RED = red("IMU axes", "mean specific force -9.8 m/s² along z", "z points down: FRD?", "set imu_axes: frd")
 AMBER = amber("GNSS", "5 % of the fixes stand still", "frozen receiver", "leave them out")
@@ -55,6 +56,16 @@ def test_the_page_says_mistake_and_remedy_and_replaces_only_pages_of_ours(tmp_pa
     with pytest.raises(DataError, match="no page of gnss-sem-map"):
         write_check_page(path, "drive", page)
     assert path.read_text() == "my own notes"
+
+
+def test_a_pipe_is_refused_and_of_a_large_file_only_the_start_is_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DataError, match="pipe: found a pipe, expected a file"):
+        check_writable(tmp_path / "pipe")
+    with (tmp_path / "big.bag").open("wb") as file:
+        file.truncate(1 << 43)  # more than any memory
+    with pytest.raises(DataError, match=r"big\.bag: exists and is no page of gnss-sem-map"):
+        check_writable(tmp_path / "big.bag")
 
 
 def test_check_ends_with_1_where_something_is_red_and_0_on_a_good_drive(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gnss_sem_map.evaluation.preflight.findings import Preflight
     from gnss_sem_map.run_stats import Progress
     from gnss_sem_map.segmentation.cache import CacheReport
+    from gnss_sem_map.sensor_log import Skip
 
 
 @contextmanager
@@ -188,8 +189,11 @@ def print_cache(report: CacheReport, out: Path) -> None:
         typer.echo(f"now use --segmenter labels:{out}")
 
 
-def print_preflight(name: str, page: Preflight, out: Path) -> None:
-    """One page: every check with its level and its evidence; below it the probable mistake and the remedy."""
+def print_preflight(name: str, page: Preflight, skips: Sequence[Skip], out: Path) -> None:
+    """One page: every check with its level and its evidence; below it the probable mistake and the remedy.
+
+    What of the log cannot be used comes last.
+    """
     from rich.console import Console
     from rich.text import Text
 
@@ -204,6 +208,8 @@ def print_preflight(name: str, page: Preflight, out: Path) -> None:
         console.print(line, highlight=False)
         for more in filter(None, (found.mistake, found.remedy)):
             console.print(f"       {more}", highlight=False, markup=False)
+    for skip in skips:
+        console.print(f"left out: {skip.what}, {skip.where}: {skip.reason}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
 
 

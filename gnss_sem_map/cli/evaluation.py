@@ -118,6 +118,6 @@ def check(
     if as_json:
         typer.echo(json.dumps(page.as_dict()))
     else:
-        print_preflight(log.name, page, out)
+        print_preflight(log.name, page, log.skips, out)
     if page.level is Level.RED:
         raise typer.Exit(1)

@@ -21,6 +21,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     """Stamps first, which are cheap; then a few seconds of scans."""
     yield from sweep_stamps.check(sample)
     if not sample.log.scans:
+        yield green(SCANS, "no LiDAR scan: the drive has a trajectory, but makes no map")
         return
     yield from _scans(sample)
     yield _intensity(sample)

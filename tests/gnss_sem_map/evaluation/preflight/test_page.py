@@ -81,6 +81,25 @@ def test_check_ends_with_1_where_something_is_red_and_0_on_a_good_drive(
     assert "imu_axes" in Path(page).read_text()
 
 
+def test_check_names_what_is_left_out_of_a_drive_and_says_where_no_scan_is_there(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    date = shutil.copytree(small_drive.drive.parent, tmp_path / small_drive.drive.parent.name)
+    drive = date / small_drive.drive.name
+    first, *others = sorted((drive / "velodyne_points/data").iterdir())
+    for path in others:
+        path.unlink()
+    words = ["check", str(drive), "-o", str(tmp_path / "check.html")]
+    lines = CliRunner().invoke(app, words).output.splitlines()
+    missing = f"{len(others)} files missing"
+    assert [line for line in lines if line.startswith("left out: scan, ") and line.endswith(missing)]
+    first.unlink()
+    assert (
+        "scans: no LiDAR scan: the drive has a trajectory, but makes no map"
+        in CliRunner().invoke(app, words).output
+    )
+
+
 def test_a_red_drive_is_mapped_only_when_it_is_forced(small_drive: Street, tmp_path: Path) -> None:
     drive, out = upside_down(small_drive, tmp_path), tmp_path / "out"
     words = ["trajectory", str(drive), "-o", str(out), "--set", "trajectory.lidar_odometry=false"]

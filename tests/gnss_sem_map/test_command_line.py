@@ -11,11 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-import typer
+import typer.testing
 from street import Street
 
+from gnss_sem_map import simulation
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import readers
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.runs import expected_cost
 
 pytestmark = pytest.mark.integration
@@ -183,3 +185,18 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(
     assert len(said.splitlines()) == 1
     assert said.startswith("gnss-sem-map: stopped by SIGINT")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("layout", ["table", "rosbag1", "mcap", "kitti-360"])
+def test_a_drive_that_is_there_is_refused_before_anything_is_simulated(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worked(*_: object, **__: object) -> None:
+        raise AssertionError("a drive was simulated")
+
+    for name in ("simulate", "prepare"):
+        monkeypatch.setattr(simulation, name, worked)
+    (tmp_path / "2026_04_19_drive_0031").mkdir()
+    words = ["simulate", "-o", str(tmp_path), "--seed", "31", "--session", "1", "--layout", layout]
+    with pytest.raises(DataError, match="2026_04_19_drive_0031: is already there"):
+        typer.testing.CliRunner().invoke(app, words, catch_exceptions=False)

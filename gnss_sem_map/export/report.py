@@ -273,7 +273,9 @@ def _classes(
     remarks = {}
     for stage, scores in semantics.items():
         strict = scores.get("strict", {}).get("mean_iou")
-        remarks[f"evaluated points that the {stage} map labels"] = percent(scores.get("coverage"))
+        remarks[f"points of the classes of the map that the {stage} map labels"] = percent(
+            scores.get("coverage")
+        )
         remarks[f"mean IoU, {stage}, if an unlabelled point is a miss"] = percent(strict)
     rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
     return {

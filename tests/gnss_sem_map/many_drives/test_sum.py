@@ -17,6 +17,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping.merging import merge_runs
 from gnss_sem_map.runs import finished_run, merged_run
@@ -150,6 +151,20 @@ def test_every_drive_has_the_point_labels_of_the_map_of_all(
     assert {name: labels_of(out / "drives" / name) for name in "ab"} == labels
     add_drive(out, drives.by_name["c"], how)
     assert_same(out, made["abc"])
+
+
+def test_what_only_a_run_of_one_drive_can_do_is_refused_with_what_works(
+    made: dict[str, Path], drives: Drives
+) -> None:
+    whole = Run.open(made["ab"])
+    with pytest.raises(DataError, match=r"for trajectory; see drives/NAME/trajectory\.parquet in it$"):
+        _ = whole.trajectory
+    with pytest.raises(DataError, match="for relabelling; map the drives again with `gnss-sem-map run`"):
+        whole.relabel(drives.labels)
+    place = re.escape(str(made["ab"] / "drives"))
+    says = f"evaluate {place}/NAME, made with --write-labels; NAME is one of a and b$"
+    with pytest.raises(DataError, match=says):
+        score_run(made["ab"], drives.by_name["a"])
 
 
 def test_a_map_of_many_drives_is_merged_into_a_run_with_their_tracks(

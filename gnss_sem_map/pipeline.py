@@ -133,7 +133,7 @@ def run(
     Raises PreflightError, DataError when not one scan can be used, and what the smoother raises.
     """
     log = log.in_our_conventions(settings.sensors)
-    check_georeference(log, origin)
+    check_georeference(log, origin, settings.mapping.voxel_size_m)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
     page, found, sharpness = _checked_and_located(

@@ -52,6 +52,24 @@ def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tm
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dry_run_tells_the_origin_that_is_given(small_drive: Street, tmp_path: Path) -> None:
+    words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--dry-run")
+    done = program(*words, "--origin", "49.02,8.43,110")
+    assert done.returncode == 0, done.stderr
+    assert "origin: 49.020000, 8.430000" in done.stdout
+
+
+def test_an_origin_that_is_too_far_is_refused_before_the_work(small_drive: Street, tmp_path: Path) -> None:
+    words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--force")
+    for more in ((), ("--dry-run",)):
+        done = program(*words, "--origin", "48,11,0", *more)
+        assert done.returncode == 1
+        assert len(done.stderr.splitlines()) == 1
+        assert "km from the origin of the map (48.000000, 11.000000, 0.0 m)" in done.stderr
+        assert "choose an --origin near the drive" in done.stderr
+        assert not list(tmp_path.iterdir())
+
+
 def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years of work")

@@ -134,7 +134,7 @@ def run(
     """
     log.check_scans()
     log = log.in_our_conventions(settings.sensors)
-    check_georeference(log, origin)
+    check_georeference(log, origin, settings.mapping.voxel_size_m)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
     page, found, sharpness = _checked_and_located(

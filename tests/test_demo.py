@@ -144,6 +144,8 @@ def test_a_run_can_be_scored_again_on_fewer_points(demo: tuple[Path, Path, str])
     everything = json.loads(whole.stdout)["semantics"]["refined"]
     assert restricted["points"] < everything["points"]
     assert restricted["coverage"] > everything["coverage"]
+    printed = gnss_sem_map("evaluate", out, "--truth", truth)
+    assert " % refined, of the points whose true class the map has" in " ".join(printed.stdout.split())
 
 
 def test_a_folder_that_no_demo_wrote_is_left_alone(tmp_path: Path) -> None:

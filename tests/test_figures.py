@@ -127,7 +127,8 @@ def test_what_the_pages_say_in_words_was_measured() -> None:
                      f" {percent('refinement', f'{OURS}/SA_vehicle')}"),
         ("paper.md", f"error is {percent('fusion', f'{LABELS}/eq. 6/pooled/ece')}, that of the default"
                      f" {percent('fusion', f'{LABELS}/default/pooled/ece')}"),
-        ("your_own_log.md", f"The map labels {100 * surround['coverage']:.1f} % of all LiDAR points, at"
+        ("your_own_log.md", f"The map labels {100 * surround['coverage']:.1f} % of the LiDAR points whose"
+                            " true class it has, at"
                             f" {100 * surround['refined']['mean_accuracy']:.1f} % accuracy and"
                             f" {100 * surround['refined']['mean_iou']:.1f} % IoU"),
         ("your_own_log.md", f"128 rings {min(shares):.1f} to {max(shares):.1f} %"),

@@ -293,6 +293,8 @@ def test_what_cannot_be_evaluated_says_what_is_missing_and_what_to_do(
 ) -> None:
     again, merged, track = (tmp_path / name for name in ("again", "merged", "track"))
     shutil.copytree(raw_run, again)
+    about = json.loads((again / "run.json").read_text())
+    (again / "run.json").write_text(json.dumps(about | {"drive": "other", "inputs": {"drive": "/elsewhere"}}))
     assert gnss_sem_map("merge", raw_run, again, "-o", merged).returncode == 0
     assert gnss_sem_map("trajectory", small_drive.drive, "-o", track).returncode == 0
     shutil.rmtree(again / "labels")

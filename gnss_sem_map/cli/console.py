@@ -147,7 +147,8 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     console.print(table)
     moving = metrics["dynamic"]
     lines = [
-        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined, of all points",
+        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined,"
+        " of the points whose true class the map has",
         f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
         f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
         f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",

@@ -9,14 +9,21 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
+    from factor_graphs.geodesy import LocalFrame
     from gnss_sem_map.config import Settings
     from gnss_sem_map.runs.expected_cost import Expected
     from gnss_sem_map.runs.source import Source
     from gnss_sem_map.sensor_log import SensorLog
 
 
-def print_plan(sources: Iterable[Source], settings: Settings, workers: int) -> None:
-    """Open every drive and its segmenter, and print what is there; raises what these raise, ends as a run would."""
+def print_plan(
+    sources: Iterable[Source], settings: Settings, workers: int, origin: LocalFrame | None = None
+) -> None:
+    """Open every drive and its segmenter, and print what is there; raises what these raise, ends as a run would.
+
+    `origin` is that of the map, by default that of the first drive that has one.
+    """
+    from gnss_sem_map.mapping.trajectory import check_georeference
     from gnss_sem_map.segmentation import no_segmenter_message
 
     seconds = memory_mb = 0.0
@@ -27,7 +34,9 @@ def print_plan(sources: Iterable[Source], settings: Settings, workers: int) -> N
             raise typer.Exit(1)
         source.open_network(settings, log)
         log.check_scans()
-        for line in _of_drive(source, log):
+        origin = origin or log.frame
+        check_georeference(log, origin, settings.mapping.voxel_size_m)
+        for line in _of_drive(source, log, origin):
             typer.echo(line)
         cost = _cost(log, workers)
         seconds, memory_mb = seconds + cost.seconds, max(memory_mb, cost.memory_mb)
@@ -39,7 +48,7 @@ def print_plan(sources: Iterable[Source], settings: Settings, workers: int) -> N
     typer.echo("dry run: nothing was written")
 
 
-def _of_drive(source: Source, log: SensorLog) -> Iterable[str]:
+def _of_drive(source: Source, log: SensorLog, origin: LocalFrame | None) -> Iterable[str]:
     first, last = log.scans[0].stamp, log.scans[-1].stamp
     yield f"{source.name}: {log.scan_count} scans over {last - first:.1f} s, {len(log.images)} images"
     if log.given is not None:
@@ -48,7 +57,6 @@ def _of_drive(source: Source, log: SensorLog) -> Iterable[str]:
         wheels = "" if log.wheels is None else f", {len(log.wheels.stamps)} wheel speeds"
         yield f"  trajectory: smoothed from {len(log.imu)} IMU samples and {len(log.gnss)} GNSS fixes{wheels}"
     yield f"  labels: {source.segmenter or 'none'}"
-    origin = log.frame
     where = (
         "none: the map is not georeferenced"
         if origin is None

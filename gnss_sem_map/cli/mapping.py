@@ -120,7 +120,7 @@ def run(
         with claimed_run(
             out, [place for drive in found for place in places_read(drive, settings, segmenter, config)]
         ):
-            print_plan(sources, settings, workers or default_workers())
+            print_plan(sources, settings, workers or default_workers(), frame)
         return
     if is_of_many:
         how = HowMapped(segmenter, frames, drive_format, device, force, resume)

@@ -22,6 +22,10 @@ Drive = Annotated[
     ),
 ]
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to write; an earlier run there is replaced.")]
+NewDrive = Annotated[
+    Path,
+    typer.Option("-o", "--out", help="Folder to write the drive into; a drive that is there is refused."),
+]
 Config = Annotated[Path | None, typer.Option("--config", help="YAML file of settings (see `config`).")]
 Set = Annotated[
     list[str] | None, typer.Option("--set", help="One setting, as section.name=value; repeatable.")

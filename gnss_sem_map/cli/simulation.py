@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 import typer
 
 from gnss_sem_map.cli.console import print_metrics, print_run, progress_bars, warn
-from gnss_sem_map.cli.options import Out
+from gnss_sem_map.cli.options import NewDrive
 
 
 def simulate(
-    out: Out,
+    out: NewDrive,
     seconds: Annotated[
         float | None,
         typer.Option(
@@ -61,20 +61,22 @@ def simulate(
     """Write a simulated drive, with the exact truth beside it."""
     from gnss_sem_map.simulation import prepare
     from gnss_sem_map.simulation import simulate as write_drive
+    from gnss_sem_map.simulation.drive import drive_name, refuse_there
     from gnss_sem_map.simulation.layouts import write_in_layout, write_rig
     from gnss_sem_map.simulation.rigs import RIGS
 
     with progress_bars() as progress:
         rig = rig or ("kitti-360" if layout == "kitti-360" else "kitti")
+        layout = layout or ("kitti-raw" if rig == "kitti" else "table")
+        if layout != "kitti-raw":  # what writes that layout refuses at once
+            refuse_there(out / drive_name(seed, session))
         if rig != "kitti" or layout == "kitti-360":
             simulation = prepare(seconds, seed, laps=laps, session=session, gnss=gnss, rig=RIGS[rig]())
-            drive = write_rig(
-                simulation, out, layout or "table", lambda done, total: progress("simulate", done, total)
-            )
+            drive = write_rig(simulation, out, layout, lambda done, total: progress("simulate", done, total))
             typer.echo(f"drive in {drive}")
             return
         drive = write_in_layout(
-            out, layout or "kitti-raw",
+            out, layout,
             lambda folder: write_drive(
                 folder, seconds, seed, lambda done, total: progress("simulate", done, total),
                 laps=laps, session=session, gnss=gnss,

@@ -70,10 +70,11 @@ def confusion(
 def semantics(counts: NDArray[np.int64], label_set: LabelSet) -> dict[str, Any]:
     """Accuracy TP / (TP + FP) and IoU TP / (TP + FP + FN) per class and on average, and coverage, all in 0..1.
 
-    The figures are over labelled points, with the coverage beside them; under `strict` an unlabelled point counts as a
-    false negative of its class. A class without truth is left out of the mean; one that is never predicted counts as 0.
-    Accuracy (elsewhere called precision) uses labelled points only, so its strict mean differs in one case: a class
-    without any labelled point is left out of the mean, but counts as 0 in the strict one.
+    The figures are over labelled points, with the coverage beside them: the labelled share of the points whose true
+    class the set has. Under `strict` an unlabelled point counts as a false negative of its class. A class without truth
+    is left out of the mean; one that is never predicted counts as 0. Accuracy (elsewhere called precision) uses
+    labelled points only, so its strict mean differs in one case: a class without any labelled point is left out of the
+    mean, but counts as 0 in the strict one.
     """
     labelled = counts[:, :-1]
     observed = _figures(labelled, labelled.sum(axis=1), label_set)

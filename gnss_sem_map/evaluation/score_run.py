@@ -26,6 +26,7 @@ from gnss_sem_map.files.ownership import amend
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 
 LARGEST = 1e12
@@ -59,8 +60,10 @@ def _check_scorable(out: Path) -> None:
     about = read_run(out)
     if "merged" in about:
         made_of = about["merged"] if isinstance(about["merged"], list) else [about["merged"]]
+        of_drives = f"evaluate {shown(out / DRIVES)}/NAME, made with --write-labels; NAME is one of"
+        instead = of_drives if is_folder(out / DRIVES) else "evaluate the runs that it was made of,"
         raise DataError(
-            f"{shown(out)}: a merged map has no labels of single points; evaluate the runs that it was made of,"
+            f"{shown(out)}: a merged map has no labels of single points; {instead}"
             f" {' and '.join(map(str, made_of))}"
         )
     if not is_folder(out / "map"):

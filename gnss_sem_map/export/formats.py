@@ -48,7 +48,7 @@ FORMATS = (
         write_laz,
     ),
     Format("removed", "removed.laz", "the voxels of moving objects that are not in map.laz", write_removed),
-    Format("ply", "map.ply", "the labelled voxels in map metres, coloured by class", write_ply),
+    Format("ply", "map.ply", "the shown voxels in map metres, coloured by class, grey where they have none", write_ply),
     Format(
         "geotiff", "topview_class.tif", "the classes from above as cloud-optimised GeoTIFF, for QGIS",
         write_topview_geotiff, needs_georeference=True,

@@ -18,6 +18,7 @@ from pyproj import CRS
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.export.dates import date_of
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.longitudes import DEGREE_DIGITS, box_around, line_through
 from gnss_sem_map.files.atomic import replacing
@@ -101,7 +102,7 @@ def _read(path: Path) -> pa.Table:
 def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
     """One mover as the table has it."""
     speed, stddev = mover.mean_speed
-    times = [drive.epoch_ns // 1000 + round(1e6 * stamp) for stamp in mover.stamps[[0, -1]].tolist()]
+    times = [date_of(drive.epoch_ns, stamp) for stamp in mover.stamps[[0, -1]].tolist()]
     start, end = mover.positions[[0, -1]]
     length, width, height = mover.size_m
     heading = np.degrees(np.arctan2(*(end - start)[:2])) % 360

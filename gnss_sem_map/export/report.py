@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -12,6 +12,7 @@ import numpy as np
 
 from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.export.charts import Chart, Curve, chart
+from gnss_sem_map.export.dates import date_of
 from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.export.movers import read_movers
 from gnss_sem_map.export.overview import NO_LABEL, Overview, coverage_pixels, label_pixels, overview_of
@@ -62,8 +63,6 @@ ENOUGH_POINTS = 200
 """Of a bin of a reliability curve: the share of fewer is chance."""
 MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
-FIRST_DATE_S = datetime(1980, 1, 1, tzinfo=UTC).timestamp()
-"""Stamps before are no Unix time, but seconds since some moment: no drive with GNSS is as old."""
 TITLES = {"accuracy": "accuracy", "iou": "IoU"}
 MAPS = {"map": "before refinement", "refined": "after refinement"}
 
@@ -152,8 +151,7 @@ def _facts(run: Mapping[str, Any]) -> list[str]:
 def _beginning(run: Mapping[str, Any]) -> datetime | None:
     """The time of the first scan; None where the stamps of the drive are no dates."""
     first_s, _ = run.get("scans_s") or (0.0, 0.0)
-    unix_s = (run.get("epoch_ns") or 0) / 1e9 + first_s
-    return datetime.fromtimestamp(unix_s, UTC) if unix_s >= FIRST_DATE_S else None
+    return date_of(run.get("epoch_ns") or 0, first_s)
 
 
 def _picture(path: Path) -> str:
@@ -273,7 +271,9 @@ def _classes(
     remarks = {}
     for stage, scores in semantics.items():
         strict = scores.get("strict", {}).get("mean_iou")
-        remarks[f"evaluated points that the {stage} map labels"] = percent(scores.get("coverage"))
+        remarks[f"points of the classes of the map that the {stage} map labels"] = percent(
+            scores.get("coverage")
+        )
         remarks[f"mean IoU, {stage}, if an unlabelled point is a miss"] = percent(strict)
     rows = [(name, *(values[i] for _, values in columns)) for i, name in enumerate([*names, "all"])]
     return {

@@ -12,6 +12,7 @@ from pyproj import CRS
 from factor_graphs import tum
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.longitudes import box_around, line_through
 from gnss_sem_map.files.atomic import replacing
 
@@ -61,9 +62,9 @@ def write_geojson(trajectory: Trajectory, frame: LocalFrame, path: Path | str) -
 def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, path: Path | str) -> None:
     """Write a point per pose as GeoParquet 1.1: WGS 84 (EPSG:4979), heights above the ellipsoid.
 
-    Columns: `time` (UTC), `stamp_s`, `heading_deg` from north over east, `speed_mps` where velocities are known,
-    `stddev_east_m`, `stddev_north_m`, `stddev_up_m` where covariances are, and `geometry` (WKB). Raises DataError when
-    the file cannot be written.
+    Columns: `time` (UTC; null where the log has no date), `stamp_s`, `heading_deg` from north over east, `speed_mps`
+    where velocities are known, `stddev_east_m`, `stddev_north_m`, `stddev_up_m` where covariances are, and `geometry`
+    (WKB). Raises DataError when the file cannot be written.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -71,10 +72,9 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     lat_deg, lon_deg, alt_m = frame.to_geodetic(trajectory.positions)
     places = np.column_stack([lon_deg, lat_deg, alt_m])
     forward = trajectory.T_map_imu[:, :2, 0]
+    times = epoch_ns + np.round(1e9 * trajectory.stamps).astype(np.int64)
     columns = {
-        "time": pa.array(
-            epoch_ns + np.round(1e9 * trajectory.stamps).astype(np.int64), pa.timestamp("ns", "UTC")
-        ),
+        "time": pa.array(times, pa.timestamp("ns", "UTC"), mask=~are_dates(times)),
         "stamp_s": trajectory.stamps,
         "heading_deg": np.degrees(np.arctan2(*forward.T)) % 360,
     }

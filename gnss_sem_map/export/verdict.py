@@ -106,7 +106,7 @@ def _classes(metrics: Mapping[str, Any]) -> Iterator[str]:
     yield (
         f"Classes, measured against the given truth: {100 * refined['mean_accuracy']:.1f} % of the labelled"
         f" points are right (mean over the classes); {100 * (refined.get('coverage') or 0):.1f} % of"
-        " all points have a label."
+        " the points whose true class the map has carry a label."
     )
 
 

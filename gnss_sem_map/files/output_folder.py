@@ -69,7 +69,7 @@ def claimed(
     claim = Claim(real, by_name)
     refuse_places(real)
     refuse_inputs(real, inputs)
-    with _parents(real), locked(real):
+    with parents_made(real), locked(real):
         work_folder.refuse_foreign(claim.work)
         with _explained(claim.work):
             _move_back(claim)
@@ -253,8 +253,8 @@ def refuse_foreign(claim: Claim) -> None:
 
 
 @contextmanager
-def _parents(out: Path) -> Iterator[None]:
-    """Create the parent folders of an output folder; created ones are removed again if they stay empty."""
+def parents_made(out: Path) -> Iterator[None]:
+    """Create the parent folders of a result; created ones are removed again if they stay empty."""
     missing = [folder for folder in out.parents if not folder.exists()]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.smoothing import Solution, smooth
@@ -20,6 +22,8 @@ from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
 from gnss_sem_map.scans.revisits import Registrar
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.tile_files import Z_OFFSET
 
 MATCHED_SHARE = 0.95
 """With this share of matched scans, poses are accurate enough to tell slow objects from static ones."""
@@ -138,12 +142,23 @@ def in_frame(
     return replace(log, frame=origin), trajectory.moved(origin.pose_of(log.frame))
 
 
-def check_georeference(log: SensorLog, origin: LocalFrame | None) -> None:
-    """Raise DataError for a drive in its own poses, which fits into no frame."""
-    if origin is not None and log.frame is None:
+def check_georeference(log: SensorLog, origin: LocalFrame | None, voxel_size_m: float) -> None:
+    """Raise DataError for a drive in its own poses, which fits into no frame, and for one too far from the origin."""
+    if origin is None or origin == log.frame:
+        return
+    if log.frame is None:
         raise DataError(
             f"{log.name}: has no georeference, so its map has no origin; expected GNSS, or no --origin and no other"
             " drive"
+        )
+    p_origin = origin.pose_of(log.frame)[:3, 3]
+    farthest_m, highest_m = voxel_size_m * (1 << AXIS_BITS - 1), voxel_size_m * Z_OFFSET
+    if max(abs(p_origin[:2])) >= farthest_m or abs(p_origin[2]) >= highest_m:
+        raise DataError(
+            f"{log.name}: lies {np.linalg.norm(p_origin[:2]) / 1000:.1f} km from the origin of the map"
+            f" ({origin.lat_deg:.6f}, {origin.lon_deg:.6f}, {origin.alt_m:.1f} m) and {p_origin[2]:.0f} m above its"
+            f" plane, expected less than {farthest_m / 1000:.0f} km and +-{highest_m:.0f} m; choose an --origin near"
+            " the drive, or make two maps"
         )
 
 

@@ -24,7 +24,7 @@ from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.export.georeference import check_delivery
 from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import locked, new_folder, real_path, refuse_inputs
+from gnss_sem_map.files.output_folder import locked, new_folder, parents_made, real_path, refuse_inputs
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
@@ -139,7 +139,7 @@ class Run:
     @cached_property
     def trajectory(self) -> Trajectory:
         """Poses of the IMU in the map, with covariances; raises DataError for a merged run."""
-        self._refuse_merged("trajectory")
+        self._refuse_merged("trajectory", f"see {DRIVES}/NAME/trajectory.parquet in it")
         return Trajectory.load(self.folder / "trajectory.parquet")
 
     @cached_property
@@ -153,7 +153,11 @@ class Run:
         return open_label_set(self.settings.classes)
 
     def map(self, box: tuple[ArrayLike, ArrayLike] | None = None, *, refined: bool = True) -> SemanticMap:
-        """The map, or its part in a box (low, high), each (3,) m; only the tiles of the box are read."""
+        """The map, or its part in a box (low, high), each (3,) m; only the tiles of the box are read.
+
+        It holds the voxels that refinement removed, too, with the label of what moved there and `State.REMOVED`:
+        `map[map.shown]` are the labelled voxels that stand, `map.standing` are all that stand.
+        """
         return tiles.read(self.folder / ("refined" if refined else "map"), self.label_set, box)
 
     def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
@@ -206,7 +210,9 @@ class Run:
 
         Raises DataError for a merged run, and if the drive was moved or removed.
         """
-        self._refuse_merged("relabelling")
+        self._refuse_merged(
+            "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
+        )
         log, settings = self.drive(), self.settings
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
@@ -271,10 +277,10 @@ class Run:
         files = [Path(to) / known[name].file for name in chosen]
         if there := [file for file in files if file.exists()]:
             raise DataError(f"{shown(there[0])}: exists; move it away or choose another folder")
-        Path(to).mkdir(parents=True, exist_ok=True)
-        for done, (name, file) in enumerate(zip(chosen, files, strict=True), 1):
-            known[name].write(exported, file)
-            progress("export", done, len(files))
+        with parents_made(Path(to) / "file"):
+            for done, (name, file) in enumerate(zip(chosen, files, strict=True), 1):
+                known[name].write(exported, file)
+                progress("export", done, len(files))
         return files
 
     def _amended(self, format_: Format, exported: Exported) -> Path:
@@ -291,11 +297,13 @@ class Run:
         log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
-    def _refuse_merged(self, what: str) -> None:
+    def _refuse_merged(self, what: str, of_drives: str) -> None:
+        """`of_drives` is what to do instead where the map keeps its drives in folders of their own."""
+        instead = of_drives if is_folder(self.folder / DRIVES) else "use one of those"
         if self.is_merged:
             names = " and ".join(map(str, self.about["merged"]))
             raise DataError(
-                f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; use one of those"
+                f"{shown(self.folder)}: is merged of {names}, expected a run of one drive for {what}; {instead}"
             )
 
     @contextmanager

@@ -32,6 +32,7 @@ from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.mapping.trajectory import check_georeference
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
@@ -107,7 +108,7 @@ def run_drives(
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
         Georeference.of(frame, settings.delivery)  # refuses what cannot be delivered
         file = _begin(claim, settings, how)
-        tracks = {source.name: track for source in sources if (track := _track(source, frame)) is not None}
+        tracks = _tracks(sources, frame, settings)
         base = None if align_to is None else read_base(align_to, frame)
         bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress, base)
         failed = map_all(sources, claim.work, bound, file, how.force, frame, executor, progress)
@@ -172,7 +173,7 @@ def _changed(
     file, align_to = _begin(claim, settings, how), read_run(out).get("aligned_to")
     base = None if align_to is None else read_base(Path(align_to), frame)
     tracks = {name: _driven(folder) for name, folder in there.items()}
-    tracks |= {source.name: track for source in added if (track := _track(source, frame)) is not None}
+    tracks |= _tracks(added, frame, settings)
     known = [_source_of(name, folder) for name, folder in there.items()]
     sources = [*known, *added]
     bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress, base)
@@ -222,17 +223,20 @@ def _driven(folder: Path) -> Array:
     return tracks_of(folder)[0].positions
 
 
-def _track(source: Source, frame: LocalFrame) -> Array | None:
-    """The GNSS track of a drive in this frame, (n, 3) m; None where there is none, or its task will say why."""
-    try:
-        log = source.open_log(with_imu=False)
-    except (SemMapError, FactorGraphError, OSError):
-        return None
-    if log.gnss is None or log.frame is None or not len(log.gnss):
-        return None
-    T = frame.pose_of(log.frame)
-    track: Array = log.gnss.positions @ T[:3, :3].T + T[:3, 3]
-    return track
+def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, Array]:
+    """The GNSS track of each drive that has one in this frame, (n, 3) m; of the others, their task says why."""
+    found = {}
+    for source in sources:
+        try:
+            log = source.open_log(with_imu=False)
+            check_georeference(log, frame, settings.mapping.voxel_size_m)
+        except (SemMapError, FactorGraphError, OSError):
+            continue
+        if log.gnss is None or log.frame is None or not len(log.gnss):
+            continue
+        T = frame.pose_of(log.frame)
+        found[source.name] = log.gnss.positions @ T[:3, :3].T + T[:3, 3]
+    return found
 
 
 def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:

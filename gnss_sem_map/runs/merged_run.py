@@ -16,6 +16,7 @@ from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.mapping.refining import refine_map
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.about import about_map
+from gnss_sem_map.runs.held_drives import HELD, check_none_twice, held_drives
 from gnss_sem_map.runs.run_folder import claimed_run, write_about, write_map_files
 from gnss_sem_map.runs.run_settings import read_settings
 from gnss_sem_map.runs.tracks import keep_tracks, tracks_of
@@ -25,7 +26,7 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
     """Write the merged run into `out`, refined with the settings of the first; returns the content of run.json.
 
     With `match`, the second is registered to the first. Pictures show the tracks of the first. Raises DataError for
-    folders that hold no run, a run with itself, and maps that do not fit together.
+    folders that hold no run, a run with itself, runs that hold the same drive, and maps that do not fit together.
     """
     for run in (first, second):
         read_run(run)
@@ -33,6 +34,7 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
         raise DataError(
             f"{second}: is the first run as well, and all its evidence would count twice; give another run"
         )
+    check_none_twice(first, second)
     with claimed_run(out, [first, second]), new_folder(out) as folder:
         return _merge(first, second, folder, match)
 
@@ -46,6 +48,7 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
     about = {
         "name": f"{first.name} + {second.name}",
         "merged": [first.name, second.name],
+        HELD: [*held_drives(first), *held_drives(second)],
         "local_frame": asdict(merged.frame),
         "map": about_map(folder, refined.report),
         "match": _about(merged.alignment),

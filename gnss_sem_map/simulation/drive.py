@@ -70,7 +70,7 @@ class Simulation:
     @property
     def name(self) -> str:
         """Date and number of the drive."""
-        return f"{str(_date_of(self.session)).replace('-', '_')}_drive_{self.seed:04d}"
+        return drive_name(self.seed, self.session)
 
     @property
     def day(self) -> int:
@@ -157,6 +157,18 @@ def _date_of(session: int) -> np.datetime64:
     return np.datetime64("2026-04-18") + np.timedelta64(session, "D")
 
 
+def drive_name(seed: int, session: int = 0) -> str:
+    """Date and number of the drive of this seed in this session."""
+    return f"{str(_date_of(session)).replace('-', '_')}_drive_{seed:04d}"
+
+
+def refuse_there(*places: Path) -> None:
+    """Raise DataError for a place of a drive where something is already."""
+    for place in places:
+        if place.exists():
+            raise DataError(f"{place}: is already there; remove it or simulate into another folder")
+
+
 def day_of(seed: int, session: int) -> int:
     """Seed of all that differs between two sessions of one town, but for the town itself."""
     return seed + 1_000_000 * session
@@ -240,10 +252,8 @@ def simulate(
     do not depend on the threads. Raises DataError when the drive is already there or is too short.
     """
     date = str(_date_of(session)).replace("-", "_")
-    drive = Path(folder) / date / f"{date}_drive_{seed:04d}_sync"
-    for path in (drive, _twin(drive)):
-        if path.exists():
-            raise DataError(f"{path}: is already there; remove it or simulate into another folder")
+    drive = Path(folder) / date / f"{drive_name(seed, session)}_sync"
+    refuse_there(drive, _twin(drive))
     simulation = prepare(seconds, seed, lidar, camera, laps=laps, session=session, gnss=gnss)
     with _for_us_alone(drive) as partial:
         write_calibration(partial / "calibration", camera or Camera())

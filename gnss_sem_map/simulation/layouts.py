@@ -23,7 +23,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.simulation.bags import BagWriter
-from gnss_sem_map.simulation.drive import Simulation
+from gnss_sem_map.simulation.drive import Simulation, refuse_there
 from gnss_sem_map.simulation.kitti_360_drive import write_kitti_360
 from gnss_sem_map.simulation.table_drive import made_aside, write_table
 
@@ -58,8 +58,7 @@ def rewrite(drive: Path, out: Path, layout: Layout, progress: Progress | None = 
     Raises DataError when it is already there.
     """
     target = out / drive.name.removesuffix("_sync")
-    if target.exists():
-        raise DataError(f"{target}: is already there; remove it or simulate into another folder")
+    refuse_there(target)
     log = kitti_raw.read(drive)
     partial = drive.parent / f"{target.name}.{layout}"
     if layout == "table":

@@ -12,10 +12,9 @@ import numpy as np
 
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.drive import Simulation, write_png, write_truth
+from gnss_sem_map.simulation.drive import Simulation, refuse_there, write_png, write_truth
 from gnss_sem_map.thread_pools import thread_pool
 
 UNFILTERED: Final = (
@@ -50,9 +49,8 @@ def write_table(
 
 @contextmanager
 def made_aside(out: Path, target: Path) -> Iterator[Path]:
-    """A folder to write into, which is moved to `target` when all is written."""
-    if target.exists():
-        raise DataError(f"{target}: is already there; remove it or simulate into another folder")
+    """A folder to write into, which is moved to `target` when all is written; raises DataError when it is there."""
+    refuse_there(target)
     out.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".simulated-", dir=out) as folder:
         drive = Path(folder) / target.name

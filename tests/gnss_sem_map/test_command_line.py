@@ -11,11 +11,13 @@ import time
 from pathlib import Path
 
 import pytest
-import typer
+import typer.testing
 from street import Street
 
+from gnss_sem_map import simulation
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import readers
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.runs import expected_cost
 
 pytestmark = pytest.mark.integration
@@ -48,6 +50,24 @@ def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tm
     assert re.search(r"expected: about [\d.]+ min with 1 process that map", done.stdout)
     assert "nothing was written" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dry_run_tells_the_origin_that_is_given(small_drive: Street, tmp_path: Path) -> None:
+    words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--dry-run")
+    done = program(*words, "--origin", "49.02,8.43,110")
+    assert done.returncode == 0, done.stderr
+    assert "origin: 49.020000, 8.430000" in done.stdout
+
+
+def test_an_origin_that_is_too_far_is_refused_before_the_work(small_drive: Street, tmp_path: Path) -> None:
+    words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--force")
+    for more in ((), ("--dry-run",)):
+        done = program(*words, "--origin", "48,11,0", *more)
+        assert done.returncode == 1
+        assert len(done.stderr.splitlines()) == 1
+        assert "km from the origin of the map (48.000000, 11.000000, 0.0 m)" in done.stderr
+        assert "choose an --origin near the drive" in done.stderr
+        assert not list(tmp_path.iterdir())
 
 
 def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_path: Path) -> None:
@@ -192,3 +212,18 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(
     assert len(said.splitlines()) == 1
     assert said.startswith("gnss-sem-map: stopped by SIGINT")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("layout", ["table", "rosbag1", "mcap", "kitti-360"])
+def test_a_drive_that_is_there_is_refused_before_anything_is_simulated(
+    layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def worked(*_: object, **__: object) -> None:
+        raise AssertionError("a drive was simulated")
+
+    for name in ("simulate", "prepare"):
+        monkeypatch.setattr(simulation, name, worked)
+    (tmp_path / "2026_04_19_drive_0031").mkdir()
+    words = ["simulate", "-o", str(tmp_path), "--seed", "31", "--session", "1", "--layout", layout]
+    with pytest.raises(DataError, match="2026_04_19_drive_0031: is already there"):
+        typer.testing.CliRunner().invoke(app, words, catch_exceptions=False)

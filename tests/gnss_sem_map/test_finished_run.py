@@ -16,6 +16,7 @@ import pytest
 from street import Street
 
 from gnss_sem_map import Run, Settings, run
+from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.output_folder import locked
 from gnss_sem_map.mapping.evidence import write_moving_points
@@ -164,6 +165,11 @@ def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Ru
         finished.export(["laz"], tmp_path / "files")
     with pytest.raises(ConfigError, match="viewer"):
         finished.export(["las"], tmp_path / "files")
+    (tmp_path / "wrong.gtx").write_bytes(b"no grid")
+    for delivery in (DeliverySettings(geoid=tmp_path / "wrong.gtx"), DeliverySettings(crs=2056)):
+        with pytest.raises(ConfigError, match=r"delivery\."):
+            finished.export(["laz"], tmp_path / "new" / "files", delivery)
+    assert not (tmp_path / "new").exists()
     before = (finished.folder / "map.ply").read_bytes()
     [ply] = finished.export(["ply"])
     assert ply.read_bytes() == before

@@ -7,6 +7,7 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from pyproj import Geod, Transformer
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
@@ -47,7 +48,7 @@ def test_areas_and_kerbs_are_those_of_the_street(package: Path) -> None:
         shapes, columns = read(package, name)
         assert shapely.is_valid(shapes).all()
         assert shapely.area(shapes).sum() == pytest.approx(area, rel=0.005)
-        np.testing.assert_allclose(columns["area_m2"], shapely.area(shapes))
+        np.testing.assert_allclose(columns["area_m2"].sum(), area, rtol=0.005)
         assert ((columns["confidence"] > 0.5) & (columns["confidence"] < 1)).all()
         top = 115.0 + (0.2 if name == "road" else 0.4)
         np.testing.assert_allclose(columns["height_m"], top, atol=0.05)
@@ -55,6 +56,27 @@ def test_areas_and_kerbs_are_those_of_the_street(package: Path) -> None:
     assert shapely.length(lines).sum() == pytest.approx(60.0, rel=0.005)
     road, _ = read(package, "road")
     assert shapely.distance(shapely.union_all(road).boundary, lines).max() < 1e-6
+
+
+@pytest.mark.parametrize("epsg", [None, 3857])
+def test_lengths_and_areas_are_true_metres_in_every_crs(
+    epsg: int | None, street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    path = tmp_path / "map.gpkg"
+    write_geopackage(Exported(tiles.in_memory(street, karlsruhe), epsg=epsg), path)
+    to_degrees = Transformer.from_crs(epsg or karlsruhe.utm_epsg, 4326, always_xy=True)
+    geod = Geod(ellps="WGS84")
+    for layer in ("road", "sidewalk", "kerbs", "buildings", "vehicles"):
+        shapes, columns = read(path, layer)
+        shapes = [shapely.transform(shape, to_degrees.transform, interleaved=False) for shape in shapes]
+        if "area_m2" in columns:
+            areas = [abs(geod.geometry_area_perimeter(shape)[0]) for shape in shapes]
+            np.testing.assert_allclose(columns["area_m2"], areas, rtol=2e-4)
+        else:
+            lengths = (
+                2 * (columns["length_m"] + columns["width_m"]) if layer == "vehicles" else columns["length_m"]
+            )
+            np.testing.assert_allclose(lengths, [geod.geometry_length(shape) for shape in shapes], rtol=2e-4)
 
 
 def test_simplified_edges_leave_neither_gaps_nor_overlaps(package: Path) -> None:

@@ -63,6 +63,16 @@ def test_geopandas_reads_a_row_per_mover(mover, karlsruhe, tmp_path) -> None:
     assert [row["end_lon_deg"], row["end_lat_deg"], row["end_alt_m"]] == pytest.approx(line[-1].tolist())
 
 
+def test_a_log_without_a_date_has_no_times(mover, karlsruhe, tmp_path) -> None:
+    write_movers([mover], DriveOfMovers("monday", 0, karlsruhe), tmp_path)
+    [row] = read_movers(tmp_path)
+    assert row["first_time"] is None
+    assert row["last_time"] is None
+    assert row["last_stamp_s"] == 3.0
+    [feature] = json.loads((tmp_path / "objects.geojson").read_text())["features"]
+    assert feature["properties"]["first_time"] is None
+
+
 def test_the_track_is_that_of_the_mover(mover, karlsruhe, tmp_path) -> None:
     write_movers([mover], DriveOfMovers("monday", EPOCH_NS, karlsruhe), tmp_path)
     (row,) = pq.read_table(tmp_path / "objects.parquet").to_pylist()

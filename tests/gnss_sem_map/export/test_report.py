@@ -122,7 +122,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
         ["position: errors inside the ellipsoid that should hold 90 %", "91.2 %"],
         ["static points kept (SA)", "99.1 %"],
         ["expected calibration error (ECE)", "3.1 %"],
-        ["evaluated points that the raw map labels", "75.0 %"],
+        ["points of the classes of the map that the raw map labels", "75.0 %"],
         ["mean IoU, refined, if an unlabelled point is a miss", "61.0 %"],
         ["export", "1.25 s", "580"],
         ["numpy", "2.4.6"],
@@ -135,6 +135,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
     assert '<p class="warning">the fixes are better than they say</p>' in text
     assert "1 remark below must be read" in page.verdict
     assert "0.12 m root mean square error" in page.verdict
+    assert " % of the points whose true class the map has carry a label." in page.verdict
     assert "90.0 % of the labelled points are right" in page.verdict
     assert "3 parts of the recording could not be used: 114 files missing" in page.verdict
 

@@ -140,6 +140,13 @@ def test_geopandas_reads_the_geoparquet_back(
     np.testing.assert_allclose(np.sin(np.radians(table["heading_deg"])), np.sin(east), atol=1e-9)
 
 
+def test_a_log_without_a_date_has_no_times(
+    uncertain: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    write_geoparquet(uncertain, karlsruhe, 0, tmp_path / "track.parquet")
+    assert geopandas.read_parquet(tmp_path / "track.parquet")["time"].isna().all()
+
+
 def test_a_track_across_the_180_degree_meridian_is_cut_there(track: Trajectory, tmp_path: Path) -> None:
     """As RFC 7946 asks, sections 3.1.9 and 5.2: else it is a line around the Earth."""
     middle = track.positions[len(track) // 2]

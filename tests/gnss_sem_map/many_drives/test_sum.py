@@ -17,6 +17,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping.merging import merge_runs
 from gnss_sem_map.runs import finished_run, merged_run
@@ -152,20 +153,55 @@ def test_every_drive_has_the_point_labels_of_the_map_of_all(
     assert_same(out, made["abc"])
 
 
+def test_what_only_a_run_of_one_drive_can_do_is_refused_with_what_works(
+    made: dict[str, Path], drives: Drives
+) -> None:
+    whole = Run.open(made["ab"])
+    with pytest.raises(DataError, match=r"for trajectory; see drives/NAME/trajectory\.parquet in it$"):
+        _ = whole.trajectory
+    with pytest.raises(DataError, match="for relabelling; map the drives again with `gnss-sem-map run`"):
+        whole.relabel(drives.labels)
+    place = re.escape(str(made["ab"] / "drives"))
+    says = f"evaluate {place}/NAME, made with --write-labels; NAME is one of a and b$"
+    with pytest.raises(DataError, match=says):
+        score_run(made["ab"], drives.by_name["a"])
+
+
 def test_a_map_of_many_drives_is_merged_into_a_run_with_their_tracks(
     made: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    merged_run.merge_run_folders(made["ab"], made["a"], out, match=False)
+    merged_run.merge_run_folders(made["ab"], made["abc"] / "drives" / "c", out, match=False)
     assert len(list((out / "tracks").iterdir())) == 2
-    assert Run(out).refine(Run(out).settings, tmp_path / "again").about["merged"] == ["ab", "a"]
+    again = Run(out).refine(Run(out).settings, tmp_path / "again")
+    assert again.about["merged"] == ["ab", "c"]
+    assert [drive["drive"] for drive in again.about["made_of"]] == ["a", "b", "c"]
+
+
+def test_no_drive_is_merged_twice(made: dict[str, Path], tmp_path: Path) -> None:
+    """Neither out of maps of several drives, nor of a merged map, nor of a copy of the drive elsewhere."""
+    c, merged, copied = made["abc"] / "drives" / "c", tmp_path / "merged", tmp_path / "copied"
+    merged_run.merge_run_folders(made["a"], c, merged, match=False)
+    shutil.copytree(made["a"], copied)
+    about = read_run(copied)
+    about["inputs"]["drive"] = "/elsewhere/a"
+    (copied / "run.json").write_text(json.dumps(about))
+    for first, second in ((made["ab"], made["a"]), (made["a"], made["ab"]), (merged, c), (made["a"], copied)):
+        with pytest.raises(
+            DataError, match=f"{second.name}: the drive [ac] is in .*{first.name} too, and all evid"
+        ):
+            merged_run.merge_run_folders(first, second, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    about["scans_s"][1] += 1.0  # another drive in a folder of this name
+    (copied / "run.json").write_text(json.dumps(about))
+    merged_run.merge_run_folders(made["a"], copied, tmp_path / "out", match=False)
 
 
 def test_to_a_merged_map_no_drive_is_added(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
-    out, again = tmp_path / "out", shutil.copytree(made["a"], tmp_path / "again")
-    merged_run.merge_run_folders(made["a"], again, out, match=False)
+    out = tmp_path / "out"
+    merged_run.merge_run_folders(made["a"], made["abc"] / "drives" / "c", out, match=False)
     says = r"out: was merged by `merge` and keeps no drives; expected a map of `gnss-sem-map run`$"
     with pytest.raises(DataError, match=says):
         add_drive(out, drives.by_name["b"], how)

@@ -66,7 +66,7 @@ class ChunkStore:
     def write(self, chunk: MappedChunk) -> None:
         """Save a chunk; raises DataError when the disk is full or the folder may not be written to.
 
-        Unfinished files are removed.
+        Unfinished files are removed. One that is there already, of a worker taken for lost, has the same bytes.
         """
         beside = self.folder / f".{chunk.number}.{os.getpid()}.part"
         checksums: dict[str, str] = {}
@@ -86,6 +86,8 @@ class ChunkStore:
             write_whole(beside / RECORD, json.dumps({"sha256": _checksum(body), "record": body}).encode())
             beside.rename(self.folder / str(chunk.number))
         except OSError as error:
+            if self.is_whole(chunk.number):
+                return
             raise DataError(
                 f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then --resume"
             ) from None

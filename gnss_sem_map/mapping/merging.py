@@ -8,6 +8,7 @@ frame that is not registered is added exactly.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -112,25 +113,27 @@ def merge_runs(
         merge(static[0], static[1], frames[0], frames[1], T),
         merge(moved[0], moved[1], frames[0], frames[1], T),
         keyframes if all(one.keyframes for one in known) else [],
-        _attributes(first, second, places[1], static[0].voxel_size_m),
+        _attributes(first, second, frames, T, static[0].voxel_size_m),
         frames[0],
         alignment,
     )
 
 
 def _attributes(
-    first: Path, second: Path, T_first_second: NDArray[np.float64], voxel_size_m: float
+    first: Path,
+    second: Path,
+    frames: Sequence[LocalFrame],
+    T: NDArray[np.float64] | None,
+    voxel_size_m: float,
 ) -> Attributes | None:
-    """The attributes of both runs, in the frame of the first."""
-    parts = []
-    for run, T in ((first, np.eye(4)), (second, T_first_second)):
-        known = open_attributes(run)
-        if known is None:
-            return None
-        whole = known.whole()
-        p_first = _moved((unpack(whole.keys) + np.float64(0.5)) * voxel_size_m, T)
-        parts.append(replace(whole, keys=keys_of(p_first, voxel_size_m)))
-    return combined(parts)
+    """The attributes of both runs, in the frame of the first; `T` as in `merge`."""
+    known = [open_attributes(run) for run in (first, second)]
+    if known[0] is None or known[1] is None:
+        return None
+    own, other = known[0].whole(), known[1].whole()
+    p_second = (unpack(other.keys) + np.float64(0.5)) * voxel_size_m
+    p_first = _in_frame(p_second, frames[1], frames[0], T)  # as `into_frame` does, to the last bit
+    return combined([own, replace(other, keys=keys_of(p_first, voxel_size_m))])
 
 
 def _without(run: Path, label_set: LabelSet, moved: VoxelMap) -> VoxelMap:
@@ -144,7 +147,7 @@ def align(
     first: VoxelMap, second: VoxelMap, first_frame: LocalFrame, second_frame: LocalFrame, match: bool = True
 ) -> Alignment:
     """Align the second map to the first: register it with `match`, and keep that if the overlap grows."""
-    p_second = _centres_in(second, second_frame, first_frame)
+    p_second = _in_frame(second.centres, second_frame, first_frame)
     before = _overlap(first, p_second)
     if not match:
         return Alignment(None, "", (before, before))
@@ -187,7 +190,7 @@ def into_frame(
     """
     if source == target and T is None:
         return voxels
-    p_target = _moved(_centres_in(voxels, source, target), np.eye(4) if T is None else T)
+    p_target = _in_frame(voxels.centres, source, target, T)
     keys, places = np.unique(keys_of(p_target, voxels.voxel_size_m), return_inverse=True)
     evidence = np.zeros((len(keys), voxels.evidence.shape[1]), np.int64)
     hits = np.zeros(len(keys), np.int64)
@@ -220,9 +223,12 @@ def _moved_heights(
     return np.asarray(np.rint(voxels.hits * (HEIGHT_UNITS * over_bottom - 0.5)), np.int64)
 
 
-def _centres_in(voxels: VoxelMap, source: LocalFrame, target: LocalFrame) -> NDArray[np.float64]:
-    """Centres (v, 3) m in another frame."""
-    return voxels.centres if source == target else target.to_map(*source.to_geodetic(voxels.centres))
+def _in_frame(
+    p: NDArray[np.float64], source: LocalFrame, target: LocalFrame, T: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Points (n, 3) m in another frame, then moved by `T` (4, 4)."""
+    p_target = p if source == target else target.to_map(*source.to_geodetic(p))
+    return p_target if T is None else _moved(p_target, T)
 
 
 def _moved(p: NDArray[np.float64], T: NDArray[np.float64]) -> NDArray[np.float64]:

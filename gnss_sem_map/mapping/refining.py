@@ -112,7 +112,7 @@ class _Refinement:
         tiles.write_tiles(pieces, self.run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set)
         reports = [RefinementReport.from_json(made[tile].about["said"]["report"]) for tile in sums]
         kerbs = [_kerbs(made[tile].beside) for tile in sums if made[tile].beside is not None]
-        return Refined(reduce(add, reports), kerb_points.joined(kerbs) if kerbs else None)
+        return Refined(RefinementReport.joined(reports), kerb_points.joined(kerbs) if kerbs else None)
 
     @property
     def _shared(self) -> tuple[Any, ...]:

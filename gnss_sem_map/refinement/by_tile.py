@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import reduce
-from operator import add
 from typing import Any
 
 import numpy as np
@@ -131,7 +129,7 @@ def run_steps(
     sums = sum((sums_of(tile, voxels, beside, settings) for tile in tiles), Sums())
     figures = figures_of(sums)
     parts = [refine_tile(tile, voxels, beside, settings, figures) for tile in tiles]
-    report = reduce(add, (report for _, report in parts))
+    report = RefinementReport.joined([report for _, report in parts])
     return replace(_joined([state for state, _ in parts]), vehicles=report.objects), report
 
 

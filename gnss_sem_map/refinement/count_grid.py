@@ -139,8 +139,8 @@ def _slabs(keys: NDArray[np.int64], cell: int) -> Iterator[slice]:
     """Parts of the sorted voxels, no fewer than the threads, that no cell is in two of."""
     start = 0
     while start < len(keys):
-        last = keys[min(start + max(len(keys) // THREADS, LEAST_AT_ONCE), len(keys)) - 1] >> (2 * AXIS_BITS)
-        end = int(np.searchsorted(keys, (last // cell + 1) * cell << (2 * AXIS_BITS)))
+        last = keys[min(start + max(len(keys) // THREADS, LEAST_AT_ONCE), len(keys)) - 1]
+        end = int(np.searchsorted(keys, _last_beside(last, cell), side="right"))
         yield slice(start, end)
         start = end
 
@@ -152,10 +152,10 @@ def _ends(keys, layer):
     count, i = 0, 0
     while i < len(keys):
         z = keys[i] & AXIS_MASK
-        past = keys[i] - z + (z // layer + 1) * layer
-        while i + 8 <= len(keys) and keys[i + 7] < past:  # keys are sorted: the eighth decides for eight
+        last = keys[i] - z + min((z // layer + 1) * layer - 1, AXIS_MASK)
+        while i + 8 <= len(keys) and keys[i + 7] <= last:  # keys are sorted: the eighth decides for eight
             i += 8
-        while i < len(keys) and keys[i] < past:
+        while i < len(keys) and keys[i] <= last:
             i += 1
         count += 1
         ends[count] = i
@@ -163,12 +163,19 @@ def _ends(keys, layer):
 
 
 @njit(cache=True, nogil=True)
+def _last_beside(key, cell):
+    """The largest key in the same cells along x: the first one past them may be too large for 64 bits."""
+    x = ((key >> (2 * AXIS_BITS)) // cell + 1) * cell - 1
+    return min(x, AXIS_MASK) << (2 * AXIS_BITS) | ((1 << (2 * AXIS_BITS)) - 1)
+
+
+@njit(cache=True, nogil=True)
 def _count(keys, labels, votes, cell, layer, reach, counts):
     """One slab of cells at a time, run by run, on a grid of its cells (y, z) with room for the reach."""
     start = 0
     while start < len(keys):
-        past = ((keys[start] >> (2 * AXIS_BITS)) // cell + 1) * cell << (2 * AXIS_BITS)
-        slab = slice(start, start + np.searchsorted(keys[start:], past))
+        last = _last_beside(keys[start], cell)
+        slab = slice(start, start + np.searchsorted(keys[start:], last, side="right"))
         start = slab.stop
         _count_slab(
             keys[slab], labels[slab], votes, cell, layer, reach, _ends(keys[slab], layer), counts[slab]

@@ -6,8 +6,10 @@ Its name is the same in the file, in the settings and in the report.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -212,15 +214,18 @@ class RefinementReport:
         ]
         return cls(tuple(steps), tuple(objects), (), float(content["systematic_errors"]))
 
-    def __add__(self, other: RefinementReport) -> RefinementReport:
-        """Of two parts of a map; objects are numbered from west to east."""
-        objects = sorted((*self.objects, *other.objects), key=lambda thing: tuple(thing.centre))
-        return RefinementReport(
-            tuple(a + b for a, b in zip(self.steps, other.steps, strict=True)),
+    @classmethod
+    def joined(cls, reports: Sequence[RefinementReport]) -> RefinementReport:
+        """Of all parts of a map, one at least; objects are numbered from west to east."""
+        objects = sorted(
+            (thing for report in reports for thing in report.objects), key=lambda thing: tuple(thing.centre)
+        )
+        return cls(
+            tuple(reduce(add, parts) for parts in zip(*(report.steps for report in reports), strict=True)),
             tuple(replace(thing, number=number) for number, thing in enumerate(objects)),
-            (*self.tracked, *other.tracked),
-            max(self.systematic_errors, other.systematic_errors),
-            self.untracked + other.untracked,
+            tuple(one for report in reports for one in report.tracked),
+            max(report.systematic_errors for report in reports),
+            sum(report.untracked for report in reports),
         )
 
 

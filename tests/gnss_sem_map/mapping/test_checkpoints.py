@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import signal
@@ -24,7 +25,7 @@ from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import MOVING_POINTS, REMOVED, STATIC, ChunkStore
-from gnss_sem_map.mapping.fusion import map_scans
+from gnss_sem_map.mapping.fusion import map_range, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.voxels import tiles
@@ -189,6 +190,16 @@ def test_a_damaged_chunk_is_mapped_again(
     store = map_scans(drive, tmp_path / "work", stats, resume=True)
     assert_same_as(at_once, store, stats)
     assert others == {n: (tmp_path / f"work/{n}/record.json").stat().st_ino for n in (0, 2)}
+
+
+def test_a_chunk_that_is_there_already_is_left_as_it_is(drive: Drive, tmp_path: Path) -> None:
+    """A worker that was taken for lost may have saved it."""
+    drive = by_chunks(drive, 2)
+    store = map_scans(drive, tmp_path / "work", RunStats())
+    before = (tmp_path / "work/0/record.json").stat()
+    map_range(drive, store, range(1))
+    assert os.path.samestat((tmp_path / "work/0/record.json").stat(), before)
+    assert {path.name for path in (tmp_path / "work").iterdir() if path.name.endswith(".part")} == set()
 
 
 def test_a_chunk_that_is_damaged_under_way_is_named_and_never_used(drive: Drive, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from long_street import SIZE_M, keyframes, street
 from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, run_steps, sums_of, tiles_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence, MapState
-from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 VOXELS = street()
@@ -75,7 +75,7 @@ def test_the_map_is_the_sum_of_its_tiles_in_any_order() -> None:
     sums = reduce(add, (sums_of(tile, VOXELS, BESIDE, ALL) for tile in reversed(tiles)))
     parts = [refine_tile(tile, VOXELS, BESIDE, ALL, figures_of(sums)) for tile in reversed(tiles)]
     state, report = run_steps(VOXELS, ALL, BESIDE)
-    of_parts = reduce(add, (report for _, report in parts))
+    of_parts = RefinementReport.joined([report for _, report in parts])
     assert of_parts.steps == report.steps
     assert of_parts.systematic_errors == report.systematic_errors > 0
     assert [thing.voxels for thing in of_parts.objects] == [thing.voxels for thing in report.objects]

@@ -52,6 +52,14 @@ def test_the_count_grid_of_one_voxel_columns_is_a_bincount():
         np.testing.assert_array_equal(counts[:, k], np.bincount(column, labels == c)[column])
 
 
+def test_the_last_voxels_that_have_keys_are_counted():
+    """The first key past their cells would not fit into 64 bits."""
+    end = 2**20 - 1
+    keys = np.sort(pack(np.array([[end, end, end], [end, end, end - 11], [end - 8, end, end]])))
+    counts = count_grid(keys, np.full(3, BUILDING, np.int8), (BUILDING, VEGETATION), 5, 5, 1)
+    assert counts.tolist() == [[1, 0]] * 3
+
+
 def test_any_number_of_threads_counts_the_same(monkeypatch):
     keys, labels = voxels(np.random.default_rng(2), 5000, 30)
     expected = count_grid(keys, labels, (BUILDING, VEGETATION), 5, 5, 1)

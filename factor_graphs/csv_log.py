@@ -6,7 +6,7 @@ What has one obvious repair is repaired, with a warning that counts the rows; al
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +29,7 @@ from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
     from pyarrow import Table
+    from pyarrow.csv import InvalidRow
 
 Array = NDArray[np.float64]
 
@@ -38,16 +39,19 @@ WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 # Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer.
 LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
 LONGEST_HEADER = 10_000
+NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$"
+# A table with a larger share of damaged rows is another kind of table; its first row is in line 2.
+MOST_DAMAGED, FIRST_ROW = 0.5, 2
 
 
 def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
     """Read `imu.csv` and `gnss.csv` of a folder; the local frame has its origin at the first valid fix.
 
     IMU columns: stamp_s; ax, ay, az, specific force, m/s²; wx, wy, wz, rad/s; x forward, y left, z up. GNSS columns:
-    stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m. Other columns are ignored. Rows without a
-    value, with a repeated stamp, or without a valid fix are dropped, and rows out of order are sorted: a RepairWarning
-    says how many. Raises MeasurementError for a file that is missing, holds no such table, or has stamps in another
-    unit than seconds.
+    stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m. Other columns are ignored. Rows that are
+    damaged, without a value, with a repeated stamp, or without a valid fix are dropped, and rows out of order are
+    sorted: a RepairWarning says how many. Raises MeasurementError for a file that is missing, holds no such table, has
+    more damaged rows than others, or has stamps in another unit than seconds.
     """
     imu_csv, gnss_csv = Path(folder) / "imu.csv", Path(folder) / "gnss.csv"
     imu_rows = _numbers(imu_csv, IMU_COLUMNS, LONGEST_IMU_STEP_S)
@@ -111,9 +115,11 @@ def parse_numbers(content: bytes, columns: tuple[str, ...], where: str, longest_
 
 
 def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table:
-    """The named columns of a CSV file, each with its Arrow type; raises MeasurementError for anything else."""
+    """The named columns of a CSV file, each with its Arrow type; a damaged row has none of the damaged values.
+
+    Raises MeasurementError for another table, and where most rows are damaged.
+    """
     import pyarrow as pa
-    from pyarrow import csv
 
     expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds"
     header = content[:LONGEST_HEADER].partition(b"\n")[0].decode("utf-8-sig", "replace")
@@ -124,28 +130,74 @@ def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table
         found = " ".join(header.split())[:200]
         raise MeasurementError(f"{where}: column {wrong[0]} is missing or repeated in {found}; {expected}")
     try:
-        table = csv.read_csv(
-            pa.BufferReader(_completed(content, len(names))),
-            # with several threads an error does not tell its row
-            read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False),
-            convert_options=csv.ConvertOptions(
-                include_columns=list(types),
-                column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
-                strings_can_be_null=True,
-            ),
-        )
+        table = _read(content, names, types)
     except (pa.ArrowException, ValueError, KeyError) as error:
-        raise MeasurementError(f"{where}: {' '.join(str(error).split())[:200]}; {expected}") from None
+        repaired = _without_damage(content, names, types)
+        if repaired is None:
+            raise MeasurementError(f"{where}: {' '.join(str(error).split())[:200]}; {expected}") from None
+        table = repaired
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
     return table
 
 
-def _completed(content: bytes, cells: int) -> bytes:
-    """A last line that was cut off, when the logger died, becomes a row without values: dropped and counted as such."""
-    start = content.rfind(b"\n") + 1
-    is_cut = start and content.count(b",", start) < cells - 1 and content[start:].strip()
-    return content[:start] + b"," * (cells - 1) if is_cut else content
+def _read(
+    content: bytes,
+    names: list[str],
+    types: Mapping[str, str],
+    if_invalid: Callable[[InvalidRow], str] | None = None,
+    encoding: str = "utf8",
+) -> Table:
+    """The columns in `types` of rows with columns `names`; raises what pyarrow does."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    return csv.read_csv(
+        pa.BufferReader(content),
+        # with several threads an error does not tell its row
+        read_options=csv.ReadOptions(column_names=names, skip_rows=1, use_threads=False, encoding=encoding),
+        parse_options=csv.ParseOptions(invalid_row_handler=if_invalid),
+        convert_options=csv.ConvertOptions(
+            include_columns=list(types),
+            column_types={name: pa.type_for_alias(kind) for name, kind in types.items()},
+            strings_can_be_null=True,
+        ),
+    )
+
+
+def _without_damage(content: bytes, names: list[str], types: Mapping[str, str]) -> Table | None:
+    """The table without what is damaged in it; None where most rows are damaged: it is another kind of table.
+
+    A row with too many or too few cells becomes a row without values, and a cell that is no number is without a value:
+    so both are dropped and counted as such. That takes longer than to read an intact file.
+    """
+    import pyarrow as pa
+    from pyarrow import compute
+
+    invalid: list[tuple[int, int]] = []
+
+    def leave_out(row: InvalidRow) -> str:
+        invalid.append((row.number, row.text.count("\n") + 1))  # a lost quote joins lines
+        return "skip"
+
+    try:  # as latin1 every byte is a character
+        texts = _read(content, names, dict.fromkeys(types, "string"), leave_out, "latin1")
+    except (pa.ArrowException, ValueError, KeyError):
+        return None
+    damaged, columns = np.zeros(texts.num_rows, np.bool_), {}
+    for name, kind in types.items():
+        columns[name] = texts[name]
+        if kind != "string":
+            cells = compute.utf8_trim_whitespace(texts[name])
+            is_number = compute.match_substring_regex(cells, NUMBER)
+            damaged |= compute.invert(is_number).fill_null(False).to_numpy()
+            columns[name] = compute.if_else(is_number, cells, None).cast(kind)
+    first, lines = np.array(invalid, dtype=np.int64).reshape(-1, 2).T
+    if damaged.sum() + lines.sum() > MOST_DAMAGED * (texts.num_rows + lines.sum()):
+        return None
+    places = np.repeat(first - FIRST_ROW - np.arange(len(first)), lines)
+    rows = np.insert(np.arange(texts.num_rows), places, -1)
+    return pa.table(columns).take(pa.array(rows, mask=rows < 0))
 
 
 def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:

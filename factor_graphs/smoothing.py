@@ -80,6 +80,12 @@ class Solution:
     condensed: CondensedDrive | None = None
     notes: tuple[str, ...] = ()
 
+    @property
+    def outside_imu(self) -> NDArray[np.bool_]:
+        """Which of the fixes given (m,) are of a time without IMU: not used, and `rejected` for no fault of theirs."""
+        outside: NDArray[np.bool_] = np.isnan(self.fix_residuals).any(axis=1)
+        return outside
+
     def in_short(self) -> "Solution":
         """The same with ten poses a second, enough for a plot, and without the covariances of the states."""
         stamps = self.trajectory.stamps
@@ -183,7 +189,7 @@ def _solution(
         iterations=fit.iterations,
         vehicle=vehicle,
         wheels=wheels,
-        notes=(*problem.notes, *_doubts(problem, fit, keyframes, rejected, calibration)),
+        notes=(*problem.notes, *_doubts(problem, fit, keyframes, calibration)),
     )
 
 
@@ -210,9 +216,7 @@ def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration
     return off
 
 
-def _doubts(
-    problem: Problem, fit: Fit, keyframes: Trajectory, rejected: NDArray[np.bool_], calibration: Calibration
-) -> Iterator[str]:
+def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Calibration) -> Iterator[str]:
     """What the user should know before believing the trajectory, in words."""
     force = float(np.median(np.linalg.norm(problem.intervals.specific_force, axis=1)))
     gravity = problem.frame.gravity
@@ -227,8 +231,8 @@ def _doubts(
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
-    if rejected.any():
-        yield f"{rejected.sum()} of {len(rejected)} fixes rejected"
+    if rejected := np.count_nonzero(fit.squares > REJECTION):  # of others the problem's notes tell
+        yield f"{rejected} of {len(problem.used)} fixes rejected"
     unfit = fit.relative_squares > RELATIVE_REJECTION
     if unfit.sum() > NOTABLE_REJECTION * len(unfit):
         yield f"{unfit.sum()} of {len(unfit)} relative poses rejected"

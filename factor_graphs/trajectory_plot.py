@@ -23,7 +23,7 @@ LINE_SHARE = 0.016
 
 
 def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
-    """Write track, residuals, standard deviations and biases as one PNG, with rejected fixes and all notes.
+    """Write track, residuals, standard deviations and biases as one PNG, with fixes that were not used and all notes.
 
     `fixes` are those given to the smoother. The file is written where `path` says, whatever its name ends with. Raises
     MeasurementError for other fixes, and OSError when the file cannot be written.
@@ -63,7 +63,7 @@ def _track(axes: "Axes", solution: Solution, fixes: GnssFixes) -> None:
     positions, rejected = solution.trajectory.positions, solution.rejected
     axes.plot(*positions[:, :2].T, color="black", linewidth=1.2, label="trajectory")
     axes.plot(*fixes.positions[~rejected, :2].T, ".", color="tab:blue", markersize=3, label="fixes")
-    axes.plot(*fixes.positions[rejected, :2].T, "x", color="tab:red", markersize=5, label="rejected fixes")
+    axes.plot(*fixes.positions[rejected, :2].T, "x", color="tab:red", markersize=5, label="fixes not used")
     axes.plot(*positions[0, :2], "o", color="tab:green", label="start")
     # a fix kilometres away must not shrink the drive to a dot, and a straight drive needs some width
     low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)

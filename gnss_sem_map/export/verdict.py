@@ -146,7 +146,9 @@ def _missing(run: Mapping[str, Any]) -> Iterator[str]:
     if trajectory := run.get("trajectory"):
         rejected, fixes = trajectory.get("fixes_rejected"), trajectory.get("fixes")
         if rejected is not None and fixes is not None:
-            yield f"{rejected:,} of {fixes:,} satellite positions were rejected as wrong."
+            outside = trajectory.get("fixes_outside_imu", 0)
+            unused = f"; {outside:,} were not used: the IMU recorded nothing at their time" if outside else ""
+            yield f"{rejected:,} of {fixes:,} satellite positions were rejected as wrong{unused}."
     about_map = run.get("map", {})
     if about_map.get("points_removed") and about_map.get("points"):
         share = about_map["points_removed"] / about_map["points"]

@@ -77,6 +77,10 @@ def test_the_order_of_columns_spaces_and_other_columns_do_not_matter(log):
     ("name", "row", "column", "value", "says"),
     [
         ("imu.csv", 3, 2, "nan", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
+        ("imu.csv", 3, 2, "n/k", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
+        ("imu.csv", 3, 0, "2026-11-23T15:26:52.1", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
+        ("imu.csv", 3, 6, "1,2", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
+        ("gnss.csv", 5, 1, "-", r"gnss\.csv: 1 rows dropped: no place on Earth, or 0, 0"),
         ("imu.csv", 3, 0, "", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
         ("imu.csv", 3, 1, "1e12", r"imu\.csv: IMU: 40 rows; 1 not finite, dropped"),
         ("imu.csv", 3, 0, "0.02", r"imu\.csv: IMU: 40 rows; 1 repeated, dropped"),
@@ -109,6 +113,19 @@ def test_a_last_line_that_was_cut_off_costs_that_row_only(log, kept):
     np.testing.assert_array_equal(after.specific_force, before.specific_force[:-1])
 
 
+def test_lines_of_another_kind_cost_these_rows_only(log):
+    before, *_ = read_csv(log)
+    lines = (log / "imu.csv").read_bytes().splitlines()
+    lines[5], lines[20], lines[30] = b"garbage", b"\xff\xfe\x00" + lines[20], lines[30][:25]
+    lines[40] += b",7"
+    (log / "imu.csv").write_bytes(b"\n".join(lines))
+    with pytest.warns(RepairWarning, match="40 rows; 4 not finite, dropped"):
+        after, *_ = read_csv(log)
+    kept = np.delete(np.arange(40), [4, 19, 29, 39])
+    np.testing.assert_array_equal(after.stamps, before.stamps[kept])
+    np.testing.assert_array_equal(after.specific_force, before.specific_force[kept])
+
+
 def test_rows_out_of_order_are_sorted_and_counted(log):
     before, *_ = read_csv(log)
 
@@ -129,9 +146,10 @@ def test_rows_out_of_order_are_sorted_and_counted(log):
         (lambda h, r: (h.replace("stamp_s", "time"), r), r"column stamp_s is missing .* in time,ax.*expected numbers"),
         (lambda h, r: (h.replace("wz", "wy"), r), "column wy is missing or repeated"),
         (lambda h, r: (h.replace(",", ";"), r), "column stamp_s is missing .* in stamp_s;ax"),
-        (cell(4, 3, "n/k"), "Row #6.*invalid value 'n/k'.*expected numbers"),
-        (cell(4, 0, "2026-11-23T15:26:52.1"), "Row #6.*2026-11-23T15.*a stamp is a number of seconds"),
-        (lambda h, r: (h, [*r[:-1], r[-1][:4]]), "Row #41: Expected 7 columns, got 4"),
+        (lambda h, r: (h, [[*c[:3], "n/k", *c[4:]] for c in r]), "Row #2.*invalid value 'n/k'.*expected numbers"),
+        (lambda h, r: (h, [["2026-11-23T15:26:52.1", *c[1:]] for c in r]), "Row #2.*a stamp is a number of seconds"),
+        (lambda h, r: (h, [*r[:19], *(c[:4] for c in r[19:])]), "Row #21: Expected 7 columns, got 4"),
+        (lambda h, r: (h, [*r[:9], ['"', *r[9][1:]], *r[10:]]), "Row #11: Expected 7 columns, got 1"),
         (lambda h, r: (h, []), "no rows"),
         (lambda h, r: ("", []), "empty"),
         (lambda h, r: (h, [[f"{float(c[0]) * 1e3}", *c[1:]] for c in r]), "are these milliseconds"),

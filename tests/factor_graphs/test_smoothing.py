@@ -181,6 +181,10 @@ def test_fixes_kilometres_away_or_outside_the_imu_are_left_out_and_reported(simu
     assert np.isnan(s.fix_residuals[-1]).all()
     assert any(f"3 of {len(stamps)} fixes need more than 70 m/s" in note for note in s.notes)
     assert any(f"1 of {len(stamps)} fixes outside the IMU's span" in note for note in s.notes)
+    assert np.flatnonzero(s.outside_imu).tolist() == [len(stamps) - 1]
+    unfit = s.rejected.sum() - 4
+    told = [note for note in s.notes if note.endswith("fixes rejected")]
+    assert told == ([f"{unfit} of {len(stamps)} fixes rejected"] if unfit else []), "each fix is told of once"
     assert error_of(s, drive).horizontal_rms_m < 0.6
 
 

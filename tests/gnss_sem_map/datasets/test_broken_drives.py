@@ -106,7 +106,7 @@ def test_a_broken_sequence_is_refused(
     ("name", "old", "new", "says"),
     [
         ("imu.csv", "stamp_s,ax", "time,ax", "imu.csv:.*expected numbers in columns stamp_s,ax"),
-        ("gnss.csv", "0.05000000000\n", "good\n", "gnss.csv:.*expected numbers"),
+        ("gnss.csv", "std_u_m", "sigma_u", "gnss.csv:.*expected numbers"),
         ("log.yaml", '"K"', '"k"', "log.yaml: k: .*known keys are"),
         ("log.yaml", '"image_size": [300, 96], ', "", "a camera needs all of"),
     ],

@@ -209,15 +209,32 @@ def test_frames_of_a_sequence_without_a_file_are_listed(small_drive: Street, tmp
 def test_lines_of_a_stamp_table_that_are_left_out_are_listed(small_drive: Street, tmp_path: Path) -> None:
     drive = street.write_table_log(tmp_path, small_drive)
     stamps = drive / "lidar/stamps.csv"
-    stamps.write_text(stamps.read_text() + "5,0.66\n6,\n40,4.05\n")
+    stamps.write_text(stamps.read_text() + "5,0.66\n6,\n40,4.05\ngarbage\n7,later\n7,0.7,0.7\n")
     log = open_drive(drive)
     assert len(log.scans) == 12
     assert left_out(log) == [
         ("scan", 1, "frame 5 has a stamp already"),
-        ("scan", 1, "no number, or no stamp"),
+        *[("scan", 1, "no number, or no stamp")] * 4,
         ("scan", 1, "1 files missing"),
     ]
     assert [scan.stamp for scan in log.scans if scan.number == 5] == [0.55]
+
+
+def test_damaged_rows_of_a_table_are_left_out_and_counted(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    before = open_drive(drive)
+    for name in ("imu.csv", "gnss.csv"):
+        lines = (drive / name).read_text().splitlines()
+        lines[8] = "garbage"
+        (drive / name).write_text("\n".join(lines) + "\n")
+    log = open_drive(drive)
+    assert (len(log.imu or ()), len(log.gnss or ())) == (
+        len(before.imu or ()) - 1,
+        len(before.gnss or ()) - 1,
+    )
+    told = {skip.where.rpartition("/")[2]: skip.reason for skip in log.skips}
+    assert "1 not finite, dropped" in told["imu.csv"]
+    assert told["gnss.csv"] == "1 rows: no stamp, or one far off all others"
 
 
 def test_the_100_hz_twin_is_used_for_the_imu_only(copy: Path) -> None:

@@ -119,11 +119,11 @@ def decide(
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
 
-    parted = [
+    parted = (
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)
         for seen, counted in zip(observations, counts(), strict=True)
-    ]
-    segments, free = [one[0] for one in parted], [one[1] for one in parted]
+    )
+    segments, free = map(list, zip(*parted, strict=True))
     hits, misses = np.concatenate(
         [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts(), strict=True)], axis=1
     )
@@ -135,20 +135,22 @@ def decide(
         gone = _gone(objects, len(listed))
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
     stood = is_whole & ~gone & is_occupied(hits, misses)
-    moved_of = _either(_of_voxels(gone, segments), free)
-    occupied = [is_occupied(*counted) for counted in counts()]
     stood_of = (
-        np.int8(2) * whole + ((of_scan.number < 0) & there)
-        for whole, of_scan, there in zip(_of_voxels(stood, segments), segments, occupied, strict=True)
+        np.int8(2) * whole + ((of_scan.number < 0) & is_occupied(*counted))
+        for whole, of_scan, counted in zip(_of_voxels(stood, segments), segments, counts(), strict=True)
     )
+    moved_of = _either(_of_voxels(gone, segments), free)
+    del free  # a mask of all scans takes 10 MB here, at the peak of memory: others are made twice, one at a time
     stays = standing(places, counts(), moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of, stays, strict=True)]
-    stands = occupied if is_sharp else [of_scan.number >= 0 for of_scan in segments]
     if is_sharp:
         stamps = np.array([seen.stamp for seen in observations])
         near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
         of_mover, without = presence(places, of_places, near)
-        moved, stands = _either(moved, of_mover), _either(stands, without)
+        moved = _either(moved, of_mover)
+        stands = _either((is_occupied(*counted) for counted in counts()), without)
+    else:
+        stands = [of_scan.number >= 0 for of_scan in segments]
     listed = with_cover(listed, segments, [seen.seen for seen in observations], _of_voxels(gone, segments))
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count

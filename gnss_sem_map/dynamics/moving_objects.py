@@ -140,9 +140,7 @@ def decide(
         for whole, of_scan, counted in zip(_of_voxels(stood, segments), segments, counts(), strict=True)
     )
     moved_of = _either(_of_voxels(gone, segments), free)
-    del (
-        free
-    )  # a mask of all scans takes 10 MB here, at the peak of memory: others are made twice, one at a time
+    del free  # masks of all scans take 10 MB here, at the peak of memory: others are made one by one
     stays = standing(places, counts(), moved_of, stood_of)
     moved = [is_gone & ~stay for is_gone, stay in zip(moved_of, stays, strict=True)]
     if is_sharp:

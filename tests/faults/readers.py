@@ -81,9 +81,9 @@ def scan(folder: Path) -> Reader:
 
 
 def _read_now(path: Path, stamp: float) -> object:
-    from gnss_sem_map.datasets.csv_log import _read_scan
+    from gnss_sem_map.datasets.csv_log import LidarFile, _read_scan
 
-    return _read_scan(path, stamp, False, None)
+    return _read_scan(path, stamp, LidarFile(), None)
 
 
 def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:

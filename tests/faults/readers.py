@@ -83,7 +83,7 @@ def scan(folder: Path) -> Reader:
 def _read_now(path: Path, stamp: float) -> object:
     from gnss_sem_map.datasets.csv_log import LidarFile, _read_scan
 
-    return _read_scan(path, stamp, LidarFile(), None)
+    return _read_scan(path, stamp, LidarFile(T_imu_lidar=np.eye(4).tolist()), None)
 
 
 def picture(suffix: str, mutate: Callable[..., bytes], folder: Path) -> Reader:

@@ -335,9 +335,8 @@ def _claim(out: Path) -> None:
     """Make the folder of a training; raises ConfigError for one with other files."""
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        strange = sorted(
-            {path.name for path in out.iterdir()} - {STATE, NETWORK, LOG, f"{STATE}.part", MARKER}
-        )
+        own = {STATE, NETWORK, LOG, f"{STATE}.part", f"{NETWORK}.part", MARKER}
+        strange = sorted({path.name for path in out.iterdir()} - own)
         ours = (out / STATE).exists() or ((out / MARKER).exists() and not strange)  # a run has a list, too
         if any(out.iterdir()) and not ours:
             raise ConfigError(

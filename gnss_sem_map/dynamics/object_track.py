@@ -199,6 +199,19 @@ def _height(levels: Array, is_cut: NDArray[np.bool_]) -> float:
     return float(np.quantile(whole[:, 1] - whole[:, 0], SIZE_QUANTILE))
 
 
+def by_near_side(
+    low: Array, high: Array, lidar: Array, extent: float
+) -> tuple[Array, NDArray[np.int64], Array]:
+    """Middle (k,) m of an object of this extent along an axis, by its side that faces the LiDAR, and how it is found.
+
+    `low`, `high` and `lidar` (k,) m are the ends of what is seen, and the LiDAR. Beside the middle: which side is seen
+    (k,), 1 the lower one, -1 the higher one, 0 neither, and half of what is hidden (k,) m.
+    """
+    hidden = np.maximum(extent - (high - low), 0.0) / 2
+    side = np.where(lidar < low, 1, np.where(lidar > high, -1, 0))
+    return (low + high) / 2 + side * hidden, side, hidden
+
+
 def _middle(
     low: Array, high: Array, lidar: Array, is_cut: NDArray[np.bool_], edge: Array, extent: float
 ) -> tuple[Array, Array]:
@@ -207,9 +220,7 @@ def _middle(
     `low` and `high` (k,) m are the ends of what is seen, `lidar` (k,) m where the LiDAR is.
     """
     seen = high - low
-    hidden = np.maximum(extent - seen, 0.0) / 2
-    side = np.where(lidar < low, 1, np.where(lidar > high, -1, 0))
-    middle = (low + high) / 2 + side * hidden
+    middle, _, hidden = by_near_side(low, high, lidar, extent)
     vehicle = CAR_M if (~is_cut).sum() >= WHOLE_SCANS else LORRY_M
     possible = max(extent, vehicle) if extent > SMALL_M / 2 else extent
     of_cut = np.maximum(possible - seen, 0.0) / 2 + HIDDEN_STDDEV_M

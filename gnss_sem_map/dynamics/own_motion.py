@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from gnss_sem_map.dynamics.object_track import CAR_M, EDGE_STDDEV_M, EDGE_STDDEV_RATIO, by_near_side
 from gnss_sem_map.dynamics.tracking import Segment
 
-EDGE_STDDEV_M, EDGE_STDDEV_RATIO = 0.08, 0.005
-"""An edge of an object is known to this, plus this share of the range: spacing of the beams, and poses."""
 SIGNIFICANT = 5.0
 """A shift of so many standard deviations is no chance, in thousands of tracks."""
 LEAST_SCANS, LEAST_SHIFT_M = 4, 0.5
@@ -28,8 +27,6 @@ STEADY_SHARE = 0.6
 """What moves goes on: its shift is at least this share of its way, to and fro."""
 LARGEST_STEP_SHARE = 0.6
 """A step from one scan to the next that is a larger share of the shift is an error of the clusters."""
-CAR_M = 4.5
-"""A vehicle that showed less of its length may be as long as this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +39,6 @@ class OwnMotion:
     """Its standard deviation."""
     is_steady: bool
     """It went on in one direction, and not at one jump."""
-    positions_m: NDArray[np.float64]
-    """(k,) of its centre along the course."""
-    length_m: float
-    """Its greatest extent along the course."""
 
     @property
     def is_moving(self) -> bool:
@@ -69,11 +62,10 @@ def own_motion(
     noise = scatter((low + high) / 2)
     low, high = (median_filter(side, SMOOTHED, mode="nearest") for side in (low, high))
     length = float(np.quantile(high - low, 0.9))
-    side = np.where(lidar < low, 1, np.where(lidar > high, -1, 0))
-    hidden = np.maximum(length - (high - low), 0) / 2
-    centre = (low + high) / 2 + side * hidden
+    centre, side, hidden = by_near_side(low, high, lidar, length)
     start, end = np.sort([centre.argmin(), centre.argmax()])
     shift = centre[end] - centre[start]
+    # a vehicle that showed less of its length may be as long as a car
     unknown = max(CAR_M - length, 0.0) / 2 * abs(side[start] - side[end])
     unknown += sum(hidden[k] for k in (start, end) if side[k] == 0)
     known = np.maximum(EDGE_STDDEV_M + EDGE_STDDEV_RATIO * ranges[[start, end]], noise)
@@ -81,7 +73,7 @@ def own_motion(
     steps = np.diff(centre[start : end + 1])
     way, largest = abs(steps).sum(), abs(steps).max(initial=0.0)
     is_steady = bool(abs(shift) > STEADY_SHARE * way and largest < LARGEST_STEP_SHARE * abs(shift))
-    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, centre, length)
+    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady)
 
 
 def scatter(values: NDArray[np.float64]) -> float:

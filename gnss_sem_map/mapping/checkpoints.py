@@ -13,6 +13,7 @@ NUMBER/record.json           counts, skips, moving objects, checksums
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -66,7 +67,8 @@ class ChunkStore:
     def write(self, chunk: MappedChunk) -> None:
         """Save a chunk; raises DataError when the disk is full or the folder may not be written to.
 
-        Unfinished files are removed. One that is there already, of a worker taken for lost, has the same bytes.
+        A chunk that is there already stays: a worker that was thought lost may have saved it. Unfinished files are
+        removed.
         """
         beside = self.folder / f".{chunk.number}.{os.getpid()}.part"
         checksums: dict[str, str] = {}
@@ -84,15 +86,21 @@ class ChunkStore:
                 "untracked": sum(one.points < LEAST_TRACKED_POINTS for one in chunk.objects),
             }
             write_whole(beside / RECORD, json.dumps({"sha256": _checksum(body), "record": body}).encode())
-            beside.rename(self.folder / str(chunk.number))
+            self._put(beside, chunk.number)
         except OSError as error:
-            if self.is_whole(chunk.number):
-                return
             raise DataError(
                 f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then --resume"
             ) from None
         finally:
             shutil.rmtree(beside, ignore_errors=True)
+
+    def _put(self, beside: Path, number: int) -> None:
+        """Give a finished folder its name, unless another process was quicker: both have the same bytes."""
+        try:
+            beside.rename(self.folder / str(number))
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not self.is_whole(number):
+                raise
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk is of this run, complete and undamaged."""

@@ -2,7 +2,7 @@
 
 evidence/moved/               the voxels of moving points, tile by tile
          moving_points/N.npz  the points that moved in the scans of chunk N
-         keyframes/N.npz      its range images for free-space evidence, if the poses come from LiDAR odometry
+         keyframes/N.npz      its range images for free-space evidence, if the poses of the chunk are sharp enough
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class RunEvidence:
     moving_points: Sequence[Path]
     """Files of the points that moved, see `read_moving_points`."""
     keyframes: Sequence[Path]
-    """Files of keyframe scans; none unless the poses come from LiDAR odometry."""
+    """Files of keyframe scans; none of a chunk whose poses are not sharp enough (`dynamics.pose_sharpness`)."""
 
     def moving(self, lidar: str = "") -> dict[int, NDArray[np.int64]]:
         """Frame number -> indices of the moving points among the usable points of the scan; raises DataError."""

@@ -62,7 +62,6 @@ def label_points(
     files = list(moving_points)
     moving: dict[int, NDArray[np.int64]] = {}
     drive = Drive(log, trajectory, None, settings)
-    place = {scan.number: n for n, scan in enumerate(drive.scans)}
     _ = drive.nearest_m  # the scans that tell it are kept for their turn
     for start in range(0, len(drive.scans), SCANS_AT_ONCE):
         scans = drive.scans[start : start + SCANS_AT_ONCE]
@@ -70,10 +69,9 @@ def label_points(
         if box is None:
             continue
         parts = [tiled.inside(box) for tiled in maps]
-        last = place[scans[-1].number]
-        while (
-            files and max((place.get(n, -1) for n in moving), default=-1) < last
-        ):  # not every scan has an entry
+        # skipped scans are in no file: the files of these scans end where one holds the last of them, or a later one
+        enough = {scan.number for scan in drive.scans[start + len(scans) - 1 :]}
+        while files and enough.isdisjoint(moving):
             moving |= read_moving_points(files.pop(0))
         yield from _label_some(drive, scans, parts, moving, kerbs)
         for scan in scans:

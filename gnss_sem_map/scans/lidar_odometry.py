@@ -165,9 +165,7 @@ def match_section(
     first = max(section.start - WARM_UP_SCANS, 0)
     before = 0  # matches of the section before
     # the next sweeps are read, downsampled and deskewed on a second core while one is matched
-    prepare = partial(
-        _prepare, trajectory=trajectory, T_imu_lidar=log.calibration.T_imu_lidar, settings=settings
-    )
+    prepare = partial(_prepare, log=log, trajectory=trajectory, settings=settings)
     for number, (scan, sweep) in enumerate(prefetch(prepare, log.scans[first : section.stop]), first):
         if number == section.start:
             before, skips = len(matches), []
@@ -177,7 +175,7 @@ def match_section(
             else:
                 matches.append(odometry.match(number, scan, sweep))
         except _NoMatch as error:
-            skips.append(Skip("scan matching", f"frame {scan.number}", str(error)))
+            skips.append(Skip("scan matching", f"frame {log.frame_of(scan)}", str(error)))
         progress("scan matching", number + 1, len(log.scans))
     counts = Counter(
         {
@@ -200,15 +198,15 @@ class _Sweep:
 
 
 def _prepare(
-    scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
+    scan: Scan, log: SensorLog, trajectory: Trajectory, settings: ScanMatchingSettings
 ) -> _Sweep | Skip:
     """The sweep ready for registration, or the reason why it is skipped."""
     try:
-        return _sweep(scan, trajectory, T_imu_lidar, settings)
+        return _sweep(scan, trajectory, log.calibration.T_imu_lidar, settings)
     except (DataError, MeasurementError) as error:
-        return Skip("scan", f"frame {scan.number}", str(error))
+        return Skip("scan", f"frame {log.frame_of(scan)}", str(error))
     except _NoMatch as error:
-        return Skip("scan matching", f"frame {scan.number}", str(error))
+        return Skip("scan matching", f"frame {log.frame_of(scan)}", str(error))
 
 
 def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings) -> _Sweep:

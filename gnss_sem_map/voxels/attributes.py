@@ -19,7 +19,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import is_folder, read_bytes, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.voxels.map_json import files_of, name_of, tile_of
-from gnss_sem_map.voxels.tile_files import PACKING, Tile, arrow_column, global_keys, local_keys, numbers_of
+from gnss_sem_map.voxels.tile_files import Tile, as_parquet, global_keys, local_keys, numbers_of
 
 ATTRIBUTES = "attributes"
 """Folder beside a map."""
@@ -91,19 +91,9 @@ def combined(parts: Sequence[Attributes]) -> Attributes:
 
 def encode(attributes: Attributes) -> bytes:
     """The file of a tile."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     _, points, last_us, intensity = attributes.columns
     values = local_keys(attributes.keys), points, last_us, intensity.astype(np.int32)
-    table = pa.table({name: arrow_column(column) for name, column in zip(COLUMNS, values, strict=True)})
-    sink = pa.BufferOutputStream()
-    pq.write_table(
-        table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
-        write_statistics=False, store_schema=False, write_page_checksum=True,
-        column_encoding=dict.fromkeys(COLUMNS, "DELTA_BINARY_PACKED"),
-    )  # fmt: skip
-    return bytes(sink.getvalue())
+    return as_parquet(dict(zip(COLUMNS, values, strict=True)), by_difference=COLUMNS, page_checksums=True)
 
 
 def write(attributes: Iterable[tuple[Tile, Attributes]], folder: Path) -> None:

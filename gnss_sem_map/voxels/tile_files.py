@@ -10,6 +10,7 @@ removed. Keys are sorted and delta-coded, so a voxel takes about 11 bytes. Any P
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def encode(piece: SemanticMap) -> bytes:
         columns[HITS_REMOVED] = piece.hits_removed
     if piece.reasons is not None and piece.reasons.any():
         columns[REASON] = piece.reasons.astype(np.int32)
-    return _as_parquet(columns)
+    return as_parquet(columns)
 
 
 def describe(piece: SemanticMap, content: bytes) -> dict[str, Any]:
@@ -121,7 +122,7 @@ def _check(columns: dict[str, NDArray[Any]], classes: int) -> None:
 
 def encode_voxels(voxels: VoxelMap) -> bytes:
     """The voxels of one tile, without decisions, as a Parquet file."""
-    return _as_parquet(_columns_of(voxels))
+    return as_parquet(_columns_of(voxels))
 
 
 def decode_voxels(content: bytes, tile: Tile, voxel_size_m: float, label_set: LabelSet) -> VoxelMap:
@@ -142,21 +143,26 @@ def _columns_of(voxels: VoxelMap) -> dict[str, NDArray[Any]]:
     return columns if voxels.heights is None else columns | {HEIGHTS: voxels.heights}
 
 
-def _as_parquet(columns: dict[str, NDArray[Any]]) -> bytes:
+def as_parquet(
+    columns: Mapping[str, NDArray[Any]],
+    by_difference: Collection[str] = BY_DIFFERENCE,
+    page_checksums: bool = False,
+) -> bytes:
+    """Columns of numbers (n,) as a Parquet file, some of them stored as differences."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    table = pa.table({name: arrow_column(values) for name, values in columns.items()})
+    table = pa.table({name: _arrow_column(values) for name, values in columns.items()})
     sink = pa.BufferOutputStream()
     pq.write_table(
         table, sink, compression="zstd", compression_level=PACKING, use_dictionary=False,
-        write_statistics=False, store_schema=False,
-        column_encoding={name: "DELTA_BINARY_PACKED" for name in columns if name in BY_DIFFERENCE},
+        write_statistics=False, store_schema=False, write_page_checksum=page_checksums,
+        column_encoding={name: "DELTA_BINARY_PACKED" for name in columns if name in by_difference},
     )  # fmt: skip
     return bytes(sink.getvalue())
 
 
-def arrow_column(values: NDArray[Any]) -> Any:
+def _arrow_column(values: NDArray[Any]) -> Any:
     """Numbers as a column; `pa.array` imports pandas, which takes 0.2 s and 40 MB of every worker."""
     import pyarrow as pa
 

@@ -255,9 +255,9 @@ class VoxelTable:
         """Add the points of one scan: their voxel keys (n,) and their class probabilities (eq. 6).
 
         `pixels` (n,) is the row in `classes` of each point, -1 for none; `classes` (p, c + 1) are uint8 probabilities,
-        `other` last. `heights` (n,) are those of the points in their voxels, see `heights_in_voxels`; if they are not
-        given, the map has no heights. `seen` is for a table with attributes. Raises DataError when a voxel's evidence
-        would overflow.
+        `other` last. `heights` (n,) are those of the points over the bottom of their voxels, in 1/256 of the edge; if
+        they are not given, the map has no heights. `seen` is for a table with attributes. Raises DataError when a
+        voxel's evidence would overflow.
         """
         if pixels is None or classes is None:
             pixels = np.full(len(keys), -1, np.int32)
@@ -337,12 +337,6 @@ def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64
             f" {AXIS_OFFSET * voxel_size_m / 1000:.0f} km from its origin; check the poses"
         )
     return keys
-
-
-def heights_in_voxels(z: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.uint8]:
-    """Heights z (n,) m of points over the bottom of their voxels, in 1/256 of its edge."""
-    part = z / voxel_size_m
-    return np.minimum(HEIGHT_UNITS * (part - np.floor(part)), HEIGHT_UNITS - 1).astype(np.uint8)
 
 
 def unpack(keys: NDArray[np.int64]) -> NDArray[np.int32]:

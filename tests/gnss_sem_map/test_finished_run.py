@@ -19,7 +19,8 @@ from gnss_sem_map import Run, Settings, run
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.output_folder import locked
-from gnss_sem_map.mapping.evidence import write_moving_points
+from gnss_sem_map.mapping import point_labels
+from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.runs.merged_run import merge_run_folders
@@ -229,6 +230,32 @@ def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run, tmp_path: Pa
     write_moving_points({log.scans[0].number: np.array([10**6])}, moved)
     with pytest.raises(DataError, match="make the run again"):
         list(label_points(log, finished.trajectory, maps, finished.settings, [moved]))
+
+
+def test_moving_points_are_read_as_scans_need_them_though_one_was_skipped(
+    finished: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scan that is in no file must not make all files be read at once."""
+    log, maps = finished.drive(), [tiles.open_map(finished.folder / "refined")]
+    numbers, paths, read = [scan.number for scan in log.scans], [], list[Path]()
+    for start in range(0, len(numbers), 2):
+        paths.append(tmp_path / f"{start // 2}.npz")
+        kept = [number for number in numbers[start : start + 2] if number != numbers[0]]
+        write_moving_points({number: np.array([0]) for number in kept}, paths[-1])
+
+    def reading(path: Path) -> dict[int, Any]:
+        read.append(path)
+        return read_moving_points(path)
+
+    monkeypatch.setattr(point_labels, "SCANS_AT_ONCE", 2)
+    monkeypatch.setattr(point_labels, "read_moving_points", reading)
+    found = []
+    for scan, (labels,) in label_points(log, finished.trajectory, maps, finished.settings, paths):
+        found.append(scan.number)
+        assert len(read) == numbers.index(scan.number) // 2 + 1
+        assert labels.removed.any() == (scan.number != numbers[0])
+    assert found == numbers
+    assert len(paths) >= 3
 
 
 def test_the_coordinates_of_all_files_change_together_and_the_map_stays(

@@ -10,6 +10,7 @@ import pytest
 from chunks import assert_same
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from surfaces import heights_in_voxels
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
@@ -23,7 +24,7 @@ from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, heights_in_voxels, keys_of
+from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
 URBAN = open_label_set()
 HERE, THERE = LocalFrame(49.011, 8.423, 112.0), LocalFrame(49.0135, 8.4275, 120.0)

@@ -306,3 +306,10 @@ def test_a_sweep_before_a_section_is_reported_once() -> None:
     assert [skip.where for skip in found.skips] == ["frame 7"]
     assert found.counts["scans not matched"] == 1
     assert found.counts["scans matched"] == SWEEPS - 1
+
+
+def test_a_skipped_sweep_names_its_lidar_where_there_are_several() -> None:
+    log, truth = street()
+    few = Points(np.ones((3, 3), np.float32), np.zeros(3, np.float32), None)
+    found = match_scans(replace(with_scan(log, 7, few), lidar="roof"), truth)
+    assert [skip.where for skip in found.skips] == ["frame 7 of roof"]

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from surfaces import heights_in_voxels
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import open_label_set
@@ -20,7 +21,6 @@ from gnss_sem_map.voxels.voxel_map import (
     LARGE_TABLE,
     VoxelMap,
     VoxelTable,
-    heights_in_voxels,
     keys_of,
     limits_of,
     log_table,

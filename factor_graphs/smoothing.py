@@ -83,8 +83,7 @@ class Solution:
     @property
     def outside_imu(self) -> NDArray[np.bool_]:
         """Which of the fixes given (m,) are of a time without IMU: not used, and `rejected` for no fault of theirs."""
-        outside: NDArray[np.bool_] = np.isnan(self.fix_residuals).any(axis=1)
-        return outside
+        return np.asarray(np.isnan(self.fix_residuals[:, 0]))
 
     def in_short(self) -> "Solution":
         """The same with ten poses a second, enough for a plot, and without the covariances of the states."""
@@ -216,9 +215,7 @@ def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration
     return off
 
 
-def _doubts(
-    problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Calibration
-) -> Iterator[str]:
+def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Calibration) -> Iterator[str]:
     """What the user should know before believing the trajectory, in words."""
     force = float(np.median(np.linalg.norm(problem.intervals.specific_force, axis=1)))
     gravity = problem.frame.gravity

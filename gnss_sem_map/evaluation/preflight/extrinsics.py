@@ -17,9 +17,16 @@ from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, re
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR
 
 Array = NDArray[np.float64]
-NAME, LEVER, SCALE, FIT = "T_imu_lidar rotation", "T_imu_lidar position", "scale of motion", "motion"
+GIVEN, NAME, LEVER, SCALE, FIT = (
+    "T_imu_lidar",
+    "T_imu_lidar rotation",
+    "T_imu_lidar position",
+    "scale of motion",
+    "motion",
+)
 LONGEST_LEVER_M = 20.0
 """Longest vehicle on a road."""
 LEAST_WAY_M, LEAST_TURN_RAD = 1.0, np.radians(3.0)
@@ -61,6 +68,14 @@ class _Motions:
 
 def check(sample: Sample) -> Iterator[Finding]:
     """Lever arm as a number, then scale, rotation and lever arm by motion."""
+    for skip in sample.log.skips:
+        if skip.what == POSE_OF_LIDAR:
+            yield amber(
+                GIVEN,
+                skip.where,
+                "the pose of the LiDAR is not given: taken as that of the IMU",
+                "give T_imu_lidar in log.yaml",
+            )
     p = sample.log.calibration.T_imu_lidar[:3, 3]
     length = float(np.linalg.norm(p))
     if length > LONGEST_LEVER_M:

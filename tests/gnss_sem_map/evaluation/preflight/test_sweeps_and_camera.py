@@ -23,7 +23,7 @@ from gnss_sem_map.evaluation.preflight.findings import Finding, Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.sensor_log import Points, SensorLog, Skip
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Points, SensorLog, Skip
 from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 Array = NDArray[np.float64]
@@ -55,6 +55,13 @@ def mistakes(log: SensorLog) -> str:
 def calibrated(log: SensorLog, **parts: Array) -> SensorLog:
     """The same drive, with another calibration."""
     return replace(log, calibration=replace(log.calibration, **parts))
+
+
+def test_a_pose_of_the_lidar_that_is_not_given_is_said(town: SensorLog) -> None:
+    assert "is not given" not in mistakes(town)
+    log = replace(town, skips=(Skip(POSE_OF_LIDAR, "log.yaml", "not given"),))
+    [found] = [finding for finding in not_green(log) if "is not given" in finding.mistake]
+    assert (found.level, found.remedy) == (Level.AMBER, "give T_imu_lidar in log.yaml")
 
 
 def with_camera(log: SensorLog, **parts: Any) -> SensorLog:

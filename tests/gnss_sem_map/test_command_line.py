@@ -15,6 +15,7 @@ import typer
 from street import Street
 
 from gnss_sem_map.cli import app
+from gnss_sem_map.cli.console import print_run
 from gnss_sem_map.datasets import readers
 from gnss_sem_map.runs import expected_cost
 
@@ -183,3 +184,21 @@ def test_ctrl_c_is_one_line_from_the_first_import_on(
     assert len(said.splitlines()) == 1
     assert said.startswith("gnss-sem-map: stopped by SIGINT")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_summary_counts_frames_that_are_skipped_not_their_entries(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for frames, says in (
+        ({"scan": 25, "image": 2}, "7 voxels, 27 skips"),
+        ({"scan": 1}, "7 voxels, 1 skip\n"),
+    ):
+        about = {
+            "name": "x",
+            "counts": {},
+            "seconds": {},
+            "map": {"voxels": 7},
+            "skips": {"count": 1, "frames": frames},
+        }
+        print_run(about, Path("out"), as_json=False)
+        assert says in capsys.readouterr().out

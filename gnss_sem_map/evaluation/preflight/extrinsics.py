@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gnss_sem_map.errors import counted
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
 from gnss_sem_map.evaluation.preflight.sample import Sample
@@ -144,7 +145,8 @@ def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
     ratios = np.log(np.maximum(by_track, 1e-6) / np.maximum(by_lidar, 1e-6))
     ratio, spread = float(np.median(ratios)), float(np.ptp(ratios))
     found = (
-        f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees ({len(ratios)} stretches)"
+        f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees"
+        f" ({counted(len(ratios), 'stretch', 'stretches')})"
     )
     what = _track(sample)
     if abs(ratio) <= SAME_SCALE or (abs(ratio) <= WRONG_SCALE and len(ratios) < 2):
@@ -274,7 +276,7 @@ def _rotation_finding(
         return green(NAME, "not observable: the vehicle stood, and no ground was seen")
     deg, angle = np.degrees(turn), float(np.linalg.norm(turn))
     found = (
-        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by"
+        f"{', '.join(seen)} of {counted(len(sample.stretches), 'stretch', 'stretches')} turn it by"
         f" {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
         f" about x, y, z (+- {', '.join(f'{v:.1f}' for v in np.degrees(spread))})"
     )

@@ -21,6 +21,8 @@ LARGEST_OF_IMU = 1e6
 # Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available";
 # so is what is larger than the last, in any unit.
 LARGEST_OF_WHEELS, LARGEST_OF_USUAL, LARGEST_OF_ANY = 150.0, 10.0, 1e6
+# A longer step than so many usual ones is a gap: where one row is lost it is of two, with some jitter.
+LONGEST_STEP = 2.5
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
 BREAK_S, DAY_S, FEW = 600.0, 86400.0, 0.01
 
@@ -124,7 +126,7 @@ class ImuNoise(BaseModel):
 class Repairs:
     """What cleaning did to the rows of one sensor: how many were dropped and why, and where data are missing.
 
-    `gaps` (g, 2): first and last stamp, s, of every step longer than twice the usual one.
+    `gaps` (g, 2): first and last stamp, s, of every step by which more than one row is missing.
     """
 
     sensor: str
@@ -240,10 +242,10 @@ def unit_fault(stamps: Array, longest_step_s: float) -> str | None:
     return fault + (f"; are these {fitting[0]}?" if fitting else "")
 
 
-def gaps(stamps: Array, longer_than: float = 2.0) -> Array:
-    """First and last stamp, s, of every step longer than `longer_than` usual (median) steps: (g, 2)."""
+def gaps(stamps: Array) -> Array:
+    """First and last stamp, s, of every step longer than LONGEST_STEP usual (median) steps: (g, 2)."""
     steps = np.diff(stamps)
-    wide = np.flatnonzero(steps > longer_than * np.median(steps)) if len(steps) else np.empty(0, dtype=int)
+    wide = np.flatnonzero(steps > LONGEST_STEP * np.median(steps)) if len(steps) else np.empty(0, dtype=int)
     return np.column_stack([stamps[wide], stamps[wide + 1]])
 
 

@@ -83,7 +83,7 @@ class Solution:
     @property
     def outside_imu(self) -> NDArray[np.bool_]:
         """Which of the fixes given (m,) are of a time without IMU: not used, and `rejected` for no fault of theirs."""
-        return np.asarray(np.isnan(self.fix_residuals).any(axis=1))
+        return np.asarray(np.isnan(self.fix_residuals[:, 0]))
 
     def in_short(self) -> "Solution":
         """The same with ten poses a second, enough for a plot, and without the covariances of the states."""

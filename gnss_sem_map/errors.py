@@ -32,9 +32,17 @@ class ImageSizeError(DataError):
 class PointTimesError(DataError):
     """The times of a scan's points are not of a sweep; `mistake` says what they probably are."""
 
-    def __init__(self, message: str, mistake: str) -> None:
-        super().__init__(message)
-        self.mistake = mistake
+    def __init__(self, found: str, mistake: str) -> None:
+        super().__init__(found, mistake)
+        self.found, self.mistake = found, mistake
+
+    def __str__(self) -> str:
+        return f"{self.found}; {self.mistake}"
+
+
+def counted(number: int, one: str, many: str = "") -> str:
+    """A number of things in words: `many` is the plural where it is not that of `one` with an s."""
+    return f"{number:,} {one if number == 1 else many or f'{one}s'}"
 
 
 def how_to_install(extra: str) -> str:

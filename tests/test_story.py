@@ -138,6 +138,17 @@ def test_a_table_log_becomes_a_map(small_drive: Street, tmp_path: Path) -> None:
     assert agreement(tmp_path / "out", small_drive, 1) > 0.97
 
 
+def test_a_table_log_without_a_camera_is_mapped_without_asking_for_a_network(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    known = json.loads((drive / "log.yaml").read_text())
+    (drive / "log.yaml").write_text(json.dumps({"T_imu_lidar": known["T_imu_lidar"]}))
+    done = gnss_sem_map("run", drive, "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "no camera is described, so its" in done.stderr
+
+
 def test_two_runs_give_the_same_map_and_a_subset_of_frames_a_smaller_one(
     raw_run: Path, small_drive: Street, tmp_path: Path
 ) -> None:

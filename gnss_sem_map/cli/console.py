@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from gnss_sem_map.cli.logs import PROGRAM, Chosen, StageLog, Terminal
+from gnss_sem_map.errors import counted
 
 if TYPE_CHECKING:
     from gnss_sem_map.datasets.ros.contents import Topic
@@ -72,9 +73,10 @@ def print_run(about: dict[str, Any], out: Path, as_json: bool, stages: Container
         typer.echo(json.dumps(about))
         return
     counts, seconds = about["counts"], about["seconds"]
+    skips = sum(about["skips"]["frames"].values())
     typer.echo(
         f"{about['name']}: {counts.get('scans', 0)} scans, {counts.get('points', 0)} points,"
-        f" {about['map']['voxels']} voxels, {about['skips']['count']} skips"
+        f" {about['map']['voxels']} voxels, {counted(skips, 'skip')}"
     )
     done = {stage: value for stage, value in seconds.items() if stages is None or stage in stages}
     typer.echo("  ".join(f"{stage} {value:.1f} s" for stage, value in done.items()))
@@ -101,7 +103,9 @@ def print_many(about: dict[str, Any], out: Path, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps(about))
     else:
-        typer.echo(f"{len(about['merged'])} drives, {about['map']['voxels']} voxels; results in {out}")
+        typer.echo(
+            f"{counted(len(about['merged']), 'drive')}, {about['map']['voxels']} voxels; results in {out}"
+        )
         _print_passes(about)
     warn(f"{name} is left out: {reason}" for name, reason in about["failed"].items())
 

@@ -29,7 +29,7 @@ def print_plan(
     seconds = memory_mb = 0.0
     for source in sources:
         log = source.open_log()
-        if source.segmenter is None and log.images:
+        if source.segmenter is None and log.cameras:
             typer.echo(no_segmenter_message(source.drive), err=True)
             raise typer.Exit(1)
         source.open_network(settings, log)

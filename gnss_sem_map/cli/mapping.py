@@ -129,7 +129,7 @@ def run(
     [drive] = found
     with claimed_run(out, places_read(drive, settings, segmenter, config), is_resumable=True):
         log = open_log(drive, drive_format, frames)
-        if segmenter is None and log.images:
+        if segmenter is None and log.cameras:
             typer.echo(no_segmenter_message(str(drive)), err=True)
             raise typer.Exit(1)
         with progress_bars() as progress:

@@ -49,7 +49,7 @@ from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
-from gnss_sem_map.sensor_log import Calibration, Image, Lidar, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Calibration, Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, SensorName, lidar_to_camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -136,7 +136,9 @@ class LogFile(SensorConventions):
     p_imu_antenna: tuple[float, float, float] = Field(
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
-    T_imu_lidar: Matrix4 = Field(IDENTITY, description="LiDAR to IMU.")
+    T_imu_lidar: Matrix4 | None = Field(
+        None, description="LiDAR to IMU; default: that of the IMU, and the pre-flight check is amber."
+    )
     lidars: dict[SensorName, LidarFile] = Field(
         {}, description="Several LiDARs by name, in place of T_imu_lidar; T_camera_lidar is of the first."
     )
@@ -164,7 +166,7 @@ class LogFile(SensorConventions):
     def all_lidars(self) -> list[tuple[str, LidarFile]]:
         """The LiDARs with the names of their folders; the first is the one that all else is relative to."""
         alone = LidarFile(
-            T_imu_lidar=self.T_imu_lidar,
+            T_imu_lidar=self.T_imu_lidar or IDENTITY,
             is_compensated=self.lidar_is_compensated,
             intensity_max=self.intensity_max,
         )
@@ -194,7 +196,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         if repairs.dropped
     ]
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
-    lidars, scan_skips = _lidars(drive / "lidar", about)
+    lidars, scan_skips = _lidars(drive, about)
     calibration = _calibration(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
     return SensorLog(
@@ -346,15 +348,18 @@ def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, f
     return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
 
 
-def _lidars(folder: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]:
+def _lidars(drive: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]:
     """All LiDARs; the only one has no name."""
     found: list[Lidar] = []
     skips: list[Skip] = []
     for name, one in about.all_lidars:
-        scans, lost = _scans(folder / name, one)
+        scans, lost = _scans(drive / "lidar" / name, one)
         called = name if len(about.all_lidars) > 1 else ""
         found.append(Lidar(called, np.array(one.T_imu_lidar, np.float64), scans))
         skips += lost
+    if found[0].scans and not about.lidars and about.T_imu_lidar is None:
+        reason = "not given: taken as that of the IMU; give T_imu_lidar in log.yaml"
+        skips.append(Skip(POSE_OF_LIDAR, shown(drive / "log.yaml"), reason))
     return tuple(found), skips
 
 
@@ -395,4 +400,7 @@ def _images(
         of_camera = [Image(n, t, partial(frames.read_image, path, size), name) for n, t, path in found]
         images += in_order("image", of_camera, lost)
         skips += lost
+        if camera is None and found:
+            n = len(found)
+            skips.append(Skip("image", shown(place), f"no camera in log.yaml: {n} images not used", n))
     return tuple(sorted(images, key=lambda image: image.stamp)), skips

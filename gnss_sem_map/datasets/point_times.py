@@ -24,11 +24,10 @@ def leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> N
     if count > MOST_OUTSIDE * len(rows):
         with np.errstate(invalid="ignore", over="ignore"):
             largest = float(np.nanmax(np.abs(after), initial=0.0))
-        mistake = _mistake_of(after)
         raise PointTimesError(
             f"{where}: {count} of {len(rows)} point times are none, or up to {largest:.4g} s off the scan's stamp;"
-            f" expected seconds, at most {LONGEST_SWEEP_S:g}; {mistake}",
-            mistake,
+            f" expected seconds, at most {LONGEST_SWEEP_S:g}",
+            _mistake_of(after),
         )
     if count:
         rows[outside, :3], after[outside] = np.nan, 0.0

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gnss_sem_map.errors import counted
 from gnss_sem_map.export.overview import Overview
 from gnss_sem_map.export.track import Track
 
@@ -31,10 +32,10 @@ def verdict_of(
     raised = sum(found["level"] != "green" for found in findings)
     doubts = max(raised, len(run.get("warnings", ()))) + len(run.get("failed", {}))
     if doubts:
-        headline = f"The map is made; {_count(doubts, 'remark')} below must be read before it is used."
+        headline = f"The map is made; {counted(doubts, 'remark')} below must be read before it is used."
     elif findings:
         headline = (
-            f"The map is made, and none of {_count(len(findings), 'check')} of the recording found a fault."
+            f"The map is made, and none of {counted(len(findings), 'check')} of the recording found a fault."
         )
     else:
         headline = (
@@ -53,11 +54,11 @@ def verdict_of(
 
 
 def _size(run: Mapping[str, Any], overview: Overview | None, tracks: Sequence[Track]) -> str:
-    drives = f" in {_count(len(tracks), 'drive')}" if len(tracks) > 1 else ""
+    drives = f" in {counted(len(tracks), 'drive')}" if len(tracks) > 1 else ""
     length = sum(track.length_m for track in tracks)
     way = f"{_length(length)} driven{drives}" if tracks else "The driven length is not known"
     scans = run.get("counts", {}).get("scans")
-    seen = f" with {_count(scans, 'laser scan')}" if scans is not None else ""
+    seen = f" with {counted(scans, 'laser scan')}" if scans is not None else ""
     if overview is None:
         return f"{way}{seen}; the mapped area is not known."
     return (
@@ -128,7 +129,7 @@ def _passes(run: Mapping[str, Any]) -> Iterator[str]:
     if passes:
         before, after = (max(row[key] for row in passes) for key in ("before_m", "after_m"))
         yield (
-            f"{_count(len(passes), 'pair')} of passes over the same places: surfaces lay up to {100 * before:.1f} cm"
+            f"{counted(len(passes), 'pair')} of passes over the same places: surfaces lay up to {100 * before:.1f} cm"
             f" apart, and lie up to {100 * after:.1f} cm apart now."
         )
 
@@ -140,7 +141,7 @@ def _missing(run: Mapping[str, Any]) -> Iterator[str]:
     reasons = Counter(str(skip["reason"]) for skip in skips.get("listed", ()))
     if reasons:
         why = "; ".join(reason for reason, _ in reasons.most_common(3))
-        yield f"{_count(skips.get('count', sum(reasons.values())), 'part')} of the recording could not be used: {why}."
+        yield f"{counted(skips.get('count', sum(reasons.values())), 'part')} of the recording could not be used: {why}."
     elif "count" in skips:
         yield "All of the recording could be used."
     if trajectory := run.get("trajectory"):
@@ -175,7 +176,3 @@ def _length(metres: float) -> str:
 
 def _metres(metres: float) -> str:
     return f"{metres:.2f} m" if metres >= 0.1 else f"{100 * metres:.1f} cm"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number:,} {what}{'' if number == 1 else 's'}"

@@ -92,7 +92,12 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
 
 
 def _warn(drive: Drive, stats: RunStats) -> None:
-    if drive.segmenter is None:
+    if drive.log.images and not drive.log.cameras:
+        stats.warnings.append(
+            f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used: the map"
+            " shows geometry only"
+        )
+    elif drive.segmenter is None:
         stats.warnings.append("no segmenter: the map shows geometry only")
     elif not drive.log.cameras:
         stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")

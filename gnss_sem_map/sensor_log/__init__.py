@@ -169,6 +169,10 @@ class Skip:
     """Number of frames, rows or files."""
 
 
+POSE_OF_LIDAR = "pose of the LiDAR"
+"""`what` of the skip that says that a drive does not give it."""
+
+
 @dataclass(frozen=True, eq=False)
 class SensorLog:
     """A drive: every measurement with its stamp, and the calibration that joins the sensors."""

@@ -41,6 +41,13 @@ def test_repairs_are_told_in_words():
     assert str(repairs) == "IMU: 8 rows; 1 repeated, dropped; 1 out of order, sorted; 1 gaps, longest 0.96 s"
 
 
+def test_a_single_lost_row_is_no_gap():
+    rng = np.random.default_rng(0)
+    stamps = np.delete(np.arange(200) * 0.01 + rng.uniform(-5e-4, 5e-4, 200), [*range(10, 150, 7), 160, 161])
+    _, repairs = clean_imu(stamps, *2 * [rng.standard_normal((len(stamps), 3))])
+    assert str(repairs) == f"IMU: {len(stamps)} rows; 1 gaps, longest 0.03 s"
+
+
 @pytest.mark.parametrize("unit", [1.0, 3.6, 100.0, 1000.0])
 def test_codes_for_no_speed_are_dropped_whatever_the_unit(unit):
     stamps, speeds = np.arange(12) * 0.1, unit * np.array([0, 3, 5, 8, 9, 9, -9, 8, 7, 5, 3, 0.0])

@@ -16,6 +16,7 @@ from street import Street
 
 from gnss_sem_map import simulation
 from gnss_sem_map.cli import app
+from gnss_sem_map.cli.console import print_run
 from gnss_sem_map.datasets import readers
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.runs import expected_cost
@@ -227,3 +228,21 @@ def test_a_drive_that_is_there_is_refused_before_anything_is_simulated(
     words = ["simulate", "-o", str(tmp_path), "--seed", "31", "--session", "1", "--layout", layout]
     with pytest.raises(DataError, match="2026_04_19_drive_0031: is already there"):
         typer.testing.CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_the_summary_counts_frames_that_are_skipped_not_their_entries(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for frames, says in (
+        ({"scan": 25, "image": 2}, "7 voxels, 27 skips"),
+        ({"scan": 1}, "7 voxels, 1 skip\n"),
+    ):
+        about = {
+            "name": "x",
+            "counts": {},
+            "seconds": {},
+            "map": {"voxels": 7},
+            "skips": {"count": 1, "frames": frames},
+        }
+        print_run(about, Path("out"), as_json=False)
+        assert says in capsys.readouterr().out

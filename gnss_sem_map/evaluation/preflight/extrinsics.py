@@ -13,13 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gnss_sem_map.errors import counted
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR
 
 Array = NDArray[np.float64]
-NAME, LEVER, SCALE, FIT = "T_imu_lidar rotation", "T_imu_lidar position", "scale of motion", "motion"
+GIVEN, NAME, LEVER, SCALE, FIT = (
+    "T_imu_lidar",
+    "T_imu_lidar rotation",
+    "T_imu_lidar position",
+    "scale of motion",
+    "motion",
+)
 LONGEST_LEVER_M = 20.0
 """Longest vehicle on a road."""
 LEAST_WAY_M, LEAST_TURN_RAD = 1.0, np.radians(3.0)
@@ -61,6 +69,14 @@ class _Motions:
 
 def check(sample: Sample) -> Iterator[Finding]:
     """Lever arm as a number, then scale, rotation and lever arm by motion."""
+    for skip in sample.log.skips:
+        if skip.what == POSE_OF_LIDAR:
+            yield amber(
+                GIVEN,
+                skip.where,
+                "the pose of the LiDAR is not given: taken as that of the IMU",
+                "give T_imu_lidar in log.yaml",
+            )
     p = sample.log.calibration.T_imu_lidar[:3, 3]
     length = float(np.linalg.norm(p))
     if length > LONGEST_LEVER_M:
@@ -129,7 +145,8 @@ def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
     ratios = np.log(np.maximum(by_track, 1e-6) / np.maximum(by_lidar, 1e-6))
     ratio, spread = float(np.median(ratios)), float(np.ptp(ratios))
     found = (
-        f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees ({len(ratios)} stretches)"
+        f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees"
+        f" ({counted(len(ratios), 'stretch', 'stretches')})"
     )
     what = _track(sample)
     if abs(ratio) <= SAME_SCALE or (abs(ratio) <= WRONG_SCALE and len(ratios) < 2):
@@ -259,7 +276,7 @@ def _rotation_finding(
         return green(NAME, "not observable: the vehicle stood, and no ground was seen")
     deg, angle = np.degrees(turn), float(np.linalg.norm(turn))
     found = (
-        f"{', '.join(seen)} of {len(sample.stretches)} stretches turn it by"
+        f"{', '.join(seen)} of {counted(len(sample.stretches), 'stretch', 'stretches')} turn it by"
         f" {deg[0]:.1f}, {deg[1]:.1f}, {deg[2]:.1f} deg"
         f" about x, y, z (+- {', '.join(f'{v:.1f}' for v in np.degrees(spread))})"
     )

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.errors import counted
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch, Surfaces, Sweep, turns
 from gnss_sem_map.evaluation.preflight.sample import Sample
@@ -135,8 +136,8 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
     best = max(gains, key=lambda other: sum(gains[other]))
     extents, thicknesses = gains[best]
     found = (
-        f"surfaces of {len(stretches)} stretches of a second: {best.name} against {as_given.name} make them"
-        f" thinner by {thicknesses:.1f} standard errors (spread {extents:.1f})"
+        f"surfaces of {counted(len(stretches), 'stretch', 'stretches')} of a second: {best.name} against"
+        f" {as_given.name} make them thinner by {thicknesses:.1f} standard errors (spread {extents:.1f})"
     )
     sure = min(extents, thicknesses) > LEAST and (
         extents + thicknesses > RAW_SURE

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gnss_sem_map.errors import DataError, PointTimesError
+from gnss_sem_map.errors import DataError, PointTimesError, counted
 from gnss_sem_map.evaluation.preflight import extrinsics, point_times, sweep_stamps
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
@@ -37,10 +37,11 @@ def _scans(sample: Sample) -> Iterator[Finding]:
         return
     unreadable = [why for why in tried.values() if isinstance(why, DataError)]
     fit = sum(isinstance(seen, Stretch) for seen in tried.values())
-    found = f"{fit} of {len(tried)} stretches of a second have scans that fit onto each other"
+    found = f"{fit} of {counted(len(tried), 'stretch', 'stretches')} of a second have scans that fit onto each other"
     if unreadable:
         level = red if len(unreadable) > len(tried) / 2 else amber
-        yield level(SCANS, f"{found}; {unreadable[0]}", *_why_unreadable(unreadable[0]))
+        why, mistake, remedy = _why_unreadable(unreadable[0])
+        yield level(SCANS, f"{found}; {why}", mistake, remedy)
     elif len(tried) - fit > len(tried) / 2:
         yield amber(
             SCANS,
@@ -79,11 +80,12 @@ def _intensity(sample: Sample) -> Finding:
     )
 
 
-def _why_unreadable(error: DataError) -> tuple[str, str]:
-    """The probable mistake, and its remedy."""
+def _why_unreadable(error: DataError) -> tuple[str, str, str]:
+    """What was found, the probable mistake, and its remedy."""
     if isinstance(error, PointTimesError):
-        return error.mistake, "give each point's time minus the scan's stamp, s"
+        return error.found, error.mistake, "give each point's time minus the scan's stamp, s"
     return (
+        str(error),
         "scans are damaged, cut short, or other bytes than points",
         "copy the scans again: little-endian float32 x y z intensity, m",
     )

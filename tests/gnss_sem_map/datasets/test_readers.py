@@ -237,6 +237,20 @@ def test_damaged_rows_of_a_table_are_left_out_and_counted(small_drive: Street, t
     assert told["gnss.csv"] == "1 rows: no stamp, or one far off all others"
 
 
+def test_what_a_table_log_without_log_yaml_lacks_is_said(small_drive: Street, tmp_path: Path) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    (drive / "log.yaml").unlink()
+    log = open_drive(drive)
+    assert not log.cameras
+    np.testing.assert_array_equal(log.calibration.T_imu_lidar, np.eye(4))
+    assert left_out(log) == [
+        ("pose of the LiDAR", 1, "not given: taken as that of the IMU; give T_imu_lidar in log.yaml"),
+        ("image", len(log.images), f"no camera in log.yaml: {len(log.images)} images not used"),
+    ]
+    (drive / "log.yaml").write_text(json.dumps({"T_imu_lidar": np.eye(4).tolist()}))
+    assert [skip.what for skip in open_drive(drive).skips] == ["image"]
+
+
 def test_the_100_hz_twin_is_used_for_the_imu_only(copy: Path) -> None:
     twin = copy.with_name(copy.name.replace("_sync", "_extract"))
     shutil.copytree(copy / "oxts", twin / "oxts")

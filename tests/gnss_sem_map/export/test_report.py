@@ -27,7 +27,14 @@ RUN: dict[str, Any] = {
     },
     "seconds": {"mapping": 0.5, "export": 1.25},
     "peak_memory_mb": {"mapping": 409, "export": 580},
-    "trajectory": {"chi2_per_dof": 1.0312, "time_offset_s": None, "p_imu_antenna_m": [0.0, -0.32, 0.5]},
+    "trajectory": {
+        "chi2_per_dof": 1.0312,
+        "time_offset_s": None,
+        "p_imu_antenna_m": [0.0, -0.32, 0.5],
+        "fixes": 90,
+        "fixes_rejected": 2,
+        "fixes_outside_imu": 50,
+    },
     "map": {
         "voxels": 226572,
         "labelled": {"raw": {"road": 15841, "vehicle": 15261}, "refined": {"road": 18497, "vehicle": 11227}},
@@ -138,6 +145,7 @@ def test_every_figure_of_the_run_is_on_the_page(tmp_path: Path) -> None:
     assert " % of the points whose true class the map has carry a label." in page.verdict
     assert "90.0 % of the labelled points are right" in page.verdict
     assert "3 parts of the recording could not be used: 114 files missing" in page.verdict
+    assert "2 of 90 satellite positions were rejected as wrong; 50 were not used: the IMU" in page.verdict
 
 
 @pytest.mark.parametrize(

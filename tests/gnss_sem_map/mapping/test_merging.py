@@ -23,7 +23,10 @@ from gnss_sem_map.refinement.crumbs import CrumbSettings
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.attributes import ATTRIBUTES, Attributes, open_attributes
+from gnss_sem_map.voxels.attributes import write as write_attributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import indices_by_tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap, VoxelTable, keys_of
 
 URBAN = open_label_set()
@@ -108,6 +111,26 @@ def test_merged_runs_keep_moving_points_in_static_voxels_apart(tmp_path: Path) -
     raw = open_raw(tmp_path / "merged", URBAN)
     assert_same(raw.fused.whole().voxels, runs.static + runs.moved)
     assert_same(raw.evidence.moved.whole().voxels, runs.moved)
+
+
+def test_attributes_move_as_the_map_does(tmp_path: Path) -> None:
+    """The second frame is half a voxel higher: centres come to lie where voxels meet, and last bits decide."""
+    frames = LocalFrame(49, 8.4, 110.0), LocalFrame(49, 8.4, 110.1)
+    for name, frame, seed in zip("ab", frames, (0, 1), strict=True):
+        static, moved = street(HERE, seed), street(HERE, seed)[:0]
+        write_run(tmp_path / name, static, moved, frame)
+        points, of_tiles = static.hits.astype(np.int64), indices_by_tile(static.keys)
+        known = Attributes(static.keys, points, np.ones_like(points), np.zeros(len(points), np.uint8))
+        write_attributes(((tile, known[rows]) for tile, rows in of_tiles), tmp_path / name / ATTRIBUTES)
+    (tmp_path / "merged").mkdir()
+    merge_runs(tmp_path / "a", tmp_path / "b", match=False).write_raw(tmp_path / "merged")
+    merged, attributes = (
+        open_raw(tmp_path / "merged", URBAN).fused.whole(),
+        open_attributes(tmp_path / "merged"),
+    )
+    assert attributes is not None
+    np.testing.assert_array_equal(attributes.whole().keys, merged.voxels.keys)
+    np.testing.assert_array_equal(attributes.whole().points, merged.voxels.hits)
 
 
 def test_maps_of_different_runs_in_one_folder_are_refused(tmp_path: Path) -> None:

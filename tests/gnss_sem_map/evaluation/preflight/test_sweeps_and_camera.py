@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.frames import read_points
-from gnss_sem_map.errors import DataError, ImageSizeError
+from gnss_sem_map.errors import DataError, ImageSizeError, PointTimesError
 from gnss_sem_map.evaluation.preflight import camera, sweeps
 from gnss_sem_map.evaluation.preflight.findings import Finding, Level
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.segmentation.cached import CachedLabels
-from gnss_sem_map.sensor_log import Points, SensorLog, Skip
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Points, SensorLog, Skip
 from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 Array = NDArray[np.float64]
@@ -55,6 +55,13 @@ def mistakes(log: SensorLog) -> str:
 def calibrated(log: SensorLog, **parts: Array) -> SensorLog:
     """The same drive, with another calibration."""
     return replace(log, calibration=replace(log.calibration, **parts))
+
+
+def test_a_pose_of_the_lidar_that_is_not_given_is_said(town: SensorLog) -> None:
+    assert "is not given" not in mistakes(town)
+    log = replace(town, skips=(Skip(POSE_OF_LIDAR, "log.yaml", "not given"),))
+    [found] = [finding for finding in not_green(log) if "is not given" in finding.mistake]
+    assert (found.level, found.remedy) == (Level.AMBER, "give T_imu_lidar in log.yaml")
 
 
 def with_camera(log: SensorLog, **parts: Any) -> SensorLog:
@@ -125,6 +132,16 @@ def test_a_lever_arm_in_mm_is_named(town: SensorLog) -> None:
 )
 def test_wrong_point_times_are_named(town: SensorLog, change: Callable[[Array], Array], says: str) -> None:
     assert says in mistakes(with_times(town, change))
+
+
+def test_wrong_point_times_that_a_reader_refuses_are_named_once(town: SensorLog) -> None:
+    def refused() -> Points:
+        raise PointTimesError("7.bin: 90 of 90 point times are up to 99 s off", "point times are in ms")
+
+    log = replace(town, scans=tuple(replace(scan, read=refused) for scan in town.scans))
+    [found] = [finding for finding in not_green(log) if finding.check == "scans"]
+    assert str(found).count("point times are in ms") == 1
+    assert "7.bin: 90 of 90" in found.evidence
 
 
 @pytest.mark.parametrize("scale", [255.0, 1 / 65535])

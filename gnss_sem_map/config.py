@@ -135,20 +135,21 @@ def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
     """
     content = _read(file) if file is not None else {}
     if file is not None:
-        _with_files(content, file.parent)
-    named = parse(Settings, overrides, content, str(file) if file else "--set").model_dump(exclude_unset=True)
-    _with_files(named, Path.cwd())  # a worker may have another working folder
-    return Settings.model_validate(named)
+        _find_files(content, file.parent)
+    for override in overrides:
+        _apply(content, override)
+    _find_files(content, Path.cwd())  # a worker may have another working folder
+    return parse(Settings, (), content, str(file) if file else "--set")
 
 
-def _with_files(content: Any, folder: Path) -> None:
-    """Find the files that settings name, those in FILES, from a folder."""
+def _find_files(content: dict[str, Any], folder: Path) -> None:
+    """Make the names of files in settings absolute: they are found from a folder."""
     for *sections, name in FILES:
-        section = content
+        section: Any = content
         for part in sections:
             section = section.get(part) if isinstance(section, dict) else None
         said = section.get(name) if isinstance(section, dict) else None
-        if isinstance(said, str | Path) and (Path(said).suffix or name != "classes"):
+        if isinstance(said, str) and (Path(said).suffix or name != "classes"):
             section[name] = str(folder.absolute() / said)
 
 

@@ -115,19 +115,16 @@ def run(
     if is_of_many and segmenter is None:
         typer.echo(no_segmenter_message(str(found[0])), err=True)
         raise typer.Exit(1)
-    if dry_run:
-        sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
-        with claimed_run(
-            out, [place for drive in found for place in places_read(drive, settings, segmenter, config)]
-        ):
+    sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
+    with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
+        if dry_run:
             print_plan(sources, settings, workers or default_workers(), frame)
-        return
-    if is_of_many:
-        how = HowMapped(segmenter, frames, drive_format, device, force, resume)
-        _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, align_to, as_json)
-        return
-    [drive] = found
-    with claimed_run(out, places_read(drive, settings, segmenter, config), is_resumable=True):
+            return
+        if is_of_many:
+            how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+            _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, align_to, as_json)
+            return
+        [drive] = found
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.cameras:
             typer.echo(no_segmenter_message(str(drive)), err=True)
@@ -244,9 +241,10 @@ def trajectory(
     from gnss_sem_map import pipeline
     from gnss_sem_map.run_stats import RunStats
     from gnss_sem_map.runs import run_folder
+    from gnss_sem_map.runs.source import source_of
 
     settings = settings_of(config, set_)
-    with run_folder.claimed_run(out, run_folder.places_read(drive, settings, config=config)):
+    with run_folder.claimed_run(out, run_folder.places_read([source_of(drive)], settings, config)):
         log = open_log(drive, drive_format, None)
         stats = RunStats(skips=list(log.skips))
         page = pipeline.check_drive(log, None, settings, stats, force)

@@ -31,10 +31,16 @@ HEADER = re.compile(
 """Format of the header that numpy writes; nothing in it is evaluated."""
 
 _ERRORS = (
-    zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError, IndexError,
-    OverflowError, RuntimeError, NotImplementedError,
-)  # fmt: skip
-"""Exceptions of `zipfile` for a damaged archive, and of numpy for a type or a shape that it does not have."""
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    LookupError,
+    RuntimeError,
+)
+"""Exceptions of `zipfile` for a damaged archive, or one that needs a password or another method."""
 
 
 class Archive:
@@ -142,7 +148,11 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]
     shape = tuple(int(side) for side in found[3].replace(" ", "").split(",") if side)
     if len(shape) > MOST_DIMENSIONS:
         raise ValueError(f"{len(shape)} dimensions, at most {MOST_DIMENSIONS}")
-    return np.dtype(found[1]), found[2] == "True", shape, 8 + words + length
+    try:
+        dtype = np.dtype(found[1])
+    except TypeError:
+        raise ValueError(f"numbers of type {found[1]}") from None
+    return dtype, found[2] == "True", shape, 8 + words + length
 
 
 def _damaged(path: Path, error: Exception) -> DataError:

@@ -88,12 +88,10 @@ def _map_one(
 ) -> None:
     log, (correction, digest) = source.open_log(), read_correction(correction_file)
     read = fingerprints.of_log(log, source.labels_from)
-    if _is_done(
-        folder, settings, source.inputs, frame, read, digest
-    ):  # what is not to be used was removed before
+    # what is not to be used was removed before
+    if _is_done(folder, settings, source.inputs, frame, read, digest):
         return
-    places = run_folder.places_read(Path(source.drive), settings, source.segmenter)
-    with run_folder.claimed_run(folder, places) as claim:
+    with run_folder.claimed_run(folder, run_folder.places_read([source], settings)) as claim:
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
         with new_folder(folder) as part:

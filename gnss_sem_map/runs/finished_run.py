@@ -82,8 +82,7 @@ def run(
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
     source = source_of(drive, segmenter, frames, drive_format, device)
-    places = run_folder.places_read(drive, settings, source.segmenter)
-    with run_folder.claimed_run(out, places, is_resumable=True) as claim:
+    with run_folder.claimed_run(out, run_folder.places_read([source], settings), is_resumable=True) as claim:
         log = log or source.open_log()
         run_folder.georeference_of(settings, origin or log.frame)
         refuse_inputs(claim.out, sorted(log.folders))

@@ -101,8 +101,9 @@ def run_drives(
     drives = [_absolute(drive) for drive in drives]
     _check_distinct([(drive.name, drive) for drive in drives])
     sources = [how.source(drive) for drive in drives]
+    places = run_folder.places_read(sources, settings)
     with (
-        run_folder.claimed_run(out, [*_places_read(sources, settings), align_to], is_resumable=True) as claim,
+        run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
         frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
@@ -135,11 +136,9 @@ def add_drive(
     drive = _absolute(drive)
     known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
     _check_distinct([*known, (drive.name, drive)])
-    source = how.source(drive)
-    with run_folder.claimed_run(
-        out, run_folder.places_read(drive, segmenter=source.segmenter), is_resumable=True
-    ) as claim:
-        about = _changed(out, there, [source], settings, frame, how, claim, progress)
+    added = [how.source(drive)]
+    with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
+        about = _changed(out, there, added, settings, frame, how, claim, progress)
     return ManyDrives(out, about)
 
 
@@ -195,14 +194,6 @@ def _changed(
         out, {**there, **new}, settings, frame, {}, claim.work, bound, InProcess(), progress,
         align_to=None if align_to is None else Path(align_to),
     )  # fmt: skip
-
-
-def _places_read(sources: Sequence[Source], settings: Settings) -> list[Path | str | None]:
-    """All inputs that are known before the drives are opened."""
-    return [
-        place for source in sources
-        for place in run_folder.places_read(Path(source.drive), settings, source.segmenter)
-    ]  # fmt: skip
 
 
 def _source_of(name: str, folder: Path) -> Source:

@@ -82,12 +82,12 @@ def claimed_run(
 
 
 def places_read(
-    drive: Path, settings: Settings | None = None, segmenter: str | None = None, config: Path | None = None
+    sources: Sequence[Source], settings: Settings | None = None, config: Path | None = None
 ) -> list[Path | str | None]:
-    """All inputs of a run that are known before the drive is opened; without settings, they are those of the output."""
-    place = (segmenter or "").partition(":")[2].partition("?")[0]
+    """All inputs of a run that are known before its drives are opened; without settings, those of the output count."""
+    specs = [(source.segmenter or "").partition(":")[2].partition("?")[0] or None for source in sources]
     named = [] if settings is None else settings.files
-    return [drive, config, place or None, *named]
+    return [*(source.drive for source in sources), *specs, *named, config]
 
 
 def write_run(

@@ -7,6 +7,7 @@ their place, so that one of them costs the same in a file of any length.
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -36,16 +37,28 @@ class McapFile:
 
     def __init__(self, path: Path, codec: str = "") -> None:
         from rosbags.rosbag2 import ReaderError
+        from rosbags.rosbag2.storage_mcap import McapReader
 
         self.path, self._codec = path, codec
         self._file = OpenFile(path)
+        summary = McapReader(path)
         try:
-            channels, expected = self._read_summary()
+            summary.open()
+            with closing(summary):  # what it has found goes then
+                chunks, connections = tuple(summary.chunks), tuple(summary.connections)
+            sizes = [(chunk.compressed_size, chunk.uncompressed_size) for chunk in chunks]
+            spans = [(one.chunk_start_offset + one.chunk_length, one.message_index_length) for one in chunks]
+            self._starts = np.array([chunk.chunk_start_offset for chunk in chunks], np.int64)
+            self._sizes, self._spans = (np.array(rows, np.int64).reshape(-1, 2) for rows in (sizes, spans))
         except (ReaderError, *DAMAGED) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not closed ({_line(error)}); repair it: mcap recover"
                 f" {shown(path.name)} -o repaired.mcap"
             ) from None
+        self._codecs = [chunk.compression for chunk in chunks]
+        self.topics = {one.topic: one.msgtype for one in connections}
+        channels = {one.id: one.topic for one in connections}
+        expected = sum(one.msgcount for one in connections)
         self._chunks = Chunks(self._expanded)
         self._index = self._read_indexes(channels)
         indexed = sum(len(times) for times, _ in self._index.values())
@@ -69,27 +82,6 @@ class McapFile:
         if self._codec:
             return expand(data, self._codec, shown(self.path), most or MOST_BYTES)
         return data if most is None else data[:most]
-
-    def _read_summary(self) -> tuple[dict[int, str], int]:
-        """Topics by their channel, and the number of all messages; notes where the chunks are."""
-        from rosbags.rosbag2 import Reader
-
-        reader = Reader(self.path)
-        reader.open()
-        try:
-            self.topics = {one.topic: one.msgtype for one in reader.connections}
-            summary = reader.storage.chunks  # type: ignore[attr-defined]  # of McapReader
-            self._starts = np.array([chunk.chunk_start_offset for chunk in summary], np.int64)
-            sizes = [(chunk.compressed_size, chunk.uncompressed_size) for chunk in summary]
-            self._sizes = np.array(sizes, np.int64).reshape(-1, 2)
-            self._codecs = [chunk.compression for chunk in summary]
-            ends = [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary]
-            spans = [(end, chunk.message_index_length) for end, chunk in zip(ends, summary, strict=True)]
-            self._spans = np.array(spans, np.int64).reshape(-1, 2)
-            channels = {one.id: one.topic for one in reader.connections}
-            return channels, sum(one.msgcount for one in reader.connections)
-        finally:
-            reader.close()
 
     def _read_indexes(self, channels: dict[int, str]) -> dict[str, tuple[Ints, Ints]]:
         found: dict[str, list[tuple[int, NDArray[np.uint64]]]] = {}

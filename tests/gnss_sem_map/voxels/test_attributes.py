@@ -10,6 +10,7 @@ import pytest
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.voxels import attributes
 from gnss_sem_map.voxels.attribute_table import SAMPLE, WAITS, seen_of
 from gnss_sem_map.voxels.attributes import (
     ATTRIBUTES,
@@ -100,11 +101,16 @@ def test_intensities_that_are_none_count_as_dark_or_bright() -> None:
     assert seen_of(values, np.arange(7.0), valid, 5)[1].tolist() == [5 + 10**6 * i for i in range(6)]
 
 
-def test_parts_combine_in_any_order_to_the_median_of_medians() -> None:
+def test_parts_combine_in_any_order_and_number_of_rows_to_the_median_of_medians(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     parts = [in_table(points_of(seed, 5, voxels=50)) for seed in (1, 1, 2)]
     parts[1] = Attributes(parts[1].keys, 3 * parts[1].points, parts[1].last_us + 1, parts[1].intensity[::-1])
     whole = combined(parts)
     assert_same(combined(parts[::-1]), whole)
+    for rows in (1, 50, 1000):
+        monkeypatch.setattr(attributes, "ROWS_AT_ONCE", rows)
+        assert_same(combined(parts), whole)
     assert_same(combined([parts[0]]), parts[0])
     assert_same(combined([]), NOTHING)
     for key, points, last_us, median in zip(*whole.columns, strict=True):

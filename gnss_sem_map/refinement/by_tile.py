@@ -27,7 +27,7 @@ from gnss_sem_map.refinement import (
     vehicles,
 )
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
-from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable, VehicleObject
+from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings, do
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -107,7 +107,8 @@ def refine_tile(
         state, report = do(step, state, settings, own if halo else None)
         reports.append(report)
     assert state.decided is not None
-    state = replace(state, vehicles=tuple(thing for thing in state.vehicles if _holds(tile, thing, size)))
+    # of a long object every tile sees another part, with another centre; but those that meet see the same first tile
+    state = replace(state, vehicles=tuple(thing for thing in state.vehicles if thing.tile == tile))
     return state, RefinementReport(tuple(reports), state.vehicles, systematic_errors=state.systematic_error)
 
 
@@ -177,11 +178,6 @@ def _cut(state: MapState, tile: Tile, margin_m: float) -> MapState:
     return replace(
         state[places_around(state.voxels, tile, margin_m)], beside=replace(state.beside, moved=moved)
     )
-
-
-def _holds(tile: Tile, thing: VehicleObject, voxel_size_m: float) -> bool:
-    """Whether the centre of an object lies in a tile."""
-    return tuple(np.floor(thing.centre[:2] / voxel_size_m / (1 << TILE_BITS)).tolist()) == tile
 
 
 def _joined(parts: Sequence[MapState]) -> MapState:

@@ -18,6 +18,7 @@ from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
 from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
+from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap, best_classes
 
 Scores = NDArray[np.float32]
@@ -62,6 +63,8 @@ class VehicleObject:
     centre: NDArray[np.float64]
     """(3,) m, in the map frame."""
     length_m: float
+    tile: Tile
+    """The first one, by x and then y, that holds a part of it: this one reports it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -202,17 +202,8 @@ class RefinementReport:
         ]
         if [step.name for step in steps] != [step.name for step in STEPS]:
             raise ValueError("a report of other steps")
-        objects = [
-            VehicleObject(
-                **{
-                    **thing,
-                    "motion": Motion(thing["motion"]),
-                    "centre": np.array(thing["centre"], np.float64),
-                }
-            )
-            for thing in content["objects"]
-        ]
-        return cls(tuple(steps), tuple(objects), (), float(content["systematic_errors"]))
+        objects = tuple(_object_of(thing) for thing in content["objects"])
+        return cls(tuple(steps), objects, (), float(content["systematic_errors"]))
 
     @classmethod
     def joined(cls, reports: Sequence[RefinementReport]) -> RefinementReport:
@@ -227,6 +218,14 @@ class RefinementReport:
             max(report.systematic_errors for report in reports),
             sum(report.untracked for report in reports),
         )
+
+
+def _object_of(thing: Mapping[str, Any]) -> VehicleObject:
+    x, y = thing["tile"]
+    centre = np.array(thing["centre"], np.float64)
+    return VehicleObject(
+        **{**thing, "motion": Motion(thing["motion"]), "centre": centre, "tile": (int(x), int(y))}
+    )
 
 
 def do(

@@ -20,6 +20,7 @@ from gnss_sem_map.refinement.state import (
     classes_of,
 )
 from gnss_sem_map.voxels.dbscan import NOISE, TIE, dbscan
+from gnss_sem_map.voxels.tile_files import TILE_BITS
 from gnss_sem_map.voxels.voxel_map import limits_of
 
 LOWEST_M, HIGHEST_M = 0.1, 3.5
@@ -160,7 +161,8 @@ def _describe(
     voxel_size_m: float,
 ) -> VehicleObject:
     centre = (indices.mean(axis=0) + 0.5) * voxel_size_m
-    return VehicleObject(number, motion, reason, len(indices), centre, float(length_m))
+    x, y = np.unique(indices[:, :2] >> TILE_BITS, axis=0)[0].tolist()
+    return VehicleObject(number, motion, reason, len(indices), centre, float(length_m), (x, y))
 
 
 def groups(clusters: NDArray[np.int32]) -> list[NDArray[np.int64]]:

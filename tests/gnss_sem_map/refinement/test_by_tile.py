@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from long_street import SIZE_M, keyframes, street
+from long_street import SIZE_M, URBAN, keyframes, street
 
 from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, run_steps, sums_of, tiles_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
@@ -101,6 +101,25 @@ def test_nobody_sees_where_tiles_meet() -> None:
     assert there.decided is not None
     assert (here.decided.labels == there.decided.labels).mean() > 0.999
     np.testing.assert_allclose(here.decided.confidence, there.decided.confidence, atol=0.05)
+
+
+@pytest.mark.parametrize("along", [0, 1])
+@pytest.mark.parametrize("before", [20, 100, 180])
+def test_an_object_longer_than_a_halo_is_reported_once(along: int, before: int) -> None:
+    """A row of cars of 40 m, a bit askew, of which so many voxels are before the border of two tiles."""
+    row, across, up = (part.ravel() for part in np.meshgrid(range(200), range(9), range(1, 7), indexing="ij"))
+    cars = np.stack([row + 512 - before, across + 105 - abs(row - 100) // 10, up], axis=1)
+    road = np.stack(np.meshgrid(range(300, 724), range(80, 130), [0], indexing="ij"), -1).reshape(-1, 3)
+    indices = np.concatenate([cars, road])
+    classes = np.repeat([URBAN.index("vehicle"), URBAN.index("road")], [len(cars), len(road)])
+    keys = pack(indices if along == 0 else indices[:, [1, 0, 2]])
+    evidence = np.full((len(keys), len(URBAN.names)), -3000, np.int32)
+    evidence[np.arange(len(keys)), classes] = 0
+    order = np.argsort(keys)
+    voxels = VoxelMap(SIZE_M, URBAN, keys[order], evidence[order], np.ones(len(keys), np.uint32))
+    _, report = run_steps(voxels)
+    [found] = report.objects
+    assert found.tile == (0, 0)
 
 
 counts = st.integers(0, 2**60)

@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -23,6 +21,7 @@ from gnss_sem_map.simulation.compiled import Floats
 from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
 from gnss_sem_map.simulation.oxts import DATAFORMAT, Gnss, oxts_rows, row_text, sweep_rows
+from gnss_sem_map.simulation.png_files import write_ids, write_photo
 from gnss_sem_map.simulation.rigs import Rig, kitti
 from gnss_sem_map.simulation.sessions import Change, changes, session_of
 from gnss_sem_map.simulation.streets import around_the_block
@@ -381,18 +380,9 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.
     name, scan, image = f"{k:010d}", simulation.scan(k), simulation.image(k)
     (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
     (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
-    write_png(drive / "image_02" / "data" / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
-    unfiltered = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)  # ids are read four times as fast so
-    write_png(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids, *unfiltered)
+    write_photo(drive / "image_02" / "data" / f"{name}.png", image.rgb)
+    write_ids(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids)
     alone = seen_alone(image, *simulation.project(k, scan))
     (drive / "truth" / "single_frame" / f"{name}.label").write_bytes(alone.astype("<u4").tobytes())
     numbers, counts = np.unique(image.instances, return_counts=True)
     return numbers[(numbers > 0) & (counts >= 60)]
-
-
-def write_png(path: Path, pixels: npt.NDArray[Any], *options: int) -> None:
-    """Write a PNG, with more options of OpenCV's encoder."""
-    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1, *options])
-    if not ok:
-        raise DataError(f"{path}: the image could not be encoded")
-    path.write_bytes(data.tobytes())

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,10 +12,11 @@ from gnss_sem_map.datasets.kitti_360 import IMAGES, T_IMU_POSE, geodetic_to_worl
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.camera import Camera
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.drive import Simulation, write_oxts, write_png, write_stamps, write_truth
+from gnss_sem_map.simulation.drive import Simulation, write_oxts, write_stamps, write_truth
 from gnss_sem_map.simulation.kitti_rig import transform
+from gnss_sem_map.simulation.png_files import write_ids, write_photo
 from gnss_sem_map.simulation.rigs import MountedCamera
-from gnss_sem_map.simulation.table_drive import UNFILTERED, Progress, made_aside, render_frames
+from gnss_sem_map.simulation.table_drive import Progress, made_aside, render_frames
 
 _R_RECT: Final = Rotation.from_euler("ZYX", [-0.10, 0.51, 0.15], degrees=True).as_matrix()
 _RECTIFIED: Final = ("image_00", "image_01")
@@ -65,8 +65,8 @@ def _write_frame(simulation: Simulation, k: int, drive: Path, images: Path) -> N
     for number, camera in enumerate(simulation.rig.cameras):
         image = simulation.image(k, number)
         folder = images / camera.name / IMAGES[camera.name]
-        write_png(folder / f"{name}.png", cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR))
-        write_png(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids, *UNFILTERED)
+        write_photo(folder / f"{name}.png", image.rgb)
+        write_ids(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids)
 
 
 def _camera_in_pose(camera: MountedCamera) -> Floats:

@@ -5,22 +5,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
-import cv2
 import numpy as np
 
 from factor_graphs.csv_log import GNSS_COLUMNS, IMU_COLUMNS
 from gnss_sem_map.datasets import kitti_raw
 from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.drive import Simulation, refuse_there, write_png, write_truth
+from gnss_sem_map.simulation.drive import Simulation, refuse_there, write_truth
+from gnss_sem_map.simulation.png_files import write_ids, write_photo
 from gnss_sem_map.thread_pools import thread_pool
 
-UNFILTERED: Final = (
-    cv2.IMWRITE_PNG_FILTER,
-    cv2.IMWRITE_PNG_FILTER_NONE,
-)  # ids are read four times as fast so
 Progress = Callable[[int, int], None]
 
 
@@ -139,6 +135,5 @@ def _write_frame(simulation: Simulation, k: int, drive: Path) -> None:
         (drive / "truth" / "labels" / lidar.name / f"{name}.label").write_bytes(labels.tobytes())
     for number, camera in enumerate(simulation.rig.cameras):
         image = simulation.image(k, number)
-        pixels = cv2.cvtColor(image.rgb, cv2.COLOR_RGB2BGR)
-        write_png(drive / "images" / camera.name / f"{name}.png", pixels)
-        write_png(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids, *UNFILTERED)
+        write_photo(drive / "images" / camera.name / f"{name}.png", image.rgb)
+        write_ids(drive / "truth" / "train_ids" / camera.name / f"{name}.png", image.train_ids)

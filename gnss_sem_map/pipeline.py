@@ -234,7 +234,7 @@ def map_drive(
             elsewhere=elsewhere,
             labels_from=labels_from,
         )
-        release_memory()  # of the chunks
+        release_memory(always=True)  # of the chunks: a tile of the map is the sum of those of many
         write_raw(store, folder, drive.log.frame)
     if stats.counts["points"] - stats.counts["points left out"] == stats.counts["points of moving objects"]:
         stats.warnings.append("all points were removed as moving: the pictures show the removed points")

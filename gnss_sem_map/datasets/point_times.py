@@ -11,25 +11,32 @@ from gnss_sem_map.errors import DataError, PointTimesError
 Array = NDArray[np.float64]
 
 MOST_OUTSIDE = 0.1
-"""Largest share of a sweep's points without a valid time."""
+"""Largest share of a sweep's returns without a valid time."""
 UNITS = {1e3: "ms", 1e6: "µs", 1e9: "ns"}
 SWEEPS_S = (0.01, 0.6)
 """Duration of most of a sweep: scanners have 2 to 50 revolutions per second."""
 
 
+def are_returns(rows: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which rows (n, 3 or more) are returns: where nothing came back drivers write zeros, or NaN, and any time."""
+    size = np.abs(rows[:, 0]) + np.abs(rows[:, 1]) + np.abs(rows[:, 2])
+    return np.asarray((size > 0) & (size < np.inf))
+
+
 def leave_out_of_sweep(rows: NDArray[np.float32], after: Array, where: str) -> None:
-    """Invalidate the points without a time in this sweep; raises DataError when they are too many."""
+    """Invalidate the points without a time in this sweep; raises DataError when too many of its returns are such."""
     outside = ~(np.abs(after) <= LONGEST_SWEEP_S)
-    count = int(outside.sum())
-    if count > MOST_OUTSIDE * len(rows):
-        with np.errstate(invalid="ignore", over="ignore"):
-            largest = float(np.nanmax(np.abs(after), initial=0.0))
-        raise PointTimesError(
-            f"{where}: {count} of {len(rows)} point times are none, or up to {largest:.4g} s off the scan's stamp;"
-            f" expected seconds, at most {LONGEST_SWEEP_S:g}",
-            _mistake_of(after),
-        )
-    if count:
+    if outside.any():
+        returned = are_returns(rows)
+        count, of = int((outside & returned).sum()), int(returned.sum())
+        if count > MOST_OUTSIDE * of:
+            with np.errstate(invalid="ignore", over="ignore"):
+                largest = float(np.nanmax(np.abs(after[returned]), initial=0.0))
+            raise PointTimesError(
+                f"{where}: {count} of {of} point times are none, or up to {largest:.4g} s off the scan's stamp;"
+                f" expected seconds, at most {LONGEST_SWEEP_S:g}",
+                _mistake_of(after[returned]),
+            )
         rows[outside, :3], after[outside] = np.nan, 0.0
     if np.ptp(after) > LONGEST_SWEEP_S:
         raise DataError(

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_intensity
-from gnss_sem_map.datasets.point_times import leave_out_of_sweep
+from gnss_sem_map.datasets.point_times import are_returns, leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.errors import DataError
@@ -87,7 +87,8 @@ def read_cloud(
     field = time_field(list(table.dtype.names or ()), times)
     if field is None:
         raise no_times(where, list(table.dtype.names or ()))
-    after = _after(np.asarray(table[field]), stamp_ns)
+    times = np.asarray(table[field])
+    after = _after(times, times[are_returns(rows)], stamp_ns)
     leave_out_of_sweep(rows, after, where)
     after += stamp
     return Points(rows[:, :3], rows[:, 3], after)
@@ -152,14 +153,16 @@ def _largest_intensity(table: NDArray[Any]) -> float:
     return float(np.iinfo(kind).max) if kind is not None and kind.kind == "u" else 1.0
 
 
-def _after(times: NDArray[Any], stamp: int) -> Array:
-    """The times of the points, s after the stamp, Unix ns, of their message."""
+def _after(times: NDArray[Any], of_returns: NDArray[Any], stamp: int) -> Array:
+    """The times of the points, s after the stamp, Unix ns, of their message; those of its returns tell their kind."""
+    told = of_returns[::EVERY].astype(np.float64)
+    told = told[np.isfinite(told)]
+    middle = float(np.median(told)) if len(told) else 0.0
     if times.dtype.kind in "iu":  # ns, and where 64 bits hold them perhaps of Unix time
-        if times.dtype.itemsize == 8 and len(times) and np.median(times[::EVERY]) > ABSOLUTE_NS:
+        if times.dtype.itemsize == 8 and middle > ABSOLUTE_NS:
             times = times.astype(np.int64) - stamp
         return np.asarray(times * 1e-9, np.float64)
     after = times.astype(np.float64)
-    middle = float(np.median(after[::EVERY])) if len(after) else 0.0
     if middle > ABSOLUTE_NS:
         return (after - float(stamp)) * 1e-9
     if middle > ABSOLUTE_S:

@@ -114,6 +114,27 @@ def test_the_times_of_points_of_every_driver(tmp_path: Path, name: str, kind: st
     np.testing.assert_allclose(points.stamps - scan.stamp, TIMES + start, atol=5e-7)
 
 
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+@pytest.mark.parametrize("time", [0.0, np.nan, 9.9])
+@pytest.mark.parametrize("zero_s", [0.0, START_NS * 1e-9])
+def test_rows_without_a_return_have_any_time(
+    tmp_path: Path, nothing: float, time: float, zero_s: float
+) -> None:
+    table = sweep(zero_s + TIMES, "<f8", "timestamp")
+    lost = np.arange(len(table)) % 3 < 2
+    table["timestamp"][lost] = time
+    for axis in "xyz":
+        table[axis] = np.where(lost, nothing, 7.0)
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages if one[0] != "/points"]
+    rig.cloud(START_NS, table)
+    [scan] = open_drive(ros.write(tmp_path / "drive", rig)).scans
+    points = scan.read()
+    assert points.stamps is not None
+    np.testing.assert_allclose((points.stamps - scan.stamp)[~lost], TIMES[~lost], atol=5e-7)
+    np.testing.assert_array_equal(points.xyz[~lost], 7.0)
+
+
 @pytest.mark.parametrize("kind", ["<f4", "u1", "<u2"])
 def test_intensities_have_the_scale_that_the_rig_says(tmp_path: Path, kind: str) -> None:
     fields = [(name, "<f4") for name in "xyz"]

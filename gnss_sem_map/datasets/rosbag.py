@@ -102,6 +102,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         gnss=gnss,
         imu_noise=rig.imu.noise,
         initial_attitude=attitude,
+        attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*gnss_skips, *imu_skips, *calibration_skips, *image_skips),
     )

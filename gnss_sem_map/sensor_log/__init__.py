@@ -195,6 +195,8 @@ class SensorLog:
     """None: the estimator's default."""
     initial_attitude: AttitudePrior | None = None
     """Attitude of the navigation unit at the first IMU stamp; None: estimated from the motion."""
+    attitude_of_unit: bool = False
+    """Whether that is of the unit's own axes, as its samples are, and not of ours."""
     given: Trajectory | None = None
     """Poses given with the drive; if present, there is no smoothing."""
     reference: Trajectory | None = None
@@ -256,6 +258,9 @@ class SensorLog:
             return self
         theirs = chosen.over(self.conventions)
         offset = theirs.lidar_time_offset_s or 0.0
+        attitude = self.initial_attitude
+        if attitude is not None and self.attitude_of_unit:
+            attitude = theirs.attitude_in_ours(attitude)
         late = (
             self._with_scans(lambda scans: tuple(_later(scan, offset) for scan in scans)) if offset else self
         )
@@ -264,6 +269,7 @@ class SensorLog:
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
             gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
             wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
+            initial_attitude=attitude,
             conventions=None,
         )
 

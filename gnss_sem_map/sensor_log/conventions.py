@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.alignment import AttitudePrior
 from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
 
 Array = NDArray[np.float64]
@@ -88,6 +89,14 @@ class SensorConventions(BaseModel):
         if np.array_equal(force, np.eye(3)) and np.array_equal(rate, np.eye(3)):
             return imu
         return ImuSamples(imu.stamps, imu.specific_force @ force.T, imu.angular_rate @ rate.T)
+
+    def attitude_in_ours(self, unit: AttitudePrior) -> AttitudePrior:
+        """The attitude of our axes by that of the unit's own; the very same object where they are the same."""
+        turn = self._to_ours(None)
+        if np.array_equal(turn, np.eye(3)):
+            return unit
+        variances = np.diag((turn * unit.stddevs**2) @ turn.T)
+        return AttitudePrior(unit.R_map_imu @ turn.T, np.sqrt(variances))
 
     def fixes_in_ours(self, fixes: GnssFixes) -> GnssFixes:
         """The same fixes on our clock."""

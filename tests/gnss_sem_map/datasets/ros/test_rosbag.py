@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import ros
 from ros import START_NS, rig_yaml, sweep
+from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.datasets import detect_format, open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 TIMES = np.linspace(-0.05, 0.05, 64)
 
@@ -176,3 +178,30 @@ def test_a_cloud_with_gaps_between_its_fields(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points.xyz[:, 0], np.arange(6) + 1)
     np.testing.assert_allclose(points.intensity, np.arange(6) / 5, atol=1e-6)
     np.testing.assert_array_equal(points.rows.reshape(-1, 4)[:, 0], np.arange(6) + 1)
+
+
+@pytest.mark.parametrize("in_rig", [True, False])
+def test_the_attitude_of_a_unit_with_axes_of_its_own_becomes_that_of_ours(
+    tmp_path: Path, in_rig: bool
+) -> None:
+    said = {"imu_axes": "frd", "imu_rotation_deg": [3.0, -7.0, 20.0]}
+    rig, unit = ros.drive(), Rotation.from_euler("ZYX", [1.0, 0.2, 3.1])
+    for topic, _, message in rig.messages:
+        if topic == "/imu":
+            q = message.orientation
+            q.x, q.y, q.z, q.w = unit.as_quat()
+            message.orientation_covariance[[0, 4, 8]] = [0.01, 0.04, 0.09]
+    bag = ros.write(tmp_path / "drive", rig)
+    rig_yaml(bag, imu={"topic": "/imu", "attitude": True}, **said if in_rig else {})
+    theirs = open_drive(bag)
+    ours = theirs.in_our_conventions(
+        SensorConventions() if in_rig else SensorConventions.model_validate(said)
+    )
+    assert theirs.imu is not None
+    assert ours.imu is not None
+    assert ours.initial_attitude is not None
+    R, variances = ours.initial_attitude.R_map_imu, ours.initial_attitude.stddevs**2
+    in_map = theirs.imu.specific_force @ unit.as_matrix().T
+    np.testing.assert_allclose(ours.imu.specific_force @ R.T, in_map, atol=1e-9)
+    turn = R.T @ unit.as_matrix()
+    np.testing.assert_allclose(variances, np.diag(turn @ np.diag([0.01, 0.04, 0.09]) @ turn.T), atol=1e-9)

@@ -100,7 +100,8 @@ def _move(
     assert keyframes.velocities is not None
     dt = intervals.durations[:, None]
     about = (1 - u) * keyframes.velocities[which] + u * keyframes.velocities[which + 1]
-    a = np.einsum("nij,nj->ni", R, force) - 2 * np.cross(frame.earth_rate, about) - [0.0, 0.0, frame.gravity]
+    gravity = frame.gravity_at(keyframes.positions)[which]
+    a = np.einsum("nij,nj->ni", R, force) - 2 * np.cross(frame.earth_rate, about) + gravity
     v_end = keyframes.velocities[which] + _sum_since_keyframe(a * dt, intervals.bounds, which)
     v = v_end - a * dt
     step = (v + a * dt / 2) * dt

@@ -62,14 +62,24 @@ class LocalFrame:
 
     @property
     def gravity(self) -> float:
-        """Normal gravity, m/s², at the origin: Somigliana's formula, second order in height."""
-        sin2 = np.sin(np.radians(self.lat_deg)) ** 2
-        e2 = FLATTENING * (2 - FLATTENING)
-        on_ellipsoid = EQUATORIAL_GRAVITY * (1 + SOMIGLIANA_K * sin2) / np.sqrt(1 - e2 * sin2)
-        a, f = SEMI_MAJOR_AXIS, FLATTENING
-        m = EARTH_RATE**2 * a**3 * (1 - f) / GRAVITATIONAL_CONSTANT
-        h = self.alt_m / a
-        return float(on_ellipsoid * (1 - 2 * (1 + f + m - 2 * f * sin2) * h + 3 * h**2))
+        """Normal gravity, m/s², at the origin."""
+        return float(_normal_gravity(np.radians(self.lat_deg), np.array(self.alt_m)))
+
+    def gravity_at(self, points: ArrayLike) -> Array:
+        """Normal gravity at points in the map frame (n, 3) m, in its axes, (n, 3) m/s².
+
+        It turns with the curved Earth: 10 km from the origin by 0.09°.
+        """
+        lat_deg, lon_deg, alt_m = self.to_geodetic(points)
+        lat, lon = np.radians(lat_deg), np.radians(lon_deg - self.lon_deg)
+        origin = np.radians(self.lat_deg)
+        outwards = np.cos(lat) * np.cos(lon)
+        up = np.column_stack([
+            np.cos(lat) * np.sin(lon),
+            np.cos(origin) * np.sin(lat) - np.sin(origin) * outwards,
+            np.sin(origin) * np.sin(lat) + np.cos(origin) * outwards,
+        ])  # fmt: skip
+        return np.asarray(-_normal_gravity(lat, alt_m)[:, None] * up)
 
     @property
     def earth_rate(self) -> Array:
@@ -82,6 +92,15 @@ class LocalFrame:
         """EPSG code of the UTM zone (WGS 84) that the origin's longitude lies in."""
         zone = int((self.lon_deg + 180) % 360 // 6) + 1
         return (32600 if self.lat_deg >= 0 else 32700) + zone
+
+
+def _normal_gravity(lat: Array, alt_m: Array) -> Array:
+    """Normal gravity, m/s², at latitudes in rad and heights: Somigliana's formula, second order in height."""
+    sin2, h = np.sin(lat) ** 2, alt_m / SEMI_MAJOR_AXIS
+    e2, f = FLATTENING * (2 - FLATTENING), FLATTENING
+    on_ellipsoid = EQUATORIAL_GRAVITY * (1 + SOMIGLIANA_K * sin2) / np.sqrt(1 - e2 * sin2)
+    m = EARTH_RATE**2 * SEMI_MAJOR_AXIS**3 * (1 - f) / GRAVITATIONAL_CONSTANT
+    return np.asarray(on_ellipsoid * (1 - 2 * (1 + f + m - 2 * f * sin2) * h + 3 * h**2))
 
 
 @lru_cache(maxsize=16)

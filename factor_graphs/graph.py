@@ -1,6 +1,7 @@
 """One function per factor: how each measurement binds the pose X, velocity V and bias B of the keyframes."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -17,11 +18,15 @@ Array = NDArray[np.float64]
 
 # GTSAM's own error of integration, m²/s: far below any IMU's, but it keeps short intervals regular.
 INTEGRATION_VARIANCE = 1e-8
+# Gravity is one within a cube of this edge: it turns by 1e-5 rad from the middle to the edge.
+CELL_M = 100.0
 
 
-def preintegration_params(noise: ImuNoise, frame: LocalFrame) -> gtsam.PreintegrationCombinedParams:
+def preintegration_params(
+    noise: ImuNoise, frame: LocalFrame, gravity: Array
+) -> gtsam.PreintegrationCombinedParams:
     """Everything GTSAM must know of the IMU and of the Earth: it presumes identity for what is not set."""
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(frame.gravity)
+    params = gtsam.PreintegrationCombinedParams(gravity)
     params.setAccelerometerCovariance(noise.accelerometer_noise_density**2 * np.eye(3))
     params.setGyroscopeCovariance(noise.gyroscope_noise_density**2 * np.eye(3))
     params.setBiasAccCovariance(noise.accelerometer_bias_walk**2 * np.eye(3))
@@ -32,18 +37,23 @@ def preintegration_params(noise: ImuNoise, frame: LocalFrame) -> gtsam.Preintegr
 
 
 def imu_factors(
-    intervals: ImuIntervals, noise: list[ImuNoise], frame: LocalFrame, first: int = 0
+    intervals: ImuIntervals, noise: list[ImuNoise], frame: LocalFrame, positions: Array, first: int = 0
 ) -> Iterator[gtsam.CombinedImuFactor]:
     """The preintegrated IMU from each keyframe to the next (Forster et al. 2017), bias walk included.
 
-    The keyframes are numbered from `first`.
+    The keyframes are numbered from `first`; `positions` (k - 1, 3) m are about where the intervals begin: gravity is
+    that of there.
     """
-    params = {key: preintegration_params(n, frame) for key, n in {id(n): n for n in noise}.items()}
+    cells, cell = np.unique(np.round(positions / CELL_M), axis=0, return_inverse=True)
+    gravity, known = frame.gravity_at(CELL_M * cells), dict[tuple[int, int], Any]()
     steps = zip(intervals.specific_force, intervals.angular_rate, intervals.durations.tolist(), strict=True)
-    for i, (its_noise, count) in enumerate(
-        zip(noise, np.diff(intervals.bounds).tolist(), strict=True), first
+    for i, (its_noise, place, count) in enumerate(
+        zip(noise, cell.ravel().tolist(), np.diff(intervals.bounds).tolist(), strict=True), first
     ):
-        pim = gtsam.PreintegratedCombinedMeasurements(params[id(its_noise)])
+        key = id(its_noise), place
+        if key not in known:
+            known[key] = preintegration_params(its_noise, frame, gravity[place])
+        pim = gtsam.PreintegratedCombinedMeasurements(known[key])
         integrate = pim.integrateMeasurement
         for _ in range(count):
             integrate(*next(steps))

@@ -125,14 +125,14 @@ def _predict(problem: Problem, i: int, state: _State, noise: ImuNoise) -> tuple[
     rate = intervals.angular_rate[first:last] - state.biases[3:]
     turns = Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
     R, p, v, covariance, whole = state.R, state.p, state.v, state.covariance, np.eye(15)
-    gravity, earth = np.array([0.0, 0.0, frame.gravity]), frame.earth_rate
+    gravity, earth = frame.gravity_at(state.p[None])[0], frame.earth_rate
     earth_turn = Rotation.from_rotvec(-earth * dt[0]).as_matrix()
     for start in range(0, len(dt), COVARIANCE_STEPS):
         some = slice(start, start + COVARIANCE_STEPS)
         F, Q = _transition(R, force[some].mean(axis=0), rate[some].mean(axis=0), float(dt[some].sum()), noise)
         covariance, whole = F @ covariance @ F.T + Q, F @ whole
         for f, turn, h in zip(force[some], turns[some], dt[some].tolist(), strict=True):
-            a = R @ f - gravity - 2 * np.cross(earth, v)
+            a = R @ f + gravity - 2 * np.cross(earth, v)
             p, v, R = p + v * h + a * (h * h / 2), v + a * h, earth_turn @ R @ turn
     return _State(R, p, v, state.biases, covariance), whole
 

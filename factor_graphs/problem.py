@@ -204,9 +204,9 @@ def motion_graph(problem: Problem, inflation: float, of_walk: float) -> gtsam.No
     """Every factor but the fixes: the IMU with `inflation` times its noise, `of_walk` times its walk, and the prior."""
     graph = gtsam.NonlinearFactorGraph()
     noise = problem.intervals.noise(problem.noise.scaled(inflation, of_walk))
-    for factor in imu_factors(problem.intervals, noise, problem.frame):
-        graph.add(factor)
     T, velocities = problem.guess
+    for factor in imu_factors(problem.intervals, noise, problem.frame, T[:-1, :3, 3]):
+        graph.add(factor)
     priors = prior_factors(
         T[0], velocities[0], problem.attitude, START_POSITION_STDDEV, START_SPEED_STDDEV, problem.noise
     )

@@ -51,7 +51,8 @@ class RigidMotion(ABC):
     def specific_force(self, stamps: ArrayLike, frame: LocalFrame) -> Array:
         """What a perfect accelerometer reads, (k, 3) m/s², gravity and Coriolis included (Groves 2013)."""
         coriolis = 2 * np.cross(frame.earth_rate, self.velocities(stamps))
-        return self._in_imu(stamps, self.accelerations(stamps) + coriolis + [0.0, 0.0, frame.gravity])
+        gravity = frame.gravity_at(self.poses(stamps)[:, :3, 3])
+        return self._in_imu(stamps, self.accelerations(stamps) + coriolis - gravity)
 
     def angular_rate(self, stamps: ArrayLike, frame: LocalFrame) -> Array:
         """What a perfect gyroscope reads, (k, 3) rad/s, the rotation of the Earth included."""

@@ -131,8 +131,9 @@ class StreamingSmoother:
         last = first + len(intervals.keyframes) - 1
         bias = gtsam.imuBias.ConstantBias(self.state.biases[:3], self.state.biases[3:])
         ahead = gtsam.NavState(gtsam.Pose3(self.state.T_map_imu), self.state.velocity)
+        here = np.tile(self.state.T_map_imu[:3, 3], (last - first, 1))
         for i, factor in enumerate(
-            imu_factors(intervals, intervals.noise(self._noise), self._frame, first), first + 1
+            imu_factors(intervals, intervals.noise(self._noise), self._frame, here, first), first + 1
         ):
             graph.push_back(factor)
             ahead = factor.preintegratedMeasurements().predict(ahead, bias)

@@ -81,3 +81,11 @@ def test_the_transform_between_two_frames_is_rigid_and_that_of_the_earth(lat, lo
     np.testing.assert_allclose(T_here_there[:3, :3] @ T_here_there[:3, :3].T, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(there.pose_of(here) @ T_here_there, np.eye(4), atol=1e-6)
     np.testing.assert_allclose(here.pose_of(here), np.eye(4), atol=1e-6)
+
+
+def test_gravity_elsewhere_is_that_of_a_frame_there():
+    frame = LocalFrame(-33.2, 179.9, 120.0)
+    points = np.random.default_rng(0).uniform(-5e4, 5e4, (20, 3)) * [1.0, 1.0, 0.05]
+    for gravity, *place in zip(frame.gravity_at(points), *frame.to_geodetic(points), strict=True):
+        there = LocalFrame(*map(float, place))
+        np.testing.assert_allclose(gravity, -there.gravity * frame.pose_of(there)[:3, 2], atol=1e-7)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,12 @@ class LabelSet:
                 f"class set {self.name!r}: found classes {list(self.names)},"
                 " expected 2 to 64 different names, none of them 'other'"
             )
+        ids = self.semantic_kitti_ids.tolist()
+        if 0 in ids or len(set(ids)) != count:
+            raise ConfigError(
+                f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for every class,"
+                " none of them 0, which is a point without a class"
+            )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
             if unknown:
@@ -66,38 +73,65 @@ class LabelSet:
             )
         return self.names.index(name)
 
-    def table_from(self, source_names: Sequence[str], source: str | None = None) -> NDArray[np.float32]:
+    def about(self) -> dict[str, Any]:
+        """What `open_label_set` reads back, without the sources."""
+        rows = zip(
+            self.names,
+            self.colours.tolist(),
+            self.semantic_kitti_ids.tolist(),
+            self.asprs_codes.tolist(),
+            strict=True,
+        )
+        keys = ("name", "colour", "semantic_kitti_id", "asprs_code")
+        return {"name": self.name, "classes": [dict(zip(keys, row, strict=True)) for row in rows]}
+
+    def table_from(self, source_names: Sequence[str]) -> NDArray[np.float32]:
         """The (s, c + 1) 0/1 matrix that sums the probabilities of s source classes into ours and, last, `other`.
 
-        Without `source`, a name may be one of ours, `other`, or of any known taxonomy, provided that they agree. Raises
-        ConfigError for an unknown name.
+        A name may be one of ours, `other`, or of any source, provided that these agree. Raises ConfigError for an
+        unknown name.
         """
         table = np.zeros((len(source_names), len(self.names) + 1), np.float32)
         for row, name in enumerate(source_names):
-            table[row, self._target(name, source)] = 1.0
+            table[row, self._target(name)] = 1.0
         return table
 
-    def _target(self, name: str, source: str | None) -> int:
+    def of_source(self, source: str, name: str) -> int:
+        """Index of the class of a taxonomy's class, c for `other`; raises ConfigError without a table of this source."""
+        if source not in self.sources:
+            raise ConfigError(
+                f"class set {self.name!r} does not know the classes of {source!r}, only of {list(self.sources)};"
+                f" add a table {source!r} to the `sources` of the class set file"
+            )
+        target = self.sources[source].get(name, OTHER)
+        return len(self.names) if target == OTHER else self.names.index(target)
+
+    @cached_property
+    def _known(self) -> dict[str, set[str]]:
+        """The names of every source: those in its table, and the others of its taxonomy, if that ships with us."""
+        return {
+            source: {*table, *(taxonomy(source).names if source in _shipped() else ())}
+            for source, table in self.sources.items()
+        }
+
+    def _target(self, name: str) -> int:
         if name == OTHER:
             return len(self.names)
-        if source is None and name in self.names:
+        if name in self.names:
             return self.names.index(name)
-        known = [source] if source is not None else list(self.sources)
-        targets = {
-            self.sources[s].get(name, OTHER) for s in known if s in self.sources and name in taxonomy(s).names
-        }
+        targets = {self.of_source(source, name) for source, names in self._known.items() if name in names}
         if len(targets) == 1:
-            target = targets.pop()
-            return len(self.names) if target == OTHER else self.names.index(target)
-        everything = sorted(
-            {n for s in known if s in self.sources for n in taxonomy(s).names} | set(self.names)
-        )
+            return targets.pop()
+        everything = sorted(set(self.names).union(*self._known.values()))
         if not targets:
             raise ConfigError(
                 f"class {name!r} is unknown to the class set {self.name!r}{_did_you_mean(name, everything)};"
                 " name it `other` or add it to the `sources` of the class set file"
             )
-        raise ConfigError(f"class {name!r} is ambiguous: {sorted(targets)}; say which taxonomy it is of")
+        ours = [(*self.names, OTHER)[target] for target in sorted(targets)]
+        raise ConfigError(
+            f"class {name!r} is ambiguous in the class set {self.name!r}: {ours}; name it as one of these"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,16 +149,16 @@ class Taxonomy:
         """Table from id to class index: c is `other`, -1 void, -2 an unknown id."""
         table = np.full(size, -2, np.int16)
         table[[i for i in self.void[kind] if 0 <= i < size]] = UNLABELLED
-        rows = label_set.table_from(self.names, self.name).argmax(1)
-        for name, row in zip(self.names, rows, strict=True):
+        for name in self.names:
+            row = label_set.of_source(self.name, name)
             if 0 <= self.ids[kind].get(name, -1) < size:
                 table[self.ids[kind][name]] = row
         return table
 
 
-def open_label_set(name_or_file: str | Path = "urban") -> LabelSet:
-    """Read a class set: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
-    content = _read(name_or_file)
+def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> LabelSet:
+    """Read a class set: the name of a shipped one, the user's YAML file, or what `about` gave. Raises ConfigError."""
+    content = name_or_file if isinstance(name_or_file, Mapping) else _read(name_or_file)
     try:
         classes = content["classes"]
         return LabelSet(
@@ -142,6 +176,8 @@ def open_label_set(name_or_file: str | Path = "urban") -> LabelSet:
                 for s, table in content.get("sources", {}).items()
             },
         )
+    except ConfigError:
+        raise
     except _CONTENT_ERRORS as error:
         raise ConfigError(
             f"class set {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]};"
@@ -194,14 +230,20 @@ def _whole(value: Any, below: int) -> int:
 _CACHE: dict[str, dict[str, Any]] = {}
 
 
+@cache
+def _shipped() -> list[str]:
+    """Names of the class sets and taxonomies that ship with us."""
+    files = [Path(file.name) for file in (resources.files("gnss_sem_map") / "labels").iterdir()]
+    return sorted(file.stem for file in files if file.suffix == ".yaml")
+
+
 def _read(name_or_file: str | Path) -> dict[str, Any]:
-    shipped = resources.files("gnss_sem_map") / "labels"
-    available = sorted(f.name.removesuffix(".yaml") for f in shipped.iterdir())
+    available = _shipped()
     name = str(name_or_file)
     if name in _CACHE:
         return _CACHE[name]
     if name in available:
-        file = Path(str(shipped / f"{name}.yaml"))
+        file = Path(str(resources.files("gnss_sem_map") / "labels" / f"{name}.yaml"))
     elif is_file(Path(name), ConfigError):
         file = Path(name)
     else:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.labels.probabilities import checked_probabilities, shrink_of
-from gnss_sem_map.segmentation.classes import named_classes
+from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.pixels import checked_pixels
 from gnss_sem_map.sensor_log import Image
 
@@ -34,8 +34,9 @@ class PythonSegmenter:
             raise ConfigError(
                 f"{self._where} has no class_names; give it that attribute, or use ?classes=road,..."
             )
-        count = len(own) if own is not None else 1 + str(classes).count(",")
-        self.class_names = named_classes(classes, count, label_set, self._where, own)
+        names = named_classes(classes, None if own is None else len(own), label_set, self._where, own)
+        self._count, self._kept = len(names), [i for i, name in enumerate(names) if name != VOID]
+        self.class_names = tuple(names[i] for i in self._kept)
 
     def __call__(self, image: Image) -> NDArray[np.uint8] | NDArray[np.float32]:
         """Class probabilities (h, w, c) of one image."""
@@ -45,9 +46,9 @@ class PythonSegmenter:
             answer = np.asarray(self._function(pixels))
         except Exception as error:  # the user's function may raise anything
             raise DataError(f"{where}: {type(error).__name__} {str(error)[:200]}") from error
-        seen = checked_probabilities(answer, len(self.class_names), where)
+        seen = checked_probabilities(answer, self._count, where)
         shrink_of(seen.shape, (pixels.shape[1], pixels.shape[0]), where)
-        return seen
+        return seen if len(self._kept) == self._count else seen[:, :, self._kept]
 
 
 def _import(place: str) -> Callable[[NDArray[np.uint8]], Any]:

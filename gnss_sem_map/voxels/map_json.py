@@ -48,7 +48,7 @@ def describe(
         "format": FORMAT,
         "voxel_size_m": voxel_size_m,
         "classes": list(label_set.names),
-        "class_set": label_set.name,
+        "class_set": label_set.about(),
         "states": {state.name.lower(): int(state) for state in State},
         "reasons": {reason.name.lower(): int(reason) for reason in Reason},
         "origin": origin,

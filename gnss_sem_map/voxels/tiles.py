@@ -148,7 +148,7 @@ def open_map(
     damaged tile.
     """
     about = read_description(folder / MAP_JSON)
-    label_set = label_set or open_label_set(str(about.get("class_set")))
+    label_set = label_set or open_label_set(about.get("class_set", "urban"))
     if tuple(about["classes"]) != label_set.names:
         raise DataError(
             f"{shown(folder)}: found classes {about['classes']}, expected {list(label_set.names)}"

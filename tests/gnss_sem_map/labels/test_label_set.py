@@ -1,5 +1,6 @@
 """Classes are mapped by name, never by index."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,17 +52,37 @@ def test_train_ids_and_label_ids_of_the_same_class_agree() -> None:
 
 def test_a_user_s_class_set_is_read_and_checked(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
-    row = "{name: %s, colour: [1, 2, 3], semantic_kitti_id: 40, asprs_code: 11}"
-    file.write_text(f"name: mine\nclasses: [{row % 'road'}, {row % 'grass'}]\n")
-    assert open_label_set(file).names == ("road", "grass")
-    file.write_text(f"name: mine\nclasses: [{row % 'road'}, {row % 'road'}]\n")
-    with pytest.raises(ConfigError, match="different names"):
+    row = "{name: %s, colour: [1, 2, 3], semantic_kitti_id: %d, asprs_code: 11}"
+    file.write_text(f"name: mine\nclasses: [{row % ('road', 40)}, {row % ('grass', 72)}]\n")
+    known = open_label_set(file)
+    assert known.names == ("road", "grass")
+    again = open_label_set(known.about())
+    assert (again.name, again.names, again.about()) == ("mine", known.names, known.about())
+    np.testing.assert_array_equal(again.colours, known.colours)
+    file.write_text(f"name: mine\nclasses: [{row % ('road', 40)}, {row % ('road', 72)}]\n")
+    with pytest.raises(ConfigError, match=r"^class set 'mine': .*different names"):
         open_label_set(file)
+    for same in (40, 0):  # labels of points would be those of another class, or of none
+        file.write_text(f"name: mine\nclasses: [{row % ('road', 40)}, {row % ('grass', same)}]\n")
+        with pytest.raises(ConfigError, match=rf"semantic_kitti_id \[40, {same}\], expected a different one"):
+            open_label_set(file)
     file.write_text("name: mine\nclasses: [{name: road}]\n")
     with pytest.raises(ConfigError, match="expected name, classes"):
         open_label_set(file)
     with pytest.raises(ConfigError, match="no class set 'nothing'"):
         open_label_set("nothing")
+
+
+def test_a_user_s_taxonomy_needs_only_a_table_in_the_class_set(tmp_path: Path) -> None:
+    mars = tmp_path / "mars.yaml"
+    mars.write_text(
+        "name: mars\nids: [id]\nclasses: [{name: dust, id: 7}, {name: hut, id: 8}, {name: air, id: 9}]\n"
+    )
+    mine = replace(URBAN, sources={**URBAN.sources, "mars": {"dust": "road", "hut": "building"}})
+    assert taxonomy(mars).lookup(mine, "id")[6:10].tolist() == [-2, 0, 3, 5]
+    assert mine.table_from(["dust", "hut", "car"]).argmax(1).tolist() == [0, 3, 2]
+    with pytest.raises(ConfigError, match="does not know the classes of 'mars'.*add a table 'mars'"):
+        taxonomy(mars).lookup(URBAN, "id")
 
 
 def test_ids_of_semantic_kitti_map_as_the_scoring_protocol_says() -> None:

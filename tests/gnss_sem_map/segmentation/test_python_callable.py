@@ -27,6 +27,9 @@ by_colour.class_names = ("road", "vegetation", "sky")
 def unnamed(pixels):
     return by_colour(pixels)
 
+def eleven(pixels):
+    return np.full((*pixels.shape[:2], 11), 1 / 11, np.float32)
+
 def logits(pixels):
     return by_colour(pixels) - 2
 
@@ -88,3 +91,14 @@ def test_what_is_no_probabilities_is_refused_with_the_image(module: str, name: s
 def test_a_callable_that_is_not_there_or_not_named_is_refused(module: str, place: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         open_segmenter(f"python:{place.format(module)}", URBAN)
+
+
+def test_classes_may_be_those_of_a_taxonomy_and_void_is_dropped(module: str) -> None:
+    of_camvid = open_segmenter(f"python:{module}:eleven?classes=camvid", URBAN)
+    assert len(of_camvid.class_names) == 11
+    assert of_camvid(camera()).shape == (9, 13, 11)
+    segment = open_segmenter(f"python:{module}:by_colour?classes=road,void,sky", URBAN)
+    assert segment.class_names == ("road", "sky")
+    whole = open_segmenter(f"python:{module}:by_colour", URBAN)(camera())
+    np.testing.assert_array_equal(segment(camera()), whole[:, :, [0, 2]])
+    URBAN.table_from(segment.class_names)  # each is known

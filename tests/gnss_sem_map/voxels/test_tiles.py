@@ -205,6 +205,13 @@ def test_a_map_of_another_class_set_or_in_the_way_is_refused(tmp_path: Path) -> 
     assert read_frame(tmp_path / "map") == FRAME
 
 
+def test_a_map_of_a_user_s_class_set_is_opened_without_its_file(tmp_path: Path) -> None:
+    mine = replace(URBAN, name="mine", colours=URBAN.colours[::-1].copy())
+    known = random_map()
+    tiles.write(replace(known, voxels=replace(known.voxels, label_set=mine)), tmp_path / "map", FRAME)
+    assert tiles.open_map(tmp_path / "map").label_set.about() == mine.about()
+
+
 def test_the_pieces_by_tile_are_the_map(tmp_path: Path) -> None:
     voxels = random_map().voxels
     pieces = dict(tiles.by_tile(voxels))

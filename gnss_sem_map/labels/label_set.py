@@ -97,7 +97,7 @@ class LabelSet:
         return table
 
     def of_source(self, source: str, name: str) -> int:
-        """Index of the class for a name of a taxonomy, c for `other`; raises ConfigError without a table of this source."""
+        """Index of the class for a name of a taxonomy, c for `other`; raises ConfigError without a table of it."""
         if source not in self.sources:
             raise ConfigError(
                 f"class set {self.name!r} does not know the classes of {source!r}, only of {list(self.sources)};"

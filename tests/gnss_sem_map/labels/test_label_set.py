@@ -60,7 +60,7 @@ def test_a_user_s_class_set_is_read_and_checked(tmp_path: Path) -> None:
     assert (again.name, again.names, again.about()) == ("mine", known.names, known.about())
     np.testing.assert_array_equal(again.colours, known.colours)
     file.write_text(f"name: mine\nclasses: [{row % ('road', 40)}, {row % ('road', 72)}]\n")
-    with pytest.raises(ConfigError, match="^class set .mine.: .*different names"):
+    with pytest.raises(ConfigError, match=r"^class set .mine.: .*different names"):
         open_label_set(file)
     for same in (40, 0):  # labels of points would be those of another class, or of none
         file.write_text(f"name: mine\nclasses: [{row % ('road', 40)}, {row % ('grass', same)}]\n")

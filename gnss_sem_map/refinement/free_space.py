@@ -40,8 +40,8 @@ class FreeSpaceSettings(StepSettings):
 
 
 def reach_m(settings: FreeSpaceSettings, voxel_size_m: float) -> float:
-    """The voxels around; keyframe scans are used wherever they are."""
-    return voxel_size_m
+    """The voxels around one, and what they stand over, one farther; keyframe scans are used wherever they are."""
+    return 2 * voxel_size_m
 
 
 def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:

@@ -145,3 +145,24 @@ def test_witnesses_are_two_metres_or_two_seconds_apart() -> None:
     assert kept is not None
     x = np.linalg.inv(kept.T_lidar_map)[:, 0, 3]
     np.testing.assert_allclose(x, [0, 0, 0.5, 2.5, 4.5], atol=1e-9)
+
+
+def test_a_border_of_tiles_changes_nothing_though_all_other_steps_are_off() -> None:
+    """Beside x = 0 a ghost goes with the next one, beyond the border, which stands over ground yet one farther."""
+    ghosts = np.array([(-0.1, 3.1, 1.1), *[(0.1, 3.1, 1.1)] * 5])
+    ground = np.array([(-0.3, 3.1, 0.1), (0.3, 3.1, 0.1)])
+    witnesses = KeyframeScans.of([witness(x - 15.0) for x in STREET])
+    settings = RefinementSettings(
+        **{
+            name: {"enabled": False}
+            for name in vars(RefinementSettings())
+            if name not in ("free_space", "decision")
+        }
+    )
+    for shift in (0.0, 0.2, 1.0):
+        table = VoxelTable(0.2, URBAN)
+        table.add(keys_of(np.concatenate([ghosts, ground]) + np.array([shift, 0.0, 0.0]), 0.2))
+        refined, _ = refine(table.to_map(), settings, Evidence(keyframes=witnesses))
+        np.testing.assert_array_equal(
+            refined.states == State.REMOVED, refined.voxels.indices[:, 2] == 5, f"{shift}"
+        )

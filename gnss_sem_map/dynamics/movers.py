@@ -1,7 +1,8 @@
 """Movers of a drive: what moved, each with its track, size, speed, class and the evidence that it moved.
 
 A drive is searched chunk by chunk and LiDAR by LiDAR, so one object may have several tracks. Tracks of different chunks
-or LiDARs that lie on each other are of one object.
+or LiDARs that lie on each other are of one object. What is within the outline of another one, scan after scan, is a
+part of it that was a segment of its own: the front of a lorry, of which a pole hides the middle.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy.ndimage import median_filter
 from factor_graphs.sessions import components
 from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
-from gnss_sem_map.dynamics.object_track import ObjectTrack
+from gnss_sem_map.dynamics.object_track import SMALL_M, ObjectTrack, courses
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,9 @@ LEAST_COMMON_S = 0.25
 """Tracks that have less time in common are not compared."""
 LEAST_WAY_M, SIGNIFICANT = 0.5, 3.0
 """What moved went so far, and so many standard deviations of that."""
+PART_SHARE, PART_MARGIN_M = 0.8, 0.5
+"""A part of something larger is within its outline in so large a share of the scans, and no farther before or behind
+its middle than half of its length and so much."""
 GROUND_PLACES = 9
 """The ground under a place is the median of so many."""
 LEAST_LABELLED = 0.2
@@ -113,8 +117,37 @@ def movers_of(objects: Sequence[TrackedObject], movable: Sequence[str]) -> tuple
     """
     moved = [one for one in objects if one.motion in GONE and one.track is not None]
     movers = [_mover([moved[n] for n in group], movable) for group in _same(moved)]
-    seen_to_move = [one for one in movers if one.went_somewhere]
+    seen_to_move = _without_parts([one for one in movers if one.went_somewhere])
     return tuple(sorted(seen_to_move, key=lambda one: (one.stamps[0], *one.positions[0])))
+
+
+def _without_parts(movers: Sequence[Mover]) -> list[Mover]:
+    """The movers that are no parts of others."""
+    starts, ends, points, sizes = (
+        np.array([(one.stamps[0], one.stamps[-1], one.points, max(one.size_m[:2])) for one in movers])
+        .reshape(-1, 4)
+        .T
+    )
+
+    def is_part(one: Mover) -> bool:
+        may_hold = (
+            (starts < one.stamps[-1]) & (ends > one.stamps[0]) & (points > one.points) & (sizes > SMALL_M)
+        )
+        return any(_holds(movers[n], one) for n in np.flatnonzero(may_hold).tolist())
+
+    return [one for one in movers if not is_part(one)]
+
+
+def _holds(whole: Mover, part: Mover) -> bool:
+    """Whether the middle of a part is within the outline of the whole in most scans of the part."""
+    at, places = part.stamps, whole.track.positions
+    off = part.track.positions - np.column_stack([np.interp(at, whole.stamps, axis) for axis in places.T])
+    east, north = courses(places)[np.searchsorted(whole.stamps, at).clip(max=len(places) - 1)].T
+    along, across = abs(east * off[:, 0] + north * off[:, 1]), abs(east * off[:, 1] - north * off[:, 0])
+    length, width, _ = whole.size_m
+    inside = (at >= whole.stamps[0]) & (at <= whole.stamps[-1])
+    inside &= (along <= length / 2 + PART_MARGIN_M) & (across <= width / 2)
+    return bool(inside.mean() >= PART_SHARE)
 
 
 def _same(objects: Sequence[TrackedObject]) -> list[list[int]]:
@@ -162,9 +195,9 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
     )
     _, first = np.unique(np.rec.fromarrays([stamps, lidars]), return_index=True)
     stamps, positions, variances = stamps[first], positions[first], variances[first]
-    points = np.array([one.points for one in objects], np.float64)
-    labelled = float(np.average([t.labelled for t in tracks], weights=points))
-    main = objects[int(points.argmax())]
+    of_tracks = np.array([one.points for one in objects], np.float64)
+    labelled = float(np.average([t.labelled for t in tracks], weights=of_tracks))
+    main = objects[int(of_tracks.argmax())]
     length, width, height = (max(sizes) for sizes in zip(*(t.size_m for t in tracks), strict=True))
     size = length, width, height
     is_labelled = labelled >= LEAST_LABELLED and len(movable) == 1
@@ -176,10 +209,11 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
         motion=main.motion,
         probability=max(one.probability for one in objects),
         evidence=main.reason,
-        points=int(points.sum()),
+        points=int(np.concatenate([t.points for t in tracks])[first].sum()),
         size_m=size,
         stamps=stamps,
-        heights=np.asarray(median_filter(positions[:, 2], GROUND_PLACES, mode="nearest")),
+        # reflected: "nearest" repeats the first place, which then is its own median
+        heights=np.asarray(median_filter(positions[:, 2], GROUND_PLACES, mode="reflect")),
         track=smooth(stamps, positions[:, :2], variances),
     )
 

@@ -61,6 +61,8 @@ class ObjectTrack:
     """Length along its course, width, and height over the ground."""
     labelled: float
     """Share of its points that an image labels as movable."""
+    points: NDArray[np.int64]
+    """(k,) points of each scan."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON; `from_dict` reads it back."""
@@ -73,7 +75,8 @@ class ObjectTrack:
     def from_dict(cls, content: Mapping[str, Any]) -> ObjectTrack:
         """What `as_dict` says."""
         arrays = {name: np.array(content[name], np.float64) for name in ("stamps", "positions", "variances")}
-        return cls(**{**content, **arrays, "size_m": tuple(content["size_m"])})
+        points = np.array(content["points"], np.int64)
+        return cls(**{**content, **arrays, "size_m": tuple(content["size_m"]), "points": points})
 
 
 def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | None:
@@ -106,13 +109,14 @@ def track_of(segments: Sequence[Segment], foot_m: float = 0.0) -> ObjectTrack | 
         if max(size) > SMALL_M:
             middle += shift[:, None] * axis
         variances += stddev[:, None] ** 2 * axis**2
-    points = sum(one.points for one in segments)
+    points = np.array([one.points for one in segments], np.int64)
     return ObjectTrack(
         stamps,
         np.column_stack([middle, levels[:, 0] - foot_m]),
         variances,
         (size[0], size[1], height),
-        sum(one.labelled for one in segments) / points,
+        sum(one.labelled for one in segments) / int(points.sum()),
+        points,
     )
 
 

@@ -115,8 +115,9 @@ def test_what_moves_but_is_not_judged_to_is_not_listed() -> None:
 
 def part(track, rows):
     return ObjectTrack(
-        track.stamps[rows], track.positions[rows], track.variances[rows], track.size_m, track.labelled
-    )
+        track.stamps[rows], track.positions[rows], track.variances[rows], track.size_m, track.labelled,
+        track.points[rows],
+    )  # fmt: skip
 
 
 def test_tracks_of_two_chunks_are_one_object_and_each_scan_counts_once() -> None:
@@ -125,6 +126,33 @@ def test_tracks_of_two_chunks_are_one_object_and_each_scan_counts_once() -> None
     (mover,) = movers_of([tracked(first, chunk=0), tracked(second, chunk=1)], ("vehicle",))
     np.testing.assert_array_equal(mover.stamps, whole.stamps)
     np.testing.assert_allclose(mover.speeds, only(whole).speeds)
+    assert mover.points == whole.points.sum()
+
+
+@pytest.mark.parametrize("hidden", [slice(0, 2), slice(-2, None)], ids=["first", "last"])
+def test_who_shows_no_feet_at_first_or_at_last_is_on_the_ground(hidden) -> None:
+    track = track_of(segments(passing, straight, still))
+    track.positions[:, 2] = 5.0
+    track.positions[hidden, 2] += 1.2
+    np.testing.assert_allclose(only(track).heights, 5.0)
+
+
+@pytest.mark.parametrize("chunk", [0, 1])
+def test_a_part_of_a_car_that_was_a_segment_of_its_own_is_no_object(chunk) -> None:
+    """Its rear, seen for some scans; what drives as close before or beside the car is an object."""
+    car = track_of(segments(lambda t: (SPEED * t, 9.0), straight, still))
+
+    def small(along, across=0.0):
+        off = np.array([along, across, 0.0])
+        return replace(car, positions=car.positions + off, size_m=(0.4, 0.6, 0.5), points=np.full(40, 3))
+
+    def count(other):
+        return len(movers_of([tracked(car), tracked(part(other, slice(9, 21)), chunk=chunk)], ()))
+
+    assert count(small(-LENGTH / 2)) == 1
+    assert count(small(LENGTH / 2, WIDTH / 3)) == 1
+    assert count(small(-LENGTH / 2 - 1.0)) == 2
+    assert count(small(0.0, WIDTH)) == 2
 
 
 def test_two_lidars_that_see_one_car_list_it_once() -> None:

@@ -123,11 +123,11 @@ def main() -> None:
         sys.stdout.flush()
     except Stopped as stopped:
         stopped_by = stopped.number
-        code = _say("; ".join([str(stopped), *getattr(stopped, "__notes__", [])]), 128 + stopped_by)
+        code = _say(_with_notes(stopped), 128 + stopped_by)
     except typer.TyperException as error:
         code = _wrong_usage(error)
     except (SemMapError, FactorGraphError) as error:
-        code = _say(str(error), 1)
+        code = _say(_with_notes(error), 1)
     except MemoryError as error:
         code = _say(
             f"not enough memory ({error}); take fewer --workers, larger voxels or a part of the drive", 1
@@ -158,6 +158,11 @@ def _end_now(code: int) -> NoReturn:
     with suppress(OSError):
         sys.stdout.flush()
     os._exit(code)
+
+
+def _with_notes(error: BaseException) -> str:
+    """The message of an error, and what became of the work that was done."""
+    return "; ".join([str(error), *getattr(error, "__notes__", [])])
 
 
 def _say(message: str, code: int) -> int:

@@ -25,7 +25,7 @@ from gnss_sem_map.files import ownership, work_folder
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems without locks: there we continue without a lock."""
 FIRST_WORDS = "gnss-sem-map writes"
-RESUMABLE = "the intermediate results are kept: the same command with --resume continues"
+RESUMABLE = "the intermediate results are kept in {}: the same command with --resume continues"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def claimed(
             yield claim
         except BaseException as error:
             if is_resumable and work_folder.holds_work(claim.work):
-                error.add_note(RESUMABLE)
+                error.add_note(RESUMABLE.format(claim.work))
             raise
         finally:
             del _HELD[real]

@@ -70,11 +70,13 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def holds_work(folder: Path) -> bool:
-    """Whether there are intermediate results for --resume."""
+    """Whether there are intermediate results for --resume, also in the work folders of single drives."""
     done = any(path.name.isdecimal() for path in folder.glob("*")) and (folder / CHUNKS).is_file()
-    return done or any(
-        any((folder / place).glob(files))
-        for place, files in ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"))
+    kept = ((MATCHES, "*.npz"), (ANSWERS, "**/*.npz"), (DRIVES, "*/run.json"), (BOUND, f"*/{JOB}"))
+    return (
+        done
+        or any(any((folder / place).glob(files)) for place, files in kept)
+        or any(map(holds_work, (folder / DRIVES).glob(".*.work")))
     )
 
 

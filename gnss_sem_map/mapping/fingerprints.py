@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.labels import sensor_model
-from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.sensor_log import Image, Scan, SensorLog, file_of
 from gnss_sem_map.voxels.reuse import VERSION
 
 
-def of_log(log: SensorLog, labels_from: str = "") -> str:
-    """Digest of all that is read of a drive and of the labels of its images, and of this version."""
+def of_log(log: SensorLog, labels_from: str = "", label_set: LabelSet | None = None) -> str:
+    """Digest of all that is read of a drive, of the labels of its images and of their classes, and of this version."""
     said = [
         VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.conventions, _scans(log), _images(log),
-        _cameras(log), labels_from, _states(labels_from),
+        _cameras(log), labels_from, _states(labels_from), None if label_set is None else _of_map(label_set),
     ]  # fmt: skip
     tables = (log.imu, log.gnss, log.wheels, log.given, log.initial_attitude)
     values = (
@@ -50,7 +50,7 @@ def of_map(drive: Drive, labels_from: str) -> str:
     """Digest of everything that decides the map, this version too."""
     log, settings, trajectory = drive.log, drive.settings, drive.trajectory
     said = [
-        VERSION, log.name, log.epoch_ns, labels_from, _classes(drive), settings.classes,
+        VERSION, log.name, log.epoch_ns, labels_from, _classes(drive),
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
         settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
         _scans(log), _images(log), _states(labels_from), _cameras(log),
@@ -64,7 +64,7 @@ def of_map(drive: Drive, labels_from: str) -> str:
 def of_probabilities(drive: Drive, labels_from: str) -> str:
     """Digest of the network, the images and the classes: they decide the class probabilities."""
     said = [
-        drive.log.name, labels_from, _classes(drive), drive.settings.classes,
+        drive.log.name, labels_from, _classes(drive),
         drive.log.calibration.image_sizes, _images(drive.log), _states(labels_from),
     ]  # fmt: skip
     return _digest(said, [])
@@ -77,8 +77,14 @@ def _digest(said: list[Any], arrays: Iterable[NDArray[Any]]) -> str:
     return digest.hexdigest()
 
 
-def _classes(drive: Drive) -> list[str]:
-    return [] if drive.segmenter is None else list(drive.segmenter.class_names)
+def _classes(drive: Drive) -> list[Any]:
+    network = [] if drive.segmenter is None else list(drive.segmenter.class_names)
+    return [network, *_of_map(drive.label_set)]
+
+
+def _of_map(label_set: LabelSet) -> list[Any]:
+    """The classes of the map, and which those of a network are; their file may be changed under its name."""
+    return [label_set.names, label_set.sources]
 
 
 def _scans(log: SensorLog) -> list[Any]:

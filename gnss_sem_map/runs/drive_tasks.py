@@ -21,6 +21,7 @@ from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.run_stats import Progress
@@ -87,7 +88,7 @@ def _map_one(
     source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool, correction_file: str
 ) -> None:
     log, (correction, digest) = source.open_log(), read_correction(correction_file)
-    read = fingerprints.of_log(log, source.labels_from)
+    read = fingerprints.of_log(log, source.labels_from, open_label_set(settings.classes))
     # what is not to be used was removed before
     if _is_done(folder, settings, source.inputs, frame, read, digest):
         return

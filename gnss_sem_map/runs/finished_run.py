@@ -212,7 +212,8 @@ class Run:
         self._refuse_merged(
             "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
         )
-        log, settings = self.drive(), self.settings
+        log = replace(self.drive(), frame=self.frame)  # --origin, or another drive, may have given it
+        settings = self.settings
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)

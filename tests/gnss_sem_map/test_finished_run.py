@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,17 @@ def test_relabelled_it_is_what_a_run_with_those_labels_makes(
     for name in ("map", "refined", "labels", "removed", "evidence/moved"):
         assert files(again.folder / name) == files(finished.folder / name), name
     assert again.about["inputs"]["segmenter"] == finished.about["inputs"]["segmenter"]
+
+
+def test_relabelled_it_stays_where_it_was(finished: Run, small_drive: Street, tmp_path: Path) -> None:
+    assert finished.frame is not None
+    origin = replace(finished.frame, lat_deg=finished.frame.lat_deg + 0.001)
+    labels = f"labels:{small_drive.labels}"
+    there = run(small_drive.drive, tmp_path / "there", labels, origin=origin, force=True)
+    again = there.relabel(labels, tmp_path / "again")
+    assert again.frame == origin
+    for name in ("map.laz", "map.gpkg", "objects.parquet"):
+        assert (again.folder / name).read_bytes() == (there.folder / name).read_bytes(), name
 
 
 def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Run, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import foreign, write_list
-from gnss_sem_map.runs import finished_run, many_drives
+from gnss_sem_map.runs import finished_run, many_drives, run_folder
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
@@ -158,6 +158,26 @@ def stopped(*_: object, **__: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
+def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, chunk = tmp_path / "out", tmp_path / ".out.work/drives/.a.work/0"
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder, "write_drive", stopped)
+        with pytest.raises(KeyboardInterrupt) as stopping:
+            mapped("ab", drives, out, how)
+    assert stopping.value.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
+    there = (chunk / "record.json").stat()
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder, "write_drive", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            mapped("ab", drives, out, replace(how, resume=True))
+    assert os.path.samestat((chunk / "record.json").stat(), there), "the chunk is mapped again"
+    mapped("ab", drives, out, replace(how, resume=True))
+    assert_same(out, made["ab"])
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
 def calls_of_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the drives that are mapped from now on."""
     calls, original = [], pipeline.run
@@ -182,7 +202,7 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
         with pytest.raises(KeyboardInterrupt) as adding:
             add_drive(out, drives.by_name["c"], how)
     assert not hasattr(removing.value, "__notes__"), "nothing resumes a removal"
-    assert adding.value.__notes__ == [RESUMABLE]
+    assert adding.value.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
     calls.clear()
     assert products(out) == products(made["ab"])
     add_drive(out, drives.by_name["c"], replace(how, resume=True))

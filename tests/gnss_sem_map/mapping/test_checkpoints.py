@@ -239,6 +239,21 @@ def test_an_input_that_was_changed_since_is_noticed(
         before = fingerprints.of_map(copied, labels_from)
 
 
+def test_classes_that_were_changed_in_their_file_are_noticed(drive: Drive, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    shutil.copyfile(Path(fingerprints.__file__).parents[1] / "labels/urban.yaml", file)
+    settings = drive.settings.model_copy(update={"classes": str(file)})
+
+    def digests() -> set[str]:
+        opened = replace(drive, settings=settings)
+        of_log = fingerprints.of_log(drive.log, "", open_label_set(file))
+        return {fingerprints.of_map(opened, ""), fingerprints.of_probabilities(opened, ""), of_log}
+
+    before = digests()
+    file.write_text(file.read_text("utf-8").replace("sidewalk: sidewalk", "sidewalk: road"), "utf-8")
+    assert digests().isdisjoint(before)
+
+
 FILL = """
 import resource, sys
 from pathlib import Path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -17,16 +18,24 @@ if TYPE_CHECKING:
 
 
 def print_plan(
-    sources: Iterable[Source], settings: Settings, workers: int, origin: LocalFrame | None = None
+    sources: Iterable[Source],
+    settings: Settings,
+    workers: int,
+    origin: LocalFrame | None = None,
+    align_to: Path | None = None,
 ) -> None:
     """Open every drive and its segmenter, and print what is there; raises what these raise, ends as a run would.
 
-    `origin` is that of the map, by default that of the first drive that has one.
+    `origin` is that of the map, by default that of the first drive that has one; `align_to` as `run_drives` has it.
     """
+    from gnss_sem_map.datasets.laz_cloud import read_base
     from gnss_sem_map.mapping.trajectory import check_georeference
+    from gnss_sem_map.runs.run_folder import georeference_of
     from gnss_sem_map.segmentation import no_segmenter_message
 
     seconds = memory_mb = 0.0
+    if align_to is not None and origin is not None:
+        read_base(align_to, origin)
     for source in sources:
         log = source.open_log()
         if source.segmenter is None and log.cameras:
@@ -35,6 +44,7 @@ def print_plan(
         source.open_network(settings, log)
         log.check_scans()
         origin = origin or log.frame
+        georeference_of(settings, origin)
         check_georeference(log, origin, settings.mapping.voxel_size_m)
         for line in _of_drive(source, log, origin):
             typer.echo(line)

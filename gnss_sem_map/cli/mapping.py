@@ -102,7 +102,7 @@ def run(
     with progress_bars() as progress:
         progress("loading", 0, 1)  # of large packages, which takes a second
         from gnss_sem_map.runs import finished_run
-        from gnss_sem_map.runs.many_drives import HowMapped
+        from gnss_sem_map.runs.many_drives import HowMapped, frame_of_all
         from gnss_sem_map.runs.run_folder import claimed_run, places_read
         from gnss_sem_map.runs.source import source_of
         from gnss_sem_map.segmentation import no_segmenter_message
@@ -118,7 +118,9 @@ def run(
     sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
     with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
         if dry_run:
-            print_plan(sources, settings, workers or default_workers(), frame)
+            if is_of_many:
+                frame = frame_of_all(found, settings, drive_format, frame)
+            print_plan(sources, settings, workers or default_workers(), frame, align_to)
             return
         if is_of_many:
             how = HowMapped(segmenter, frames, drive_format, device, force, resume)

@@ -98,16 +98,15 @@ def run_drives(
     A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises DataError when all
     fail, when two drives have one name or are the same, or the first has no georeference.
     """
+    frame = frame_of_all(drives, settings, how.drive_format, origin)
     drives = [_absolute(drive) for drive in drives]
-    _check_distinct([(drive.name, drive) for drive in drives])
     sources = [how.source(drive) for drive in drives]
     places = run_folder.places_read(sources, settings)
     with (
         run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
-        frame, executor = origin or _frame_of(drives, how.drive_format), workers_of_run or InProcess()
-        Georeference.of(frame, settings.delivery)  # refuses what cannot be delivered
+        executor = workers_of_run or InProcess()
         file = _begin(claim, settings, how)
         tracks = _tracks(sources, frame, settings)
         base = None if align_to is None else read_base(align_to, frame)
@@ -122,6 +121,21 @@ def run_drives(
             out, done, settings, frame, failed, claim.work, bound, executor, progress, labelled, align_to
         )
     return ManyDrives(out, about)
+
+
+def frame_of_all(
+    drives: Sequence[Path], settings: Settings, drive_format: str | None, origin: LocalFrame | None
+) -> LocalFrame:
+    """The frame of the map of several drives, `origin` if it is given.
+
+    Raises DataError and ConfigError as `run_drives` does: for two drives of one name, and a map without a georeference
+    or that cannot be delivered.
+    """
+    drives = [_absolute(drive) for drive in drives]
+    _check_distinct([(drive.name, drive) for drive in drives])
+    frame = origin or _frame_of(drives, drive_format)
+    Georeference.of(frame, settings.delivery)
+    return frame
 
 
 def add_drive(

@@ -102,6 +102,23 @@ def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(
     assert "--segmenter none" in dry.stderr
 
 
+@pytest.mark.parametrize("wrong", ["one name", "no cloud", "no such place"])
+def test_a_dry_run_of_several_drives_ends_as_the_run_does(
+    wrong: str, small_drive: Street, tmp_path: Path
+) -> None:
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again" / small_drive.drive.name).symlink_to(small_drive.drive)
+    options = {
+        "one name": [tmp_path / "again" / small_drive.drive.name],
+        "no cloud": ["--align-to", tmp_path / "city.laz"],
+        "no such place": ["--align-to", tmp_path / "city.laz", "--crs", "2193"],
+    }[wrong]
+    words = ("-q", "run", small_drive.drive, *options, "--segmenter", "none", "-o", tmp_path / "new")
+    run, dry = program(*words), program(*words, "--dry-run")
+    assert run.returncode == 1
+    assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
+
+
 def test_a_dry_run_without_scans_ends_as_the_run_does(small_drive: Street, tmp_path: Path) -> None:
     options = ("--frames", "900:", "--segmenter", "none", "-o", tmp_path / "new")
     words = ("-q", "run", small_drive.drive, *options)

@@ -182,7 +182,7 @@ def add(
 ) -> None:
     """Add a drive to a finished map, with the map's settings: the same bytes as a run of all drives at once."""
     from gnss_sem_map.runs.finished_run import Run
-    from gnss_sem_map.runs.many_drives import HowMapped, add_drive
+    from gnss_sem_map.runs.many_drives import HowMapped, add_drive, has_point_labels
     from gnss_sem_map.segmentation import no_segmenter_message
 
     Run.open(out)
@@ -190,10 +190,19 @@ def add(
         typer.echo(no_segmenter_message(str(drive)), err=True)
         raise typer.Exit(1)
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+    had_labels = has_point_labels(out)
     with progress_bars() as progress:
         made = add_drive(out, drive, how, progress=progress)
-    warn(made.about["warnings"])
+    warn([*made.about["warnings"], *_labels_gone(had_labels)])
     print_many(made.about, out, as_json)
+
+
+def _labels_gone(had_labels: bool) -> list[str]:
+    message = (
+        "the point labels were those of the map as it was, and are gone; `gnss-sem-map run` of all drives with"
+        " --write-labels writes those of the new map"
+    )
+    return [message] if had_labels else []
 
 
 def remove(
@@ -202,11 +211,12 @@ def remove(
     as_json: Json = False,
 ) -> None:
     """Take a drive out of a finished map: the same bytes as a run of the others."""
-    from gnss_sem_map.runs.many_drives import remove_drive
+    from gnss_sem_map.runs.many_drives import has_point_labels, remove_drive
 
+    had_labels = has_point_labels(out)
     with progress_bars() as progress:
         made = remove_drive(out, name, progress)
-    warn(made.about["warnings"])
+    warn([*made.about["warnings"], *_labels_gone(had_labels)])
     print_many(made.about, out, as_json)
 
 

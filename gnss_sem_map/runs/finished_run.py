@@ -170,7 +170,7 @@ class Run:
         stats = RunStats()
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
-        with self._rewritten(out) as folder:
+        with self._rewritten(out, () if log is None else sorted(log.folders)) as folder:
             old_labels = shutil.ignore_patterns(*LABELS)
             for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / name):
@@ -220,7 +220,8 @@ class Run:
         inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
         stats = RunStats()
-        with self._rewritten(out) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:
+        reads = run_folder.places_read([source_of(Path(inputs["drive"]), segmenter)])
+        with self._rewritten(out, reads) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:
             mapped = pipeline.map_drive(
                 drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter
             )
@@ -307,10 +308,13 @@ class Run:
             )
 
     @contextmanager
-    def _rewritten(self, out: Path | str | None) -> Iterator[Path]:
-        """A new folder for this run with another map; it takes the place of the run, or of `out`."""
+    def _rewritten(self, out: Path | str | None, reads: Iterable[Path | str | None]) -> Iterator[Path]:
+        """A new folder for this run with another map; it takes the place of the run, or of `out`.
+
+        An `out` that is or holds what the run `reads`, or lies in it, is refused.
+        """
         place = self.folder if out is None else Path(out)
-        inputs = [self.folder] if place.resolve() != self.folder.resolve() else []
+        inputs = [self.folder, *reads] if place.resolve() != self.folder.resolve() else []
         with run_folder.claimed_run(place, inputs), new_folder(place) as folder:
             yield folder
 

@@ -38,6 +38,7 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import map_all
 from gnss_sem_map.runs.executors import executor_of
+from gnss_sem_map.runs.point_label_files import RAW_LABELS
 from gnss_sem_map.runs.run_settings import SETTINGS, read_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
@@ -136,6 +137,11 @@ def frame_of_all(
     frame = origin or _frame_of(drives, drive_format)
     Georeference.of(frame, settings.delivery)
     return frame
+
+
+def has_point_labels(out: Path) -> bool:
+    """Whether a finished map has labels of LiDAR points: a drive that is added or removed makes another map."""
+    return is_folder(out / RAW_LABELS) or any(out.glob(f"{DRIVES}/*/{RAW_LABELS}"))
 
 
 def add_drive(

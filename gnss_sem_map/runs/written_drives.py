@@ -91,7 +91,13 @@ def write_drives(
             "drives": {part.name: _summary(part) for part in parts},
             "failed": dict(failed),
             "aligned_to": None if align_to is None else str(align_to.resolve()),
-            "warnings": list(bound.warnings),
+            "warnings": [
+                *bound.warnings,
+                *(
+                    f"{name}: could not be bound to other drives ({bound.failed[name]})"
+                    for name in sorted(bound.failed.keys() & drives)
+                ),
+            ],
             "passes": [asdict(row) for row in bound.passes]
             + [row for part in parts for row in read_run(part).get("passes", ())],
             "local_frame": asdict(frame),

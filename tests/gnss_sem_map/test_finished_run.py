@@ -171,6 +171,17 @@ def test_relabelled_it_stays_where_it_was(finished: Run, small_drive: Street, tm
         assert (again.folder / name).read_bytes() == (there.folder / name).read_bytes(), name
 
 
+def test_it_is_written_into_nothing_that_is_read(finished: Run, small_drive: Street) -> None:
+    labels = f"labels:{small_drive.labels}"
+    for write, place in (
+        (lambda out: finished.relabel(labels, out), small_drive.drive),
+        (lambda out: finished.relabel(labels, out), small_drive.labels),
+        (lambda out: finished.refine(finished.settings, out), small_drive.drive),
+    ):
+        with pytest.raises(DataError, match=rf"out: lies in {place}.*, which is read; choose an -o outside"):
+            write(place / "out")
+
+
 def test_it_is_exported_again_and_nothing_of_others_is_written_over(finished: Run, tmp_path: Path) -> None:
     [laz] = finished.export(["laz"], tmp_path / "files")
     assert len(laspy.read(laz).points) == len(laspy.read(finished.folder / "map.laz").points)

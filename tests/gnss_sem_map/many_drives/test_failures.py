@@ -28,7 +28,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import foreign, write_list
-from gnss_sem_map.runs import finished_run, many_drives, run_folder
+from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
@@ -124,6 +124,24 @@ def test_an_error_of_the_disk_in_one_drive_leaves_the_others(
     made = mapped("ab", drives, tmp_path / "out", how)
     assert made.about["merged"] == ["a"]
     assert made.failed == {"b": f"/torn/disk: {os.strerror(errno.EIO)}"}
+
+
+def test_a_drive_that_cannot_be_bound_is_named(
+    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = bound_drives._locate_one
+
+    def fails(source: Source, *rest: Any) -> None:
+        if source.name == "b":
+            raise OSError(errno.EIO, os.strerror(errno.EIO), "/torn/disk")
+        original(source, *rest)
+
+    monkeypatch.setattr(bound_drives, "_locate_one", fails)
+    made = mapped("ab", drives, tmp_path / "out", how)
+    assert made.about["merged"] == ["a", "b"]
+    assert made.about["warnings"] == [
+        f"b: could not be bound to other drives (/torn/disk: {os.strerror(errno.EIO)})"
+    ]
 
 
 def test_where_no_drive_can_be_mapped_nothing_is_written(

@@ -170,7 +170,7 @@ class Run:
         stats = RunStats()
         has_labels = not self.is_merged and is_folder(self.folder / "labels")
         log = self.drive() if has_labels else None
-        with self._rewritten(out, () if log is None else sorted(log.folders)) as folder:
+        with self._rewritten(out, [] if log is None else [inputs_of(self.folder)["drive"]]) as folder:
             old_labels = shutil.ignore_patterns(*LABELS)
             for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES, TRACKS):
                 if is_folder(self.folder / name):
@@ -217,10 +217,10 @@ class Run:
         network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
         is_from_lidar = bool(self.about.get("from_lidar_odometry"))
         drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
-        inputs = self.about["inputs"] | {"segmenter": absolute(segmenter)}
+        inputs: dict[str, Any] = self.about["inputs"] | {"segmenter": absolute(segmenter)}
         with_labels = log if is_folder(self.folder / "labels") else None
         stats = RunStats()
-        reads = run_folder.places_read([source_of(Path(inputs["drive"]), segmenter)])
+        reads = run_folder.places_read([source_of(inputs["drive"], segmenter)])
         with self._rewritten(out, reads) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:
             mapped = pipeline.map_drive(
                 drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter

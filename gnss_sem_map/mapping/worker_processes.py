@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess, parent_process
 from typing import Any
@@ -157,6 +158,7 @@ class _Worker:
 
 def _start() -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")  # a fork of a process with threads may hang
+    resource_tracker.ensure_running()  # it unblocks signals, so a worker that starts it would not ignore them
     ours, theirs = context.Pipe()
     # the main process never waits at exit for a daemon
     process = context.Process(target=_serve, args=(theirs,), daemon=True)

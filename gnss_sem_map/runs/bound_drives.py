@@ -2,6 +2,7 @@
 
 WORK/bound/NAME/job.json, trajectory.npz    a drive that was located, in the frame of all (`runs.drive_job`)
                condensed.npz               what its graph says of its anchors (`factor_graphs.condensing`)
+               located.json                from what, and the checksums of these
                correction.npz              how its anchors move once all drives are known
 
 Only drives whose tracks come near each other are looked at, and each group that is bound is solved alone: so the result
@@ -29,10 +30,10 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.sessions import components
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import SemMapError
+from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
-from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB
+from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
@@ -44,7 +45,7 @@ from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
 from gnss_sem_map.sensor_log import SensorLog
-from gnss_sem_map.voxels.reuse import read_record
+from gnss_sem_map.voxels.reuse import read_record, write_record
 
 Array = NDArray[np.float64]
 
@@ -54,7 +55,7 @@ EVERY_M = 10.0
 """Tracks are compared by one point per cube of this edge."""
 BASE = "/base"
 """Stands for the base among the names of drives, none of which holds a slash."""
-CONDENSED, CORRECTION = "condensed.npz", "correction.npz"
+CONDENSED, CORRECTION, LOCATED = "condensed.npz", "correction.npz", "located.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +158,11 @@ def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequ
 def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFrame) -> None:
     log, folder = source.open_log().in_our_conventions(settings.sensors), work / BOUND / source.name
     fingerprint = _fingerprint(log, settings, frame)
-    if (read_record(folder / JOB) or {}).get("fingerprint") == fingerprint:  # located before an interruption
+    if _is_located(folder, fingerprint):  # before an interruption
         return
     with run_folder.claimed_run(work / DRIVES / source.name) as claim:
-        (folder / JOB).unlink(missing_ok=True)  # of the drive as it was
+        for name in (LOCATED, JOB):  # of the drive as it was
+            (folder / name).unlink(missing_ok=True)
         match = SavedMatches(source, claim.work, resume=True)
         found = pipeline.locate(log, settings, RunStats(), match=match, bound=False)
         if found.solution is None or found.solution.condensed is None:
@@ -169,6 +171,20 @@ def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFram
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / CONDENSED, found.solution.condensed.to_bytes())
         write_job(folder, source, settings, trajectory, fingerprint)
+        write_record({"fingerprint": fingerprint, "sha256": _checksums(folder)}, folder / LOCATED)
+
+
+def _is_located(folder: Path, fingerprint: str) -> bool:
+    """Whether a folder holds this drive, located and undamaged."""
+    try:
+        said = {"fingerprint": fingerprint, "sha256": _checksums(folder)}
+    except DataError:
+        return False
+    return read_record(folder / LOCATED) == said
+
+
+def _checksums(folder: Path) -> list[str]:
+    return [hashlib.sha256(read_bytes(folder / name)).hexdigest() for name in (JOB, TRAJECTORY, CONDENSED)]
 
 
 def _fingerprint(log: SensorLog, settings: Settings, frame: LocalFrame) -> str:

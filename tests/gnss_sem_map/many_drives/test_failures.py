@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import pytest
 import street
 import street_drives
+from damage import flipped, halved
 from maps_of_drives import SETTINGS, assert_same, gnss_sem_map, mapped, products, run_of
 from street import Street
 from street_drives import Drives
@@ -246,6 +247,23 @@ def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
         with pytest.raises(KeyboardInterrupt):
             run_drives([drives.by_name["a"]], tmp_path / "out", settings, again, origin=origin)
         assert len(calls) == times
+
+
+def test_what_is_damaged_of_an_interrupted_run_is_made_again(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, work = tmp_path / "out", tmp_path / ".out.work"
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(many_drives, "write_drives", stopped)
+        mapped("ab", drives, out, how)
+    halved(work / "bound/a/condensed.npz")
+    flipped(work / "bound/b/trajectory.npz")
+    halved(work / "drives/a/run.json")
+    (work / "drives/b/metrics.json").unlink()
+    calls = calls_of_the_pipeline(monkeypatch)
+    mapped("ab", drives, out, replace(how, resume=True))
+    assert calls == ["a", "b"]
+    assert_same(out, made["ab"])
 
 
 def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed(

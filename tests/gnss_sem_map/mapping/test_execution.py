@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -264,3 +265,21 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
             process.kill()
     workers = [int(path.name) for path in begun.iterdir()]
     assert wait_until(lambda: not any(map(is_alive, workers)))
+
+
+@integration
+def test_no_worker_is_ended_by_ctrl_c_which_its_parent_handles(tmp_path: Path) -> None:
+    script, begun = tmp_path / "script.py", tmp_path / "begun"
+    script.write_text(PARENT)
+    begun.mkdir()
+    words = [sys.executable, str(script), str(TESTS), str(begun)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        try:
+            assert wait_until(lambda: len(list(begun.iterdir())) == 2)
+            for path in begun.iterdir():
+                os.kill(int(path.name), signal.SIGINT)
+            time.sleep(0.5)
+            assert all(is_alive(int(path.name)) for path in begun.iterdir())
+        finally:
+            process.kill()
+        assert process.communicate()[1] == ""

@@ -87,8 +87,8 @@ def read_cloud(
     field = time_field(list(table.dtype.names or ()), times)
     if field is None:
         raise no_times(where, list(table.dtype.names or ()))
-    times = np.asarray(table[field])
-    after = _after(times, times[are_returns(rows)], stamp_ns)
+    of_points = np.asarray(table[field])
+    after = _after(of_points, of_points[are_returns(rows)], stamp_ns)
     leave_out_of_sweep(rows, after, where)
     after += stamp
     return Points(rows[:, :3], rows[:, 3], after)

@@ -256,8 +256,8 @@ def open_store(
     known = _fingerprint(about) if resume else None
     if known not in (None, fingerprint):
         raise DataError(
-            f"{folder}: the interrupted run had another drive, trajectory, labels, settings or version of this package, or"
-            " a file was changed since; run it as it was begun, or without --resume"
+            f"{folder}: the interrupted run had another drive, trajectory, labels, settings or version of this package,"
+            " or a file was changed since; run it as it was begun, or without --resume"
         )
     try:
         if known is None:

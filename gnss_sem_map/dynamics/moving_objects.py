@@ -26,7 +26,7 @@ from gnss_sem_map.dynamics.ground_grid import (
     within_radius,
 )
 from gnss_sem_map.dynamics.image_rows import Rows
-from gnss_sem_map.dynamics.lost_parts import joined_to_movers
+from gnss_sem_map.dynamics.lost_parts import joined_to_movers, with_next_parts
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
@@ -152,6 +152,7 @@ def decide(
     else:
         stands = [of_scan.number >= 0 for of_scan in segments]
     listed = with_cover(listed, segments, [seen.seen for seen in observations], _of_voxels(gone, segments))
+    objects = with_next_parts(objects, listed, settings.segment_eps_m)
     first_seen_here = tuple(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )

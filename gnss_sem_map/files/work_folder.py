@@ -104,6 +104,13 @@ def remove_drives(folder: Path) -> None:
     _remove_ours(folder / TILES)
 
 
+def remove_damaged_drives(folder: Path) -> None:
+    """Remove the maps of single drives of which a file was changed or is gone; raises OSError."""
+    for drive in (folder / DRIVES).glob("[!.]*/"):
+        if not ownership.is_whole(drive):
+            _remove_ours(drive)
+
+
 def remove_matches(folder: Path) -> None:
     """Remove saved LiDAR odometry, and what was registered along it; raises OSError."""
     _remove_known(folder, folder / MATCHES)

@@ -10,7 +10,6 @@ drives that it was bound to are mapped again, the others stay.
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.georeference import Georeference
-from gnss_sem_map.files import ownership, work_folder
+from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import Claim
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
@@ -257,9 +256,7 @@ def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
         work_folder.remove_drives(claim.work)
     work_folder.make(claim.work)
     (claim.work / DRIVES).mkdir(exist_ok=True)
-    for drive in (claim.work / DRIVES).glob("[!.]*/"):
-        if not ownership.is_whole(drive):
-            shutil.rmtree(drive)  # damaged: it is mapped again
+    work_folder.remove_damaged_drives(claim.work)
     file = claim.work / DRIVES / SETTINGS
     file.write_text(settings.to_yaml(), "utf-8")
     return file

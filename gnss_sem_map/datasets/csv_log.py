@@ -56,6 +56,8 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 Array = NDArray[np.float64]
 MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
+MOST_NEGATIVE = 0.1
+"""Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 Matrix4 = tuple[
     tuple[float, float, float, float],
     tuple[float, float, float, float],
@@ -374,6 +376,7 @@ def _scans(folder: Path, about: LidarFile) -> tuple[tuple[Scan, ...], list[Skip]
 
 def _read_scan(path: Path, stamp: float, about: LidarFile, state: frames.State | None) -> Points:
     rows = frames.read_points(path, 4 if about.is_compensated else 5, state)
+    _check_columns(rows, shown(path))
     frames.scale_intensity(rows, about.intensity_max)
     if about.is_compensated:
         return Points(rows[:, :3], rows[:, 3], None)
@@ -381,6 +384,17 @@ def _read_scan(path: Path, stamp: float, about: LidarFile, state: frames.State |
         after = rows[:, 4].astype(np.float64)
     leave_out_of_sweep(rows, after, shown(path))
     return Points(rows[:, :3], rows[:, 3], stamp + after)
+
+
+def _check_columns(rows: NDArray[np.float32], where: str) -> None:
+    """Raise DataError for numbers in rows of another length: coordinates fall into the column of intensities."""
+    negative = float((rows[:, 3] < 0).mean())
+    if negative > MOST_NEGATIVE:
+        raise DataError(
+            f"{where}: {negative:.0%} of the intensities are below zero: are these rows of another count of columns?"
+            f" expected {rows.shape[1]}, x y z intensity{'' if rows.shape[1] == 4 else ' time'}; lidar_is_compensated"
+            " in log.yaml (is_compensated in lidars) says whether there are times"
+        )
 
 
 def _images(

@@ -88,8 +88,8 @@ def read_points(path: Path, columns: int = 4, state: State | None = None) -> NDA
             rows = np.empty((size // (4 * columns), columns), "<f4")
             if size == 0 or size != rows.nbytes or file.readinto(rows.data) != size:
                 raise DataError(
-                    f"{shown(path)}: truncated scan; found {size} bytes, expected a multiple of {4 * columns} and more"
-                    " than 0"
+                    f"{shown(path)}: truncated scan, or another count of columns; found {size} bytes, expected a"
+                    f" multiple of {4 * columns} ({columns} columns) and more than 0"
                 )
         except OSError as error:
             raise DataError(f"{shown(path)}: cannot read it ({reason(error)})") from None

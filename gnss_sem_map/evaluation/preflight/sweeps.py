@@ -86,6 +86,7 @@ def _why_unreadable(error: DataError) -> tuple[str, str, str]:
         return error.found, error.mistake, "give each point's time minus the scan's stamp, s"
     return (
         str(error),
-        "scans are damaged, cut short, or other bytes than points",
-        "copy the scans again: little-endian float32 x y z intensity, m",
+        "scans are damaged, cut short, of another count of columns, or other bytes than points",
+        "copy the scans again: little-endian float32 x y z intensity, m; of a CSV log also the time of each point,"
+        " unless lidar_is_compensated is true",
     )

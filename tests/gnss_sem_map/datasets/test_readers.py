@@ -68,6 +68,21 @@ def test_intensities_of_a_table_log_have_the_scale_that_it_says(small_drive: Str
         open_drive(drive)
 
 
+@pytest.mark.parametrize(("columns", "is_compensated"), [(3, False), (4, False), (3, True), (5, True)])
+def test_scans_of_another_count_of_columns_are_not_read_as_points(
+    small_drive: Street, tmp_path: Path, columns: int, is_compensated: bool
+) -> None:
+    drive = street.write_table_log(tmp_path, small_drive)
+    for path in (drive / "lidar").glob("*.bin"):
+        rows = np.fromfile(path, "<f4").reshape(-1, 5)[:, :columns]
+        rows[: len(rows) // 20 * 20].tofile(path)  # a whole number of rows of 3, 4 and 5 columns
+    about = json.loads((drive / "log.yaml").read_text())
+    (drive / "log.yaml").write_text(json.dumps(about | {"lidar_is_compensated": is_compensated}))
+    for scan in open_drive(drive).scans:
+        with pytest.raises(DataError, match="another count of columns"):
+            scan.read()
+
+
 def test_an_odometry_sequence_gives_the_same_points_in_its_first_lidar_frame(
     small_drive: Street, tmp_path: Path
 ) -> None:

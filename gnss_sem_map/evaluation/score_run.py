@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import SHARES, coverage, errors, pose_nees, relative_error
+from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
 from gnss_sem_map.datasets.label_files import (
@@ -32,6 +33,8 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 LARGEST = 1e12
 """Largest stamp in s and length in m."""
 
+AXES = ("lat_deg", "lon_deg", "alt_m")
+
 ONE_SECOND = 10
 """Stamps between the poses that the relative error compares, when the truth is at the LiDAR's 10 Hz."""
 
@@ -41,8 +44,9 @@ def score_run(
 ) -> dict[str, Any]:
     """Scores of a run folder, in the layout of `metrics.json`; also written to it.
 
-    `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum` (poses of
-    the imu in the map frame at the scans' stamps). `label_set` is that of the run's settings unless given.
+    `truth`: a folder of `.label` files, or one with `labels/` and, where there is one, `trajectory_lidar.tum`: poses of
+    the imu at the scans' stamps, in the map frame, or in that of `world.json` beside it (`lat_deg`, `lon_deg`, `alt_m`;
+    `--origin` and maps of several drives have another). `label_set` is that of the run's settings unless given.
     `restrict_to`: only points labelled there. Raises DataError.
     """
     _check_scorable(out)
@@ -50,7 +54,8 @@ def score_run(
     metrics = read_json(out / "metrics.json") | _score_points(out, truth, label_set, restrict_to)
     path = truth / "trajectory_lidar.tum"
     if is_file(path):
-        metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), read_tum(path))
+        reference = _in_frame_of(out, read_tum(path), truth / "world.json")
+        metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), reference)
     amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
@@ -126,6 +131,21 @@ def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32
             f"{truth}: no truth for {len(missing)} of {len(wanted)} scans, first {missing[0]}; is it another drive?"
         )
     return [(name, read_labels(known[name])) for name in wanted]
+
+
+def _in_frame_of(out: Path, poses: Trajectory, world: Path) -> Trajectory:
+    """True poses in the map frame of a run; without `world`, or a georeference of the run, they are in it."""
+    own = read_run(out).get("local_frame")
+    if own is None or not is_file(world):
+        return poses
+    about = read_json(world)
+    try:
+        frames = [LocalFrame(*(float(each[axis]) for axis in AXES)) for each in (own, about)]
+    except (KeyError, TypeError, ValueError):
+        raise DataError(
+            f"{shown(world)}: expected the origin of the true poses, as {', '.join(AXES)}"
+        ) from None
+    return poses.moved(frames[0].pose_of(frames[1]))
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:

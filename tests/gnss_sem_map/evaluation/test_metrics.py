@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from sklearn.metrics import jaccard_score, precision_score
 
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.trajectory import Trajectory
+from factor_graphs.tum import write_tum
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import metrics
@@ -154,7 +157,8 @@ def test_a_class_set_without_vehicles_has_no_moving_ones() -> None:
     assert (found["DA"], found["SA"], found["SA_vehicle"], found["moving_points"]) == (None, 1 / 2, None, 0)
 
 
-def test_restricted_to_some_points_every_figure_is_of_these_alone(tmp_path: Path) -> None:
+def write_scored_run(folder: Path) -> None:
+    """A run of one scan of four points, its truth, and a selection of points."""
     files = {
         "run.json": b"{}", "metrics.json": b"{}", "map/map.json": b"{}",
         "config.yaml": Settings().to_yaml().encode(),
@@ -163,14 +167,36 @@ def test_restricted_to_some_points_every_figure_is_of_these_alone(tmp_path: Path
         "truth/0.label": ids(40, 40, 252, 252), "some/0.label": ids(40, 0, 10, 0),
     }  # fmt: skip
     for name, content in files.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(bytes(content))
-    ownership.write_list(tmp_path)
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(bytes(content))
+    ownership.write_list(folder)
+
+
+def test_restricted_to_some_points_every_figure_is_of_these_alone(tmp_path: Path) -> None:
+    write_scored_run(tmp_path)
     everything = score_run(tmp_path, tmp_path / "truth")
     assert (everything["semantics"]["refined"]["mean_iou"], everything["dynamic"]["DA"]) == (1 / 2, 1 / 2)
     found = score_run(tmp_path, tmp_path / "truth", restrict_to=tmp_path / "some")
     assert (found["semantics"]["refined"]["mean_iou"], found["dynamic"]["DA"]) == (1.0, 1.0)
     assert found["dynamic"]["moving_points"] == 1
+
+
+def test_the_truth_may_have_another_origin_than_the_map(tmp_path: Path) -> None:
+    write_scored_run(tmp_path)
+    true_frame, map_frame = LocalFrame(49.0, 8.4, 110.0), LocalFrame(49.01, 8.41, 90.0)
+    T_map_imu = np.tile(np.eye(4), (20, 1, 1))
+    T_map_imu[:, 0, 3] = np.arange(20.0)
+    truth = Trajectory(0.1 * np.arange(20), T_map_imu)
+    write_tum(truth, tmp_path / "truth" / "trajectory_lidar.tum")
+    (tmp_path / "truth" / "world.json").write_text(json.dumps(asdict(true_frame)))
+    truth.moved(map_frame.pose_of(true_frame)).save(tmp_path / "trajectory.parquet")
+    (tmp_path / "run.json").write_text(json.dumps({"local_frame": asdict(map_frame)}))
+    found = score_run(tmp_path, tmp_path / "truth")["trajectory"]
+    assert found["ate_m"] == pytest.approx(0.0, abs=1e-5)
+    assert found["tilt_rms_deg"] == pytest.approx(0.0, abs=1e-5)
+    (tmp_path / "truth" / "world.json").write_text('{"lat_deg": 49}')
+    with pytest.raises(DataError, match=r"world\.json: expected the origin"):
+        score_run(tmp_path, tmp_path / "truth")
 
 
 def test_a_calibrated_confidence_has_no_calibration_error_and_a_boast_has_its_size() -> None:

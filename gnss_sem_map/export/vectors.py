@@ -244,9 +244,7 @@ def _object(
     layer: str, found: tuple[NDArray[np.int64], Array], size: float, georeference: Georeference
 ) -> Iterator[Feature]:
     columns, confidence = found
-    voxels = int(columns[:, 4].sum())
-    shared = (float(confidence.sum()) / voxels, float(voxels))
-    levels = [columns[:, 2].min() * size, (columns[:, 3].max() + 1) * size]
+    levels, shared = _about(columns, confidence, size)
     match layer:
         case "poles":
             shape, heights = _placed(
@@ -260,26 +258,35 @@ def _object(
             sides = np.linalg.norm(np.diff(shapely.get_coordinates(rectangle)[:3], axis=0), axis=1)
             yield Feature(layer, shape, (float(sides.max()), float(sides.min()), *heights, *shared))
         case _:
-            for outline in _outlines(columns[:, :2], size):
+            for outline, its in _outlines(columns[:, :2], size):
+                levels, shared = _about(columns[its], confidence[its], size)
                 shape, heights = _placed(outline, levels, georeference)
                 yield Feature(layer, shape, (outline.area, *heights, *shared))
 
 
-def _outlines(cells: NDArray[np.int64], size: float) -> Iterator[shapely.Polygon]:
-    """Polygons around cells (n, 2), with gaps of up to four cells closed."""
+def _about(
+    columns: NDArray[np.int64], confidence: Array, size: float
+) -> tuple[list[float], tuple[float, float]]:
+    """Lowest and highest z of some columns, m; mean confidence and number of their voxels."""
+    voxels = int(columns[:, 4].sum())
+    levels = [columns[:, 2].min() * size, (columns[:, 3].max() + 1) * size]
+    return levels, (float(confidence.sum()) / voxels, float(voxels))
+
+
+def _outlines(cells: NDArray[np.int64], size: float) -> Iterator[tuple[shapely.Polygon, NDArray[np.bool_]]]:
+    """Polygons around cells (n, 2), with gaps of up to four cells closed, and which cells (n,) are in each."""
     from rasterio import Affine, features
 
     low = cells.min(axis=0) - 3
     x, y = (cells - low).T
     mask = np.zeros((y.max() + 4, x.max() + 4), bool)
     mask[y, x] = True
-    closed = ndimage.binary_closing(mask, np.ones((3, 3), bool), iterations=2).astype(np.uint8)
+    parts, _ = ndimage.label(ndimage.binary_closing(mask, np.ones((3, 3), bool), iterations=2))
     to_metres = Affine(size, 0, low[0] * size, 0, size, low[1] * size)
-    for shape, _ in features.shapes(closed, mask=closed > 0, connectivity=8, transform=to_metres):
-        outline = _polygon(shape["coordinates"]).buffer(0)
-        for part in shapely.get_parts(shapely.simplify(outline, OUTLINE_M)):
-            if part.area >= SMALLEST_AREA_M2:
-                yield part
+    for shape, number in features.shapes(parts, mask=parts > 0, connectivity=4, transform=to_metres):
+        outline = shapely.simplify(_polygon(shape["coordinates"]), OUTLINE_M)
+        if outline.area >= SMALLEST_AREA_M2:
+            yield outline, parts[y, x] == number
 
 
 def _polygon(rings: list[list[tuple[float, float]]]) -> shapely.Polygon:

@@ -125,6 +125,22 @@ def test_an_object_across_tiles_is_one(street: SemanticMap, karlsruhe: LocalFram
         assert shapely.area(read(path, "road")[0]).sum() == pytest.approx(480, rel=0.005)
 
 
+def test_each_outline_of_a_building_has_its_own_voxels_and_heights(
+    street: SemanticMap, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    """Two walls, one behind the other and 2 m up, whose ends are one cell apart."""
+    wall = street[np.flatnonzero(street.labels == 3)]
+    both = tiles.joined(
+        [wall, moved(wall, (226, 3, 10))], street.voxels.voxel_size_m, street.voxels.label_set
+    )
+    write_geopackage(Exported(tiles.in_memory(both, karlsruhe)), tmp_path / "map.gpkg")
+    shapes, columns = read(tmp_path / "map.gpkg", "buildings")
+    assert shapely.area(shapes) == pytest.approx([18.0, 18.0], abs=0.1)
+    assert columns["voxels"].tolist() == [len(wall), len(wall)]
+    assert sorted(columns["base_m"]) == pytest.approx([115.0, 117.0], abs=0.01)
+    assert sorted(columns["top_m"]) == pytest.approx([123.0, 125.0], abs=0.01)
+
+
 def test_a_map_without_georeference_is_refused(street: SemanticMap, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="needs a georeference"):
         write_geopackage(Exported(tiles.in_memory(street), title="street"), tmp_path / "map.gpkg")

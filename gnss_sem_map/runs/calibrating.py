@@ -65,7 +65,9 @@ def drive_and_map(out: Path, drive: Path | None, segmenter: str | None) -> tuple
             f" {inputs['segmenter']} if you mean it"
         )
     trajectory, segmenter = run.trajectory, segmenter or inputs.get("segmenter")
-    if (drive is None and "drive" not in inputs) or segmenter is None or segmenter == "none":
+    if segmenter == "none":
+        raise DataError(f"{shown(out)}: was made without labels; calibrate a run with --segmenter")
+    if (drive is None and "drive" not in inputs) or segmenter is None:
         raise DataError(
             f"{shown(out)}: its run.json names no drive and segmenter; give --drive and --segmenter"
         )

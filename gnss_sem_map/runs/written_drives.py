@@ -89,7 +89,7 @@ def write_drives(
             "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
             "merged": [part.name for part in parts],
             "drives": {part.name: _summary(part) for part in parts},
-            "failed": dict(failed),
+            "failed": dict(sorted(failed.items())),
             "aligned_to": None if align_to is None else str(align_to.resolve()),
             "warnings": [
                 *bound.warnings,

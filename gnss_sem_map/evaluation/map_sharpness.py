@@ -7,6 +7,7 @@ sharp.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -324,7 +325,7 @@ def _sharpness(stretches: list[_Stretch], length_m: float) -> Sharpness:
     steepness = np.concatenate([np.empty(0), *(steepness for _, steepness in surfaces)])
     voxels = sum(stretch.voxels for stretch in stretches)
     thickness = np.sqrt(variances[:, 0])
-    entropies = 0.5 * (3 * np.log(2 * np.pi * np.e) + np.log(variances).sum(axis=1))
+    entropies = 0.5 * (3 * math.log(2 * math.pi * math.e) + np.log(variances).sum(axis=1))
     return Sharpness(
         thickness_m=_median(thickness),
         ground_thickness_m=_median(thickness[steepness > GROUND_NORMAL]),

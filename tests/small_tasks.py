@@ -79,6 +79,15 @@ def begins_and_waits(folder: str) -> None:
     signal.pause()
 
 
+def waits_for_go(folder: str) -> None:
+    """Says that it began, and that it ended, which it does when the folder holds `go`."""
+    own = Path(folder) / f"{os.getpid()}"
+    own.touch()
+    while not (Path(folder) / "go").exists():
+        time.sleep(0.02)
+    own.with_suffix(".ended").touch()
+
+
 def is_wrong(kind: str) -> None:
     """Raises an error."""
     if kind == "os":

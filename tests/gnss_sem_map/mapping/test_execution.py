@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -270,16 +269,17 @@ def test_workers_end_when_their_parent_does(number: signal.Signals, tmp_path: Pa
 @integration
 def test_no_worker_is_ended_by_ctrl_c_which_its_parent_handles(tmp_path: Path) -> None:
     script, begun = tmp_path / "script.py", tmp_path / "begun"
-    script.write_text(PARENT)
+    script.write_text(PARENT.replace("begins_and_waits", "waits_for_go"))
     begun.mkdir()
     words = [sys.executable, str(script), str(TESTS), str(begun)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         try:
             assert wait_until(lambda: len(list(begun.iterdir())) == 2)
-            for path in begun.iterdir():
-                os.kill(int(path.name), signal.SIGINT)
-            time.sleep(0.5)
-            assert all(is_alive(int(path.name)) for path in begun.iterdir())
+            workers = {path.name for path in begun.iterdir()}
+            for worker in workers:
+                os.kill(int(worker), signal.SIGINT)
+            (begun / "go").touch()
+            assert process.communicate(timeout=60)[1] == ""
         finally:
             process.kill()
-        assert process.communicate()[1] == ""
+    assert {path.stem for path in begun.glob("*.ended")} == workers

@@ -5,7 +5,7 @@
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
     wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
                                                        or by `speed_unit` in log.yaml
-    log.yaml            optional: see `LogFile`
+    log.yaml            optional: see `log_yaml.LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
                                                        intensity from 0 to 1, or to `intensity_max` in log.yaml
     images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg
@@ -24,10 +24,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from scipy.spatial.transform import Rotation
 
-from factor_graphs.alignment import AttitudePrior
 from factor_graphs.csv_log import (
     GNSS_COLUMNS,
     IMU_COLUMNS,
@@ -41,16 +38,16 @@ from factor_graphs.csv_log import (
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuNoise, WheelSpeeds, clean_gnss, clean_imu, clean_wheels
+from factor_graphs.measurements import WheelSpeeds, clean_gnss, clean_imu, clean_wheels
 from gnss_sem_map.datasets import frames
-from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
+from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
-from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Calibration, Image, Lidar, Points, Scan, SensorLog, Skip
-from gnss_sem_map.sensor_log.cameras import Camera, Distortion, SensorName, lidar_to_camera
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Image, Lidar, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
@@ -58,123 +55,6 @@ MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
-Matrix4 = tuple[
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
-    tuple[float, float, float, float],
-]
-IDENTITY: Matrix4 = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))
-
-
-class InitialAttitude(BaseModel):
-    """Attitude of the IMU at its first stamp, as an inertial unit knows it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    quaternion_xyzw: tuple[float, float, float, float] = Field(description="imu to east, north, up.")
-    stddevs_rad: tuple[float, float, float] = Field(description="About the imu's x, y, z.")
-
-    @model_validator(mode="after")
-    def _is_attitude(self) -> InitialAttitude:
-        if abs(float(np.linalg.norm(self.quaternion_xyzw)) - 1) > 1e-3 or min(self.stddevs_rad) <= 0:
-            raise ValueError("expected a unit quaternion, and standard deviations above 0")
-        return self
-
-    @property
-    def prior(self) -> AttitudePrior:
-        """The same for the smoother."""
-        R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
-        return AttitudePrior(np.asarray(R), np.array(self.stddevs_rad))
-
-
-Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-
-
-class CameraFile(BaseModel):
-    """One of several cameras in `log.yaml`; its images are in `images/NAME/`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    K: Matrix3 = Field(description="Intrinsics, px.")
-    image_size: tuple[int, int] = Field(description="Width and height of the images, px.")
-    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to camera; this or T_imu_camera.")
-    T_imu_camera: Matrix4 | None = Field(None, description="Camera to IMU.")
-    distortion: Distortion | None = Field(None, description="Of the lens; default: the images are rectified.")
-    time_offset_s: float = Field(0.0, description="Moment of exposure minus image stamp.")
-
-    @model_validator(mode="after")
-    def _has_one_pose(self) -> CameraFile:
-        if (self.T_camera_lidar is None) == (self.T_imu_camera is None):
-            raise ValueError("expected one of T_camera_lidar and T_imu_camera")
-        return self
-
-    def camera(self, T_imu_lidar: Array, name: str) -> Camera:
-        """The same for the log."""
-        if self.T_camera_lidar is not None:
-            T_camera_lidar = np.array(self.T_camera_lidar, np.float64)
-        else:
-            T_camera_lidar = lidar_to_camera(np.array(self.T_imu_camera, np.float64), T_imu_lidar)
-        K = np.array(self.K, np.float64)
-        return Camera(T_camera_lidar, K, self.image_size, self.time_offset_s, self.distortion, name)
-
-
-class LidarFile(BaseModel):
-    """One of several LiDARs in `log.yaml`; its scans are in `lidar/NAME/`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    T_imu_lidar: Matrix4 = Field(description="LiDAR to IMU.")
-    is_compensated: bool = Field(False, description="As `lidar_is_compensated`.")
-    intensity_max: float = Field(1.0, gt=0, description="Number for an intensity of 1 in its scans.")
-
-
-class LogFile(SensorConventions):
-    """Content of `log.yaml`; axes, units and clocks are those of `SensorConventions`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    epoch_ns: int = Field(0, ge=-(1 << 63), lt=1 << 63, description="Unix time, ns, of stamp zero.")
-    p_imu_antenna: tuple[float, float, float] = Field(
-        (0, 0, 0), description="GNSS antenna in the imu frame, m."
-    )
-    T_imu_lidar: Matrix4 | None = Field(
-        None, description="LiDAR to IMU; default: that of the IMU, and the pre-flight check is amber."
-    )
-    lidars: dict[SensorName, LidarFile] = Field(
-        {}, description="Several LiDARs by name, in place of T_imu_lidar; T_camera_lidar is of the first."
-    )
-    T_camera_lidar: Matrix4 | None = Field(None, description="LiDAR to the only camera.")
-    K: Matrix3 | None = Field(None, description="Its intrinsics, px.")
-    image_size: tuple[int, int] | None = Field(None, description="Width and height of its images, px.")
-    distortion: Distortion | None = Field(None, description="Of its lens; default: its images are rectified.")
-    camera_time_offset_s: float = Field(0.0, description="Moment of its exposure minus image stamp.")
-    cameras: dict[SensorName, CameraFile] = Field(
-        {}, description="Several cameras by name, in place of the keys above."
-    )
-    imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
-    initial_attitude: InitialAttitude | None = Field(
-        None, description="Attitude at the first row of imu.csv; default: by the motion."
-    )
-    gnss_file: GnssFile | None = Field(None, description="A file of positions in place of gnss.csv.")
-    lidar_is_compensated: bool = Field(
-        False, description="Scans of four columns are already motion-compensated to their stamp."
-    )
-    intensity_max: float = Field(
-        1.0, gt=0, description="Number for an intensity of 1 in the scans of the only LiDAR."
-    )
-
-    @property
-    def all_lidars(self) -> list[tuple[str, LidarFile]]:
-        """The LiDARs with the names of their folders; the first is the one that all else is relative to."""
-        alone = LidarFile(
-            T_imu_lidar=self.T_imu_lidar or IDENTITY,
-            is_compensated=self.lidar_is_compensated,
-            intensity_max=self.intensity_max,
-        )
-        return list(self.lidars.items()) or [("", alone)]
-
-
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv (CSV log)"
 
 
@@ -185,7 +65,7 @@ def is_drive(drive: Path) -> bool:
 
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
-    about = _about(drive / "log.yaml")
+    about = read_log_yaml(drive / "log.yaml")
     imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(drive / "imu.csv"))
@@ -199,7 +79,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     ]
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
     lidars, scan_skips = _lidars(drive, about)
-    calibration = _calibration(about, drive / "log.yaml")
+    calibration = calibration_of(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
     return SensorLog(
         name=shown(drive.name),
@@ -218,41 +98,6 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
-
-
-def _about(path: Path) -> LogFile:
-    if not is_file(path):
-        return LogFile()
-    try:
-        return LogFile.model_validate(read_yaml(path) or {})
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = " ".join(".".join(map(str, first["loc"])).split())
-        raise DataError(
-            f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; known keys are {sorted(LogFile.model_fields)}"
-        ) from None
-
-
-def _calibration(about: LogFile, path: Path) -> Calibration:
-    T_imu_lidar = np.array(about.all_lidars[0][1].T_imu_lidar, np.float64)
-    given = about.cameras or _only_camera(about, path)
-    cameras = [one.camera(T_imu_lidar, name if len(given) > 1 else "") for name, one in given.items()]
-    return Calibration(T_imu_lidar, tuple(cameras), np.array(about.p_imu_antenna, np.float64))
-
-
-def _only_camera(about: LogFile, path: Path) -> dict[str, CameraFile]:
-    """The camera that is described by keys of its own; none if there is none."""
-    if about.T_camera_lidar is None and about.K is None and about.image_size is None:
-        return {}
-    if about.T_camera_lidar is None or about.K is None or about.image_size is None:
-        raise DataError(
-            f"{path}: a camera needs all of T_camera_lidar, K and image_size; found only some of them"
-        )
-    only = CameraFile(
-        K=about.K, image_size=about.image_size, T_camera_lidar=about.T_camera_lidar,
-        distortion=about.distortion, time_offset_s=about.camera_time_offset_s,
-    )  # fmt: skip
-    return {"": only}
 
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, list[Skip]]:

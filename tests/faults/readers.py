@@ -81,7 +81,8 @@ def scan(folder: Path) -> Reader:
 
 
 def _read_now(path: Path, stamp: float) -> object:
-    from gnss_sem_map.datasets.csv_log import LidarFile, _read_scan
+    from gnss_sem_map.datasets.csv_log import _read_scan
+    from gnss_sem_map.datasets.log_yaml import LidarFile
 
     return _read_scan(path, stamp, LidarFile(T_imu_lidar=np.eye(4).tolist()), None)
 

@@ -161,7 +161,7 @@ def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> Non
         replace(drive, from_lidar_odometry=True),
         by_chunks(drive, 1),
     ):
-        with pytest.raises(DataError, match="another drive, trajectory, labels or settings"):
+        with pytest.raises(DataError, match="another drive, trajectory, labels, settings or version"):
             map_scans(changed, work, RunStats(), resume=True)
     with pytest.raises(DataError, match="another drive"):
         map_scans(drive, work, RunStats(), resume=True, labels_from="labels:elsewhere")

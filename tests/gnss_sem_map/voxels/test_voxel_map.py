@@ -246,7 +246,11 @@ def test_a_table_that_was_put_aside_goes_on_as_one_that_was_not(tmp_path: Path) 
 
 @pytest.mark.parametrize("names", [2, 5, 6, 19])
 def test_rows_hold_any_number_of_classes(names: int) -> None:
-    some = replace(URBAN, names=tuple(f"c{i}" for i in range(names)), sources={})
+    classes = [
+        {"name": f"c{i}", "semantic_kitti_id": i + 1, "asprs_code": 1, "colour": [0, 0, i]}
+        for i in range(names)
+    ]
+    some = open_label_set({"name": "some", "classes": classes})
     rng = np.random.default_rng(7)
     classes = rng.integers(0, 256, (50, names + 1)).astype(np.uint8)
     p_map, pixels = rng.normal(0, 3, (2000, 3)), rng.integers(-1, 50, 2000).astype(np.int32)

@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gnss_sem_map.errors import counted
+from gnss_sem_map.evaluation.preflight import scan_clock
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
-from gnss_sem_map.evaluation.preflight.lidar_motion import Stretch
+from gnss_sem_map.evaluation.preflight.lidar_motion import TURN_STDDEV_RAD, WAY_STDDEV_M, Stretch
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S
 from gnss_sem_map.sensor_log import POSE_OF_LIDAR
 
 Array = NDArray[np.float64]
-GIVEN, NAME, LEVER, SCALE, FIT = (
+GIVEN, NAME, LEVER, SCALE = (
     "T_imu_lidar",
     "T_imu_lidar rotation",
     "T_imu_lidar position",
     "scale of motion",
-    "motion",
 )
 LONGEST_LEVER_M = 20.0
 """Longest vehicle on a road."""
 LEAST_WAY_M, LEAST_TURN_RAD = 1.0, np.radians(3.0)
-WAY_STDDEV_M, TURN_STDDEV_RAD, GROUND_STDDEV_RAD = 0.05, np.radians(0.15), np.radians(1.5)
-"""How well a match knows the way and the turn of a second; and how far roads and loaded vehicles tilt."""
+GROUND_STDDEV_RAD = np.radians(1.5)
+"""How far roads and loaded vehicles tilt."""
 HEADING_STDDEV_RAD = np.radians(0.5)
 """Of given poses, which say nothing of themselves."""
 SAME_RAD, WRONG_RAD, SIGMAS = np.radians([4.0, 3.0, 3.0]), np.radians(10.0), 3.5
@@ -44,11 +44,6 @@ SCALES = {
     57.2958: "in degrees taken for radians",
     1 / 57.2958: "in radians taken for degrees",
 }
-SHIFTS_S = np.arange(-20, 21) * 0.1
-LATE_S, SURE_LATE = 0.25, 5.0
-"""Less is the smoother's at 10 Hz; five standard deviations stop a run, as for a late clock of the fixes."""
-LEAST_STEPS, MOST_MISFIT = 5, 4.0
-"""Motions that must be compared; and their mean squared error where clocks agree, two standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +116,9 @@ def _motions(sample: Sample, stretches: tuple[Stretch, ...]) -> _Motions:
 
 
 def _compare(sample: Sample, motions: _Motions, p: Array) -> Iterator[Finding]:
-    shift, surer = _time_shift(sample, p)
-    if abs(shift) > LATE_S and surer > SURE_LATE:
-        yield _late(sample, shift, surer)
+    late = scan_clock.check(sample, p)
+    if late is not None:
+        yield late
         return
     R = sample.log.calibration.T_imu_lidar[:3, :3]
     ways = motions.ways_imu + _lever(motions.turns_imu) @ p
@@ -148,7 +143,7 @@ def _scale(sample: Sample, by_lidar: Array, by_track: Array) -> Finding:
         f"the trajectory goes {np.exp(ratio):.3g} times as far as the LiDAR sees"
         f" ({counted(len(ratios), 'stretch', 'stretches')})"
     )
-    what = _track(sample)
+    what = sample.track_from
     if abs(ratio) <= SAME_SCALE or (abs(ratio) <= WRONG_SCALE and len(ratios) < 2):
         return green(SCALE, found)
     for factor, unit in SCALES.items():
@@ -346,60 +341,4 @@ def _position(sample: Sample, motions: _Motions, rotation: Array, p: Array) -> I
 
 def _lever(turns: Array) -> Array:
     """(n, 3, 3) with R_imu - 1 of each turn: what it does to a lever arm."""
-    return _lever_of(Rotation.from_rotvec(turns).as_matrix())
-
-
-def _lever_of(R: Array) -> Array:
-    return np.asarray(R - np.eye(3))
-
-
-def _time_shift(sample: Sample, p: Array) -> tuple[float, float]:
-    """By how much later the trajectory moves as the scans see, s, and by how many standard deviations that is surer.
-
-    Ways and angles of turn are compared, from sweep to sweep: wrong axes do not change them.
-    """
-    trajectory = sample.trajectory
-    assert trajectory is not None
-    stamps, T = [], []
-    for seen in sample.stretches:
-        matched = sample.deskewed(seen)[0]  # of all but the second sweep
-        at = np.delete(seen.stamps, 1)
-        stamps.append(np.column_stack([at[:-1], at[1:]]))
-        T.append(np.linalg.inv(matched[:-1]) @ matched[1:])
-    ends = np.concatenate(stamps)
-    ways, turns = _magnitudes(np.concatenate(T))
-    moved = SHIFTS_S[:, None, None] + ends
-    inside = (moved[:, :, 0] >= trajectory.start) & (moved[:, :, 1] <= trajectory.end)
-    within = np.clip(moved, trajectory.start, trajectory.end)
-    of_imu = np.linalg.inv(trajectory.at(within[:, :, 0].ravel())) @ trajectory.at(within[:, :, 1].ravel())
-    of_imu[:, :3, 3] += _lever_of(of_imu[:, :3, :3]) @ p
-    w, t = (values.reshape(inside.shape) for values in _magnitudes(of_imu))
-    squares = ((w - ways) / np.hypot(WAY_STDDEV_M, 0.02 * ways)) ** 2 + ((t - turns) / TURN_STDDEV_RAD) ** 2
-    counts = inside.sum(axis=1)
-    means = np.where(inside, squares, 0.0).sum(axis=1) / np.maximum(counts, 1)
-    means[counts < max(LEAST_STEPS, 0.6 * len(ends))] = np.inf
-    zero, best = len(SHIFTS_S) // 2, int(np.argmin(means))
-    if not means[best] < MOST_MISFIT or not np.isfinite(means[zero]):
-        return 0.0, 0.0
-    surer = counts[best] * (means[zero] - means[best]) / max(float(means[best]), 1.0)
-    return float(SHIFTS_S[best]), float(np.sqrt(max(surer, 0.0)))
-
-
-def _magnitudes(T: Array) -> tuple[Array, Array]:
-    """Ways (n,) m and angles (n,) rad of motions."""
-    return np.linalg.norm(T[:, :3, 3], axis=1), np.asarray(Rotation.from_matrix(T[:, :3, :3]).magnitude())
-
-
-def _late(sample: Sample, shift: float, surer: float) -> Finding:
-    word = "early" if shift > 0 else "late"
-    return red(
-        FIT,
-        f"the trajectory moves as the scans see {abs(shift):.1f} s {'later' if shift > 0 else 'earlier'}"
-        f" ({surer:.0f} standard deviations better)",
-        f"scan stamps are {abs(shift):.1f} s {word} against {_track(sample)}: another clock",
-        "correct the stamps of the scans, or set the time offset of the LiDAR",
-    )
-
-
-def _track(sample: Sample) -> str:
-    return "the given poses" if sample.log.given is not None else "the fixes"
+    return np.asarray(Rotation.from_rotvec(turns).as_matrix() - np.eye(3))

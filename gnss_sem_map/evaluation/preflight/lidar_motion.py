@@ -21,6 +21,8 @@ from gnss_sem_map.voxels.hash_unique import distinct
 from gnss_sem_map.voxels.kernels import pack_keys
 
 Array = NDArray[np.float64]
+WAY_STDDEV_M, TURN_STDDEV_RAD = 0.05, np.radians(0.15)
+"""How well a match knows the way and the turn of a second."""
 Keys = NDArray[np.int64]
 Rates = tuple[Array, Array]
 """Angular rate (3,) rad/s and velocity (3,) m/s."""

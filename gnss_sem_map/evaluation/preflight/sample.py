@@ -77,6 +77,11 @@ class Sample:
         return self._solution.trajectory
 
     @property
+    def track_from(self) -> str:
+        """What the trajectory was made from, in words."""
+        return "the fixes" if self.log.given is None else "the given poses"
+
+    @property
     def whole_solution(self) -> Solution | None:
         """The drive smoothed as a run smooths it first; None where only a stretch was, or what was corrected."""
         is_as_logged = self.diagnosis is None or self.diagnosis.is_right

@@ -9,8 +9,10 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NoReturn
 
 import pytest
@@ -177,20 +179,23 @@ def stopped(*_: object, **__: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
+def stop_of(run: Callable[[], object], module: ModuleType, name: str) -> KeyboardInterrupt:
+    """How a run ends that is stopped where it calls this function."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, name, stopped)
+        with pytest.raises(KeyboardInterrupt) as stopping:
+            run()
+    return stopping.value
+
+
 def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
     out, chunk = tmp_path / "out", tmp_path / ".out.work/drives/.a.work/0"
-    with monkeypatch.context() as patch:
-        patch.setattr(run_folder, "write_drive", stopped)
-        with pytest.raises(KeyboardInterrupt) as stopping:
-            mapped("ab", drives, out, how)
-    assert stopping.value.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
+    ended = stop_of(lambda: mapped("ab", drives, out, how), run_folder, "write_drive")
+    assert ended.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
     there = (chunk / "record.json").stat()
-    with monkeypatch.context() as patch:
-        patch.setattr(run_folder, "write_drive", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            mapped("ab", drives, out, replace(how, resume=True))
+    stop_of(lambda: mapped("ab", drives, out, replace(how, resume=True)), run_folder, "write_drive")
     assert os.path.samestat((chunk / "record.json").stat(), there), "the chunk is mapped again"
     mapped("ab", drives, out, replace(how, resume=True))
     assert_same(out, made["ab"])
@@ -213,15 +218,11 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, calls = shutil.copytree(made["ab"], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
-    with monkeypatch.context() as patch:
-        patch.setattr(many_drives, "write_drives", stopped)
-        with pytest.raises(KeyboardInterrupt) as removing:
-            remove_drive(out, "b")
-        assert [path.name for path in tmp_path.iterdir()] == ["out"]
-        with pytest.raises(KeyboardInterrupt) as adding:
-            add_drive(out, drives.by_name["c"], how)
-    assert not hasattr(removing.value, "__notes__"), "nothing resumes a removal"
-    assert adding.value.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
+    removing = stop_of(lambda: remove_drive(out, "b"), many_drives, "write_drives")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    adding = stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
+    assert not hasattr(removing, "__notes__"), "nothing resumes a removal"
+    assert adding.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
     calls.clear()
     assert products(out) == products(made["ab"])
     add_drive(out, drives.by_name["c"], replace(how, resume=True))
@@ -253,10 +254,7 @@ def test_what_is_damaged_of_an_interrupted_run_is_made_again(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, work = tmp_path / "out", tmp_path / ".out.work"
-    with monkeypatch.context() as patch:
-        patch.setattr(many_drives, "write_drives", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            mapped("ab", drives, out, how)
+    stop_of(lambda: mapped("ab", drives, out, how), many_drives, "write_drives")
     halved(work / "bound/a/condensed.npz")
     flipped(work / "bound/b/trajectory.npz")
     halved(work / "drives/a/run.json")

@@ -10,9 +10,9 @@ from contextlib import suppress
 
 from gnss_sem_map.machine import held_bytes
 
-M_ARENA_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -3, -1
-"""Of glibc's `mallopt`: the number of heaps, the size from which memory is not taken from a heap, and how much may be
-free at its end."""
+M_ARENA_MAX, M_MMAP_MAX, M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = -8, -4, -3, -1
+"""Of glibc's `mallopt`: the number of heaps, how many arrays may have memory that is not of a heap, the size from which
+they have it, and how much may be free at the end of a heap."""
 LARGE_BYTES, FREE_BYTES = 4 << 20, 64 << 20
 """Arrays of the first size, those of a tile, a chunk or a large scan, go back to the system when they are freed, and
 leave no holes: 30 MB less at the peak, at no cost in time. With 1 MB it costs 5 ms per scan. By default glibc raises
@@ -51,6 +51,17 @@ def use_huge_pages() -> None:
     demo's network takes a fifth less time per image on a CPU, with the same result.
     """
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+
+
+def reuse_memory() -> None:
+    """From now on, keep what large arrays have freed for others, until `release_memory`: for a network on a CPU.
+
+    The arrays of a layer would each get new pages from the system, which fills them with zeros first. A run of the demo
+    drive with its network takes 98 s in place of 120 s, and 1,047 MB in place of 994 MB.
+    """
+    with suppress(OSError, AttributeError):
+        for option, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 1 << 30)):
+            ctypes.CDLL(None).mallopt(option, value)
 
 
 def collect_seldom() -> None:

@@ -15,6 +15,7 @@ from torch.nn.functional import interpolate
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.memory import reuse_memory
 from gnss_sem_map.segmentation.classes import VOID
 from gnss_sem_map.segmentation.pixels import checked_pixels, scaled
 from gnss_sem_map.sensor_log import Image
@@ -48,6 +49,8 @@ class NetworkSegmenter:
         self._scale, self._shrink = scale, shrink
         # torch prepares every layer anew for each thread that uses a GPU, and a batch of each would fill its memory
         self._gpu_thread = None if device.type == "cpu" else ThreadPoolExecutor(1)
+        if self._gpu_thread is None:
+            reuse_memory()
 
     def __call__(self, image: Image) -> NDArray[np.float32]:
         """Class probabilities (h, w, c) of one image."""

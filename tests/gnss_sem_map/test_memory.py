@@ -1,9 +1,10 @@
-"""One heap for all threads, also of Arrow; a user's choice stands. What is freed goes back once it is much."""
+"""One heap for all threads, also of Arrow; a user's choice stands. Much freed memory goes back, or is kept."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import subprocess
 import sys
 
@@ -36,11 +37,46 @@ for count, always in ((32, False), (32, True), (160, False)):
     print((before - start) >> 20, (held_bytes() - start) >> 20)
 """
 
+LARGE_ARRAYS = """
+import resource
+from gnss_sem_map.machine import held_bytes
+from gnss_sem_map.memory import release_memory, reuse_memory, share_one_heap
+share_one_heap()
 
-@pytest.mark.integration
-@pytest.mark.skipif(
+def new_pages():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        bytearray(b"x") * (6 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+each_anew = new_pages()
+reuse_memory()
+new_pages()
+kept = new_pages()
+before = held_bytes()
+release_memory(always=True)
+print(each_anew, kept, (before - held_bytes()) >> 20)
+"""
+
+only_glibc = pytest.mark.skipif(
     not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="only glibc returns memory when asked"
 )
+
+
+@pytest.mark.integration
+@only_glibc
+def test_large_arrays_use_memory_again_until_it_is_released() -> None:
+    """Ten arrays of 6 MB, one after the other: pages that the system hands out, and MB that go back in the end."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    said = subprocess.check_output([sys.executable, "-c", LARGE_ARRAYS], text=True, env=environment)
+    each_anew, kept, returned = map(int, said.split())
+    assert each_anew >= 10 * (6 << 20) // resource.getpagesize()
+    assert kept <= 100
+    assert returned >= 3
+
+
+@pytest.mark.integration
+@only_glibc
 def test_freed_memory_between_other_objects_goes_back_once_it_is_much() -> None:
     """MB held before and after: little stays, unless all of it is to go back; much goes back."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}

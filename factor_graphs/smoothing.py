@@ -231,7 +231,9 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
     if rejected := np.count_nonzero(fit.squares > REJECTION):  # of others the problem's notes tell
-        yield f"{rejected} of {len(problem.used)} fixes rejected"
+        is_most = 2 * rejected > len(problem.used)
+        asked = ": do all come from one antenna, with its lever arm and their true standard deviations?"
+        yield f"{rejected} of {len(problem.used)} fixes rejected{asked if is_most else ''}"
     unfit = fit.relative_squares > RELATIVE_REJECTION
     if unfit.sum() > NOTABLE_REJECTION * len(unfit):
         yield f"{unfit.sum()} of {len(unfit)} relative poses rejected"

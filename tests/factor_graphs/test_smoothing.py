@@ -187,6 +187,21 @@ def test_fixes_kilometres_away_or_outside_the_imu_are_left_out_and_reported(simu
     assert error_of(s, drive).horizontal_rms_m < 0.6
 
 
+def test_fixes_of_two_antennas_are_doubted_and_those_of_one_are_not(simulate):
+    drive, rng = simulate(11, noise=ImuNoise()), np.random.default_rng(11)
+    one, other = (
+        simulate_gnss(drive.motion, drive.fixes.stamps, (0.02, 0.02, 0.04), LEVER + left, rng)
+        for left in (0.0, np.array([0.0, -1.0, 0.0]))
+    )
+    is_other = np.arange(len(one)) % 2 == 1
+    both = GnssFixes(one.stamps, np.where(is_other[:, None], other.positions, one.positions), one.stddevs)
+    told = [
+        any("one antenna" in note for note in smooth(drive.imu, fixes, FRAME, None, LEVER).notes)
+        for fixes in (both, one)
+    ]
+    assert told == [True, False]
+
+
 @pytest.mark.parametrize("m", [0, 1, 2])
 def test_fewer_than_three_fixes_are_refused(simulate, m):
     drive = simulate(10, seconds=20.0)

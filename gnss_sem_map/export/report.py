@@ -46,6 +46,7 @@ FILES = {
     "drives": "map, evidence, trajectory and report of each of several drives",
     "changes.geojson": "what changed between drives, as boxes in WGS 84, for web maps and QGIS",
     "changes.laz": "the voxels of what changed, as map.laz; user_data 1: appeared, 2: vanished",
+    "attributes": "when each voxel was last seen, and the intensity of its points, as Parquet tiles",
     "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
     "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
     "labels_raw": "the same before refinement",

@@ -62,6 +62,13 @@ def printed_by(
     return capsys.readouterr().out.splitlines()
 
 
+def test_the_report_tells_of_everything_that_lies_beside_it(finished: Run) -> None:
+    rows = rows_of((finished.folder / "report.html").read_text("utf-8"))
+    told = {re.sub("<.*?>", "", name).rstrip("/") for name in rows}
+    there = {path.name for path in finished.folder.iterdir() if not path.name.startswith(".")}
+    assert there - told == {"report.html"}
+
+
 def test_notebooks_say_the_same_figures_as_the_report(
     finished: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -30,16 +30,21 @@ LEAST_WAY_M, SIGNIFICANT = 0.5, 3.0
 PART_SHARE, PART_MARGIN_M = 0.8, 0.5
 """A part of something larger is within its outline in so large a share of the scans, and no farther before or behind
 its middle than half of its length and so much."""
+SHORTEST_M = 2.5
+"""Length of the shortest car: no second one is nearer than this in its lane."""
 GROUND_PLACES = 9
 """The ground under a place is the median of so many."""
 LEAST_LABELLED = 0.2
 """With this share of its points labelled, an object is what its labels say; with less, what its shape says."""
+VEHICLE, UNKNOWN = "vehicle", "unknown"
 SHAPES = (
     ("person", 0.0, 1.2, 1.2, 0.8, 2.3),
     ("cyclist", 1.2, 2.3, 1.2, 0.8, 2.3),
-    ("vehicle", 2.3, 14.0, 3.2, 0.6, 4.5),
+    (VEHICLE, 2.3, 14.0, 3.2, 0.6, 4.5),
 )
 """Classes by shape: least and greatest length, greatest width, least and greatest height, m."""
+FASTEST_WALK_MPS, WIDEST_RIDER_M = 2.5, 1.2
+"""What drives and is wider than this is a vehicle, of which only the front or the rear is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,16 +128,13 @@ def movers_of(objects: Sequence[TrackedObject], movable: Sequence[str]) -> tuple
 
 def _without_parts(movers: Sequence[Mover]) -> list[Mover]:
     """The movers that are no parts of others."""
-    starts, ends, points, sizes = (
-        np.array([(one.stamps[0], one.stamps[-1], one.points, max(one.size_m[:2])) for one in movers])
-        .reshape(-1, 4)
-        .T
+    starts, ends, points = (
+        np.array([(one.stamps[0], one.stamps[-1], one.points) for one in movers]).reshape(-1, 3).T
     )
+    is_large = np.array([one.name == VEHICLE or max(one.size_m[:2]) > SMALL_M for one in movers], np.bool_)
 
     def is_part(one: Mover) -> bool:
-        may_hold = (
-            (starts < one.stamps[-1]) & (ends > one.stamps[0]) & (points > one.points) & (sizes > SMALL_M)
-        )
+        may_hold = (starts < one.stamps[-1]) & (ends > one.stamps[0]) & (points > one.points) & is_large
         return any(_holds(movers[n], one) for n in np.flatnonzero(may_hold).tolist())
 
     return [one for one in movers if not is_part(one)]
@@ -145,8 +147,11 @@ def _holds(whole: Mover, part: Mover) -> bool:
     east, north = courses(places)[np.searchsorted(whole.stamps, at).clip(max=len(places) - 1)].T
     along, across = abs(east * off[:, 0] + north * off[:, 1]), abs(east * off[:, 1] - north * off[:, 0])
     length, width, _ = whole.size_m
+    reach_m = length / 2 + PART_MARGIN_M
+    if whole.name == VEHICLE and part.name in (VEHICLE, UNKNOWN):
+        reach_m = max(reach_m, SHORTEST_M)
     inside = (at >= whole.stamps[0]) & (at <= whole.stamps[-1])
-    inside &= (along <= length / 2 + PART_MARGIN_M) & (across <= width / 2)
+    inside &= (along <= reach_m) & (across <= width / 2)
     return bool(inside.mean() >= PART_SHARE)
 
 
@@ -201,9 +206,11 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
     length, width, height = (max(sizes) for sizes in zip(*(t.size_m for t in tracks), strict=True))
     size = length, width, height
     is_labelled = labelled >= LEAST_LABELLED and len(movable) == 1
+    track = smooth(stamps, positions[:, :2], variances)
+    speed_mps = float(np.median(np.linalg.norm(track.velocities, axis=1)))
     return Mover(
         lidars=tuple(sorted({one.lidar for one in objects})),
-        name=movable[0] if is_labelled else class_by_shape(size),
+        name=movable[0] if is_labelled else class_by_shape(size, speed_mps),
         is_labelled=is_labelled,
         labelled=labelled,
         motion=main.motion,
@@ -214,13 +221,15 @@ def _mover(objects: Sequence[TrackedObject], movable: Sequence[str]) -> Mover:
         stamps=stamps,
         # reflected: "nearest" repeats the first place, which then is its own median
         heights=np.asarray(median_filter(positions[:, 2], GROUND_PLACES, mode="reflect")),
-        track=smooth(stamps, positions[:, :2], variances),
+        track=track,
     )
 
 
-def class_by_shape(size_m: tuple[float, ...]) -> str:
-    """What an object of this length, width and height is, m."""
+def class_by_shape(size_m: tuple[float, ...], speed_mps: float) -> str:
+    """What an object of this length, width and height, m, is at this speed."""
     length, width, height = size_m
+    if width >= WIDEST_RIDER_M and speed_mps > FASTEST_WALK_MPS:
+        length = max(length, SHORTEST_M)
     for name, shortest, longest, widest, lowest, highest in SHAPES:
         if (
             shortest <= max(length, width) < longest
@@ -228,4 +237,4 @@ def class_by_shape(size_m: tuple[float, ...]) -> str:
             and lowest <= height < highest
         ):
             return name
-    return "unknown"
+    return UNKNOWN

@@ -155,6 +155,26 @@ def test_a_part_of_a_car_that_was_a_segment_of_its_own_is_no_object(chunk) -> No
     assert count(small(0.0, WIDTH)) == 2
 
 
+@pytest.mark.parametrize(
+    ("behind_m", "size_m", "count"),
+    [
+        (2.0, (0.4, 1.9, 1.1), 1),
+        (2.0, (0.2, 1.9, 0.3), 1),
+        (3.0, (0.4, 1.9, 1.1), 2),
+        (2.0, (1.7, 0.6, 1.8), 2),
+    ],
+    ids=["another part of the lorry", "a flat part", "the next car", "a cyclist"],
+)
+def test_what_follows_a_lorry_closer_than_a_car_could_is_a_part_of_it(behind_m, size_m, count) -> None:
+    """Of the lorry, its rear alone is seen."""
+    car = track_of(segments(lambda t: (SPEED * t, 9.0), straight, still))
+    lorry = replace(car, size_m=(0.3, 2.2, 2.4), points=car.points + 100, labelled=0.0)
+    other = replace(car, size_m=size_m, positions=car.positions - (behind_m, 0.0, 0.0), labelled=0.0)
+    movers = movers_of([tracked(lorry), tracked(other)], ("vehicle",))
+    assert len(movers) == count
+    assert movers[-1].name == "vehicle"
+
+
 def test_two_lidars_that_see_one_car_list_it_once() -> None:
     left = track_of(segments(passing, straight, still))
     right = track_of(segments(passing, straight, lambda t: (1.0, 9.0)))
@@ -175,12 +195,13 @@ def test_two_cars_of_one_chunk_stay_two_and_so_do_those_of_two_chunks_behind_eac
 
 
 @pytest.mark.parametrize(
-    ("size_m", "name"),
-    [((4.5, 1.8, 1.5), "vehicle"), ((0.5, 0.7, 1.75), "person"), ((1.7, 0.6, 1.8), "cyclist"),
-     ((9.0, 2.5, 3.2), "vehicle"), ((2.0, 3.0, 0.4), "unknown")],
+    ("size_m", "speed_mps", "name"),
+    [((4.5, 1.8, 1.5), 0.0, "vehicle"), ((0.5, 0.7, 1.75), 1.4, "person"), ((1.7, 0.6, 1.8), 6.0, "cyclist"),
+     ((9.0, 2.5, 3.2), 9.0, "vehicle"), ((2.0, 3.0, 0.4), 0.0, "unknown"), ((0.3, 1.8, 1.2), 9.0, "vehicle"),
+     ((1.1, 2.2, 2.4), 9.0, "vehicle"), ((0.3, 1.8, 0.3), 9.0, "unknown"), ((0.5, 1.4, 1.8), 1.2, "cyclist")],
 )  # fmt: skip
-def test_class_by_shape(size_m, name) -> None:
-    assert class_by_shape(size_m) == name
+def test_class_by_shape(size_m, speed_mps, name) -> None:
+    assert class_by_shape(size_m, speed_mps) == name
 
 
 def test_labels_tell_the_class_only_where_one_class_moves() -> None:

@@ -141,7 +141,10 @@ def _without_parts(movers: Sequence[Mover]) -> list[Mover]:
 
 
 def _holds(whole: Mover, part: Mover) -> bool:
-    """Whether the middle of a part is within the outline of the whole in most scans of the part."""
+    """Whether the middle of a part is within the outline of the whole in most scans of the part.
+
+    Of a vehicle the outline may be that of one end, so what is nearer in its lane than a car could be is a part, too.
+    """
     at, places = part.stamps, whole.track.positions
     off = part.track.positions - np.column_stack([np.interp(at, whole.stamps, axis) for axis in places.T])
     east, north = courses(places)[np.searchsorted(whole.stamps, at).clip(max=len(places) - 1)].T

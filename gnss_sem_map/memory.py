@@ -57,8 +57,8 @@ def reuse_memory() -> None:
     """From now on, keep what large arrays have freed for others, until `release_memory`: for a network on a CPU.
 
     The arrays of a layer would each get new pages from the system, which fills them with zeros first. A run of the demo
-    drive with its network takes 98 s in place of 120 s, and 1,047 MB in place of 994 MB. Only where they go back by
-    `share_one_heap`: other programs, and what a user has chosen, stay as they are.
+    drive with its network takes 98 s in place of 120 s, and 1,060 to 1,100 MB in place of 994 MB. Only where they go
+    back by `share_one_heap`: other programs, and what a user has chosen, stay as they are.
     """
     if os.environ.get("MALLOC_MMAP_THRESHOLD_") != f"{LARGE_BYTES}":
         return

@@ -13,10 +13,10 @@ import numpy as np
 from gnss_sem_map.evaluation.metrics import LOOKS
 from gnss_sem_map.export.charts import Chart, Curve, chart
 from gnss_sem_map.export.dates import date_of
-from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.export.movers import read_movers
 from gnss_sem_map.export.overview import NO_LABEL, Overview, coverage_pixels, label_pixels, overview_of
 from gnss_sem_map.export.page import page, percent, png
+from gnss_sem_map.export.run_files import listed
 from gnss_sem_map.export.track import Track, read_track
 from gnss_sem_map.export.verdict import verdict_of
 from gnss_sem_map.files.ownership import amend
@@ -27,36 +27,6 @@ PICTURES = {
     "perspective.png": "The map, every voxel a cube, seen from behind and above the vehicle.",
     "topview.png": "The map from above, north up.",
     "trajectory.png": "The trajectory and its GNSS fixes.",
-}
-FILES = {
-    **{each.file: each.what for each in FORMATS},
-    "viewer": "the finer voxels of viewer.html, where the map is too large for one page",
-    "trajectory.png": PICTURES["trajectory.png"],
-    "trajectory.parquet": "poses of the IMU in the map, velocities and covariances",
-    "trajectory_alone.parquet": "the same before places that were passed again bound them",
-    "trajectory.tum": "the poses as stamp, position and quaternion, for evo",
-    "trajectory_covariance.tum": "the same with the covariance of every pose, for smfeval",
-    "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
-    "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
-    "trajectory_wgs84.parquet": "the track in WGS 84 with time, speed and standard deviations, as GeoParquet",
-    "objects.parquet": "what moved: a row per object with its track, size, speed and evidence, as GeoParquet",
-    "objects.geojson": "the same in WGS 84, for web maps and QGIS",
-    "map": "the map before refinement, with all evidence, as Parquet tiles",
-    "refined": "the refined map as Parquet tiles",
-    "drives": "map, evidence, trajectory and report of each of several drives",
-    "changes.geojson": "what changed between drives, as boxes in WGS 84, for web maps and QGIS",
-    "changes.laz": "the voxels of what changed, as map.laz; user_data 1: appeared, 2: vanished",
-    "attributes": "when each voxel was last seen, and the intensity of its points, as Parquet tiles",
-    "evidence": "what else the run knows, so that `gnss-sem-map refine` needs no scans",
-    "labels": "the class of every LiDAR point, SemanticKITTI raw ids, one file per scan",
-    "labels_raw": "the same before refinement",
-    "confidence": "the probability of each of these labels, float16",
-    "looks": "the LiDAR points of the voxel of each of these points, at most 255, uint8",
-    "removed": "1 for every LiDAR point on a moving vehicle that was taken out of the map",
-    "config.yaml": "all settings of this run",
-    "calibration.yaml": "the confusion model of the segmentation network that the settings name",
-    "run.json": "the content of this page about the run, machine-readable",
-    "metrics.json": "the content of this page about the evaluation, machine-readable",
 }
 MANY_SKIPS = 200
 """Number of skips on the page; run.json lists all."""
@@ -102,7 +72,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "trajectory_scores": _with_percentages(metrics.get("trajectory", {})),
         "findings": run.get("preflight", {}).get("findings", ()),
         "counts": run.get("counts", {}),
-        "files": list(_files(folder)),
+        "files": list(listed(folder)),
         "settings": read_text(folder / "config.yaml") if is_file(folder / "config.yaml") else "",
         "versions": run.get("versions", {}),
     }  # fmt: skip
@@ -370,18 +340,6 @@ def _stages(run: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "stages": [(stage, value, memory_mb.get(stage), value / longest) for stage, value in seconds.items()]
     }
-
-
-def _files(folder: Path) -> Iterator[tuple[str, str, str]]:
-    for name, what in FILES.items():
-        if (folder / name).exists():
-            yield name, _size(folder / name), what
-
-
-def _size(path: Path) -> str:
-    if path.is_dir():
-        return f"{sum(1 for _ in path.iterdir()):,} files"
-    return f"{path.stat().st_size / 1e3:,.1f} kB"
 
 
 def _with_percentages(scores: Mapping[str, Any]) -> dict[str, Any]:

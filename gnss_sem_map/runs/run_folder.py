@@ -22,7 +22,8 @@ from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.georeference import Georeference, check_delivery
 from gnss_sem_map.export.movers import DriveOfMovers, write_movers
-from gnss_sem_map.export.report import FILES, write_report
+from gnss_sem_map.export.report import write_report
+from gnss_sem_map.export.run_files import FILES
 from gnss_sem_map.export.trajectories import (
     write_covariance_tum,
     write_geojson,

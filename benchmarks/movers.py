@@ -5,7 +5,8 @@
 prints the figures and writes them into benchmarks/results/movers.json; drives that were not asked for stay as they are
 there. Poses are those that a run finds, labels the true class images. A mover is scored at every place of its track:
 its speed against that of the true object whose middle is nearest, at most NEAR_M away. `within` is the share of speeds
-within two standard deviations of the truth.
+within two standard deviations of the truth, `places_within_90` that of places within the ellipses that should hold
+90 %, both relative to the LiDAR: where the drive's own trajectory is off, objects are off with it.
 """
 
 from __future__ import annotations
@@ -22,11 +23,16 @@ from numpy.typing import NDArray
 from refinement import mapped, perfectly_seen, what_they_do
 from results_file import keep
 from scipy.interpolate import CubicSpline
+from scipy.stats import chi2
 
+from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.dynamics.movers import Mover, movers_of
+from gnss_sem_map.evaluation.score_run import read_tum
 
 RESULTS = Path(__file__).parent / "results" / "movers.json"
 NEAR_M = 3.0
+HOLDS_90 = float(chi2.ppf(0.9, 2))
+"""Squared distance, in standard deviations, to the edge of an ellipse that holds 90 %."""
 CLASSES = {"person": "person", "cyclist": "cyclist"}
 """Class of a model; all others are vehicles."""
 Array = NDArray[np.float64]
@@ -54,7 +60,8 @@ def main() -> None:
         if options.without_labels:
             drive = replace(drive, segmenter=None)
         objects = [one for chunk in mapped(drive) for one in chunk.objects]
-        figures = scored(movers_of(objects, ("vehicle",)), true_objects(folder))
+        ways = drive.trajectory, read_tum(folder / "truth" / "trajectory.tum")
+        figures = scored(movers_of(objects, ("vehicle",)), true_objects(folder), *ways)
         name = f"{folder.name}{', without labels' if options.without_labels else ''}"
         print(json.dumps({name: figures}, indent=1), flush=True)
         keep(RESULTS, {name: figures})
@@ -77,9 +84,11 @@ def true_objects(folder: Path) -> list[TrueObject]:
     return found
 
 
-def scored(movers: tuple[Mover, ...], truth: list[TrueObject]) -> dict[str, Any]:
+def scored(
+    movers: tuple[Mover, ...], truth: list[TrueObject], found_way: Trajectory, true_way: Trajectory
+) -> dict[str, Any]:
     """Figures of all movers, and of every case."""
-    off, within, means, by_case, right, unknown = [], [], [], {}, [], 0
+    off, within, inside, means, by_case, right, unknown = [], [], [], [], {}, [], 0
     for mover in movers:
         one = nearest(mover, truth)
         if one is None:
@@ -89,6 +98,8 @@ def scored(movers: tuple[Mover, ...], truth: list[TrueObject]) -> dict[str, Any]
         errors = mover.speeds - true
         off.append(errors)
         within.append(np.abs(errors) < 2 * mover.speed_stddevs)
+        places = placed(mover, found_way, true_way) - one.places(mover.stamps)
+        inside.append(((places / mover.position_stddevs) ** 2).sum(axis=1) < HOLDS_90)
         way = np.linalg.norm(np.diff(one.places(mover.stamps), axis=0), axis=1).sum()
         speed, stddev = mover.mean_speed
         means.append((speed - way / (mover.stamps[-1] - mover.stamps[0]), stddev))
@@ -102,6 +113,7 @@ def scored(movers: tuple[Mover, ...], truth: list[TrueObject]) -> dict[str, Any]
         "speed_rms_mps": rms(errors),
         "speed_median_error_mps": round(float(np.median(np.abs(errors))), 3),
         "within": round(float(np.concatenate(within).mean()), 3),
+        "places_within_90": round(float(np.concatenate(inside).mean()), 3),
         "mean_speed_rms_mps": rms(of_means),
         "mean_speed_within": round(float((np.abs(of_means) < 2 * stddevs).mean()), 3),
         "class_right": round(float(np.mean(right)), 3),
@@ -110,6 +122,13 @@ def scored(movers: tuple[Mover, ...], truth: list[TrueObject]) -> dict[str, Any]
             for case, some in sorted(by_case.items())
         },
     }
+
+
+def placed(mover: Mover, found_way: Trajectory, true_way: Trajectory) -> Array:
+    """Places (k, 2) m of a mover, had the drive been where it truly was."""
+    p_map = np.column_stack([mover.positions, np.ones(len(mover.stamps))])
+    p_imu = np.linalg.solve(found_way.at(mover.stamps), p_map[:, :, None])
+    return np.asarray((true_way.at(mover.stamps) @ p_imu)[:, :2, 0])
 
 
 def nearest(mover: Mover, truth: list[TrueObject]) -> TrueObject | None:

@@ -17,7 +17,7 @@ from scipy.ndimage import median_filter
 from factor_graphs.sessions import components
 from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
-from gnss_sem_map.dynamics.object_track import SMALL_M, ObjectTrack, courses
+from gnss_sem_map.dynamics.object_track import CAR_M, LORRY_M, SMALL_M, ObjectTrack, courses
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ PART_SHARE, PART_MARGIN_M = 0.8, 0.5
 its middle than half of its length and so much."""
 SHORTEST_M = 2.5
 """Length of the shortest car: no second one is nearer than this in its lane."""
+OUTLINE_STDDEV_M, OUTLINE_STDDEV_RATIO = 0.1, 0.05
+"""The middle of an object is known to this, plus this share of its size: no scan shows all its sides, and it turns."""
+HIGHEST_CAR_M = 2.0
+"""A higher vehicle, of which an end is seen, may be as long as a lorry."""
 GROUND_PLACES = 9
 """The ground under a place is the median of so many."""
 LEAST_LABELLED = 0.2
@@ -76,6 +80,19 @@ class Mover:
     def positions(self) -> Array:
         """(k, 3) m: the middle of its footprint."""
         return np.column_stack([self.track.positions, self.heights])
+
+    @property
+    def position_stddevs(self) -> Array:
+        """(k, 2) m of east and north, of the middle of the whole object, relative to the trajectory of the drive.
+
+        To the scatter of the track comes what all its scans have in common: the sides that none of them shows.
+        """
+        length, width, height = self.size_m
+        possible = LORRY_M if height > HIGHEST_CAR_M else CAR_M
+        unseen = max(possible - length, 0.0) / 2 if self.name in (VEHICLE, UNKNOWN) else 0.0
+        outline = OUTLINE_STDDEV_M**2 + (OUTLINE_STDDEV_RATIO * max(length, width)) ** 2
+        ahead = courses(self.track.positions)
+        return np.asarray(np.sqrt(self.track.position_variances + outline + (unseen * ahead) ** 2))
 
     @property
     def went_somewhere(self) -> bool:

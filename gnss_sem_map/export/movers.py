@@ -123,7 +123,7 @@ def _row(number: int, mover: Mover, drive: DriveOfMovers) -> dict[str, Any]:
 
 def _track(mover: Mover) -> list[dict[str, float]]:
     values = np.column_stack([
-        mover.stamps.round(6), mover.positions.round(DIGITS), np.sqrt(mover.track.position_variances).round(DIGITS),
+        mover.stamps.round(6), mover.positions.round(DIGITS), mover.position_stddevs.round(DIGITS),
         mover.speeds.round(DIGITS), mover.speed_stddevs.round(DIGITS), mover.headings_deg.round(1),
     ])  # fmt: skip
     return [dict(zip(TRACK, row, strict=True)) for row in values.tolist()]

@@ -82,6 +82,22 @@ def test_a_car_that_passes_has_its_own_speed_not_that_of_its_visible_part() -> N
     np.testing.assert_allclose(mover.size_m, (LENGTH, WIDTH, HEIGHT), atol=0.2)
 
 
+def test_of_a_car_whose_rear_alone_is_seen_the_middle_is_hardly_known_along_its_way() -> None:
+    def ahead(t):
+        return 15.0 + SPEED * t, 0.0
+
+    mover = only(track_of(segments(ahead, straight, lambda t: (SPEED * t, 0.0))))
+    off = np.abs(mover.positions[:, :2] - [ahead(t) for t in mover.stamps])
+    assert (off[:, 0] > LENGTH / 2 - 0.3).all()
+    assert (off < 2 * mover.position_stddevs).all()
+    assert mover.position_stddevs[:, 1].max() < 0.3  # across it, both edges are seen
+    whole = only(track_of(segments(passing, straight, still)))
+    assert whole.position_stddevs.max() < 0.5
+    np.testing.assert_allclose(
+        mover.speed_stddevs.max(), 0.0, atol=0.5
+    )  # what is alike in all scans moves nothing
+
+
 def test_a_curve_is_followed() -> None:
     def place(t):
         return 15 * np.sin(t / 2.5), 20 - 15 * np.cos(t / 2.5)

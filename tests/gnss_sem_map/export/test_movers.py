@@ -83,7 +83,8 @@ def test_the_track_is_that_of_the_mover(mover, karlsruhe, tmp_path) -> None:
     )
     np.testing.assert_allclose(found["speed_mps"], mover.speeds, atol=1e-3)
     np.testing.assert_allclose(found["speed_stddev_mps"], mover.speed_stddevs, atol=1e-3)
-    np.testing.assert_allclose(found["stddev_east_m"] ** 2, mover.track.position_variances[:, 0], atol=1e-4)
+    stddevs = np.column_stack([found["stddev_east_m"], found["stddev_north_m"]])
+    np.testing.assert_allclose(stddevs, mover.position_stddevs, atol=1e-3)
 
 
 def test_the_geojson_says_the_same(mover, karlsruhe, tmp_path) -> None:

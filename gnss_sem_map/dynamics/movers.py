@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from factor_graphs.sessions import components
-from gnss_sem_map.dynamics.constant_velocity import SmoothedTrack, smooth
+from gnss_sem_map.dynamics.constant_acceleration import SmoothedTrack, smooth
 from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
 from gnss_sem_map.dynamics.object_track import CAR_M, LORRY_M, SMALL_M, ObjectTrack, courses
 

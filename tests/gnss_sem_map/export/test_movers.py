@@ -10,7 +10,7 @@ import pytest
 from pyproj import Transformer
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.dynamics.constant_velocity import smooth
+from gnss_sem_map.dynamics.constant_acceleration import smooth
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.movers import DriveOfMovers, join_movers, read_movers, write_movers

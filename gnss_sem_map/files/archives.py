@@ -16,7 +16,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import MOST_BYTES, open_file, shown
 
 MOST_MEMBERS = 100
@@ -156,5 +156,5 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]
 
 
 def _damaged(path: Path, error: Exception) -> DataError:
-    why = " ".join(str(error).split())[:200] or type(error).__name__
+    why = one_line(error)
     return DataError(f"{shown(path)}: damaged file, or no .npz of plain arrays ({why})")

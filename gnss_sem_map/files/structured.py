@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.errors import DataError, SemMapError, one_line
 from gnss_sem_map.files.untrusted import read_text, shown
 
 MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 20_000
@@ -106,7 +106,7 @@ def parse_yaml(text: str) -> Any:
         finally:
             loader.dispose()
     except (yaml.YAMLError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(" ".join(str(error).split())[:200] or type(error).__name__) from None
+        raise ValueError(one_line(error)) from None
 
 
 def read_yaml(path: Path, error: type[SemMapError] = DataError) -> Any:
@@ -127,7 +127,7 @@ def read_json(path: Path, error: type[SemMapError] = DataError) -> dict[str, Any
     except RecursionError:
         raise error(f"{shown(path)}: damaged (nested too deep)") from None
     except ValueError as problem:
-        raise error(f"{shown(path)}: damaged ({' '.join(str(problem).split())[:200]})") from None
+        raise error(f"{shown(path)}: damaged ({one_line(problem)})") from None
     if not isinstance(content, dict):
         raise error(f"{shown(path)}: damaged (found {type(content).__name__}, expected a mapping)")
     return content

@@ -226,9 +226,8 @@ def _images(
 ) -> tuple[tuple[Image, ...], list[Skip]]:
     images: list[Image] = []
     skips: list[Skip] = []
-    for about, camera in zip(
-        rig.cameras.values(), cameras, strict=False
-    ):  # without a LiDAR there is no camera
+    # without a LiDAR there is no camera
+    for about, camera in zip(rig.cameras.values(), cameras, strict=False):
         messages = bag.messages(about.topic)
         said, believed, lost = stamps_of(bag, messages, about.stamps)
         of_camera = [

@@ -186,9 +186,8 @@ def _task_tokens(model: str, config: Any) -> Tensor:
         [TASK], padding="max_length", max_length=config.task_seq_len, truncation=True, return_tensors="pt"
     )
     masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
-    if len(masked.unique()) < len(
-        TASK.split()
-    ):  # without its vocabulary a tokenizer gives every word the same token
+    # without its vocabulary a tokenizer gives every word the same token
+    if len(masked.unique()) < len(TASK.split()):
         raise DataError(
             f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json and merges.txt are missing"
         )

@@ -25,17 +25,16 @@ from scipy.spatial import cKDTree
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
-from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.sessions import components
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, failure_of, path_of, run_tasks
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
@@ -132,7 +131,7 @@ def _located(
 ) -> dict[str, str]:
     """Locate drives as tasks; name -> reason of failure, empty for those that could be."""
     origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
-    function = f"{locate_one.__module__}:{locate_one.__name__}"
+    function = path_of(locate_one)
     tasks = [
         Task(source.name, function, (asdict(source), str(work), str(settings_file), origin))
         for source in sources
@@ -146,13 +145,9 @@ def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequ
 
     What was matched stays in the work folder of the drive, where its mapping finds it.
     """
-    try:
-        _locate_one(Source(**source), Path(work), config.load(Path(settings)), LocalFrame(*origin))
-    except (SemMapError, FactorGraphError) as error:
-        return str(error) or "failed"
-    except OSError as error:
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
-    return ""
+    return failure_of(
+        lambda: _locate_one(Source(**source), Path(work), config.load(Path(settings)), LocalFrame(*origin))
+    )
 
 
 def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFrame) -> None:

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
@@ -23,7 +22,7 @@ from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, failure_of, path_of, run_tasks
 from gnss_sem_map.run_stats import Progress
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
@@ -54,7 +53,7 @@ def map_all(
             force,
             str(bound.corrections.get(source.name, "")),
         )
-        tasks.append(Task(source.name, f"{map_one.__module__}:{map_one.__name__}", arguments))
+        tasks.append(Task(source.name, path_of(map_one), arguments))
     found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
     return {task.name: reason.removeprefix(f"{task.name}: ") for task, reason in found if reason}
 
@@ -68,8 +67,8 @@ def map_one(
     correction: str,
 ) -> str:
     """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
-    try:
-        _map_one(
+    return failure_of(
+        lambda: _map_one(
             Source(**source),
             Path(folder),
             config.load(Path(settings)),
@@ -77,11 +76,7 @@ def map_one(
             force,
             correction,
         )
-    except (SemMapError, FactorGraphError) as error:
-        return str(error)
-    except OSError as error:
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
-    return ""
+    )
 
 
 def _map_one(

@@ -27,7 +27,7 @@ from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
@@ -83,7 +83,7 @@ class SavedMatches:
                 yield n
             return
         write_job(folder, self.source, settings, trajectory, fingerprint)
-        function = f"{match_one.__module__}:{match_one.__name__}"
+        function = path_of(match_one)
         tasks = [
             Task(f"{log.name}, section {n} of its scans", function, (str(folder), fingerprint, n))
             for n in pending

@@ -15,7 +15,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from factor_graphs.sessions import components
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.archives import npz_of
 from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
@@ -200,7 +201,7 @@ def _bound(
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:
             files[name] = work / BOUND / name / CORRECTION
-            write_whole(files[name], _as_bytes(correction))
+            write_whole(files[name], npz_of(correction))
     return BoundDrives(files, together.passes, together.warnings)
 
 
@@ -208,12 +209,6 @@ def _read(folder: Path) -> LocatedDrive:
     _, source, _, log, trajectory = read_job(folder)
     condensed = CondensedDrive.from_bytes(read_bytes(folder / CONDENSED))
     return LocatedDrive(source.name, log, trajectory, condensed.at(trajectory))
-
-
-def _as_bytes(correction: Correction) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, **{part.name: getattr(correction, part.name) for part in fields(Correction)})
-    return file.getvalue()
 
 
 def read_correction(file: str) -> tuple[Correction | None, str]:

@@ -31,7 +31,7 @@ from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import npz_of
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
 from gnss_sem_map.mapping import fingerprints

@@ -17,7 +17,7 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import npz_of
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.work_folder import JOB, TRAJECTORY, writing_to
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog

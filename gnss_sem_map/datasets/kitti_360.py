@@ -30,7 +30,7 @@ from gnss_sem_map.datasets import frames, kitti_calibration, kitti_raw
 from gnss_sem_map.datasets.kitti_odometry import read_table
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.structured import MOST_YAML_BYTES, parse_yaml
+from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
@@ -221,11 +221,7 @@ def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
         coefficients = (bent.k1, bent.k2, bent.p1, bent.p2)
         lens = Distortion(model="mei", coefficients=coefficients, xi=about.mirror_parameters.xi)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise DataError(
-            f"{shown(file)}: {place[:100]}: {first['msg'][:200]}; expected the model of Mei"
-        ) from None
+        raise DataError(f"{shown(file)}: {fault_of(error)}; expected the model of Mei") from None
     except ValueError as error:
         raise DataError(f"{shown(file)}: not YAML ({error})") from None
     K = np.array([[projected.gamma1, 0, projected.u0], [0, projected.gamma2, projected.v0], [0, 0, 1.0]])

@@ -11,12 +11,15 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from gnss_sem_map.errors import DataError, SemMapError, one_line
 from gnss_sem_map.files.untrusted import read_text, shown
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 20_000
 MOST_JSON_BYTES = 64 << 20
@@ -131,6 +134,13 @@ def read_json(path: Path, error: type[SemMapError] = DataError) -> dict[str, Any
     if not isinstance(content, dict):
         raise error(f"{shown(path)}: damaged (found {type(content).__name__}, expected a mapping)")
     return content
+
+
+def fault_of(error: ValidationError) -> str:
+    """The first fault that pydantic found in the content of a file: its place, and what is wrong, in one line."""
+    first = error.errors()[0]
+    place = " ".join(".".join(map(str, first["loc"])).split())
+    return f"{place[:100]}: {first['msg'][:200]}"
 
 
 def not_finite(content: Any, place: str = "") -> str | None:

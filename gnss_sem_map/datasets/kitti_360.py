@@ -154,17 +154,10 @@ def _images(
     skips: list[Skip] = []
     for name, camera in zip(names, calibration.cameras, strict=True):
         found = frames.numbered("image", folder / name / IMAGES[name], *frames.IMAGE_SUFFIXES)
-        stamps_ns, lost = kitti_raw.stamps_ns(folder / name / "timestamps.txt")
-        lost += found.skips + frames.missing("image", folder / name, stamps_ns, found.files)
-        of_camera = []
-        for number, path in found.files.items():
-            if number in stamps_ns:
-                stamp = (stamps_ns[number] - epoch_ns) * 1e-9
-                read_it = partial(frames.read_image, path, camera.image_size)
-                of_camera.append(Image(number, stamp, read_it, camera.name))
-            else:
-                lost.append(Skip("image", shown(path), "no stamp for this frame"))
-        images += in_order("image", of_camera, lost)
+        of_camera, lost = kitti_raw.stamped_images(
+            found, folder / name, epoch_ns, camera.image_size, camera.name
+        )
+        images += of_camera
         skips += lost
     return tuple(sorted(images, key=lambda image: image.stamp)), skips
 

@@ -22,8 +22,8 @@ from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
 from factor_graphs.variance import BiasSteps, imu_noise_shown
-from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe, with_mounting
-from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors, with_calibration
+from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe
+from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors
 
 Array = NDArray[np.float64]
 
@@ -203,11 +203,16 @@ def _quiet(problem: Problem) -> NDArray[np.bool_]:
 
 def _with_shared(problem: Problem, fit: Fit, axle: Vehicle | None, rolling: Wheels | None) -> Fit:
     """The same solution with what all keyframes share among its values."""
+    k, values, shared = len(problem.intervals.keyframes), gtsam.Values(fit.values), {}
     if axle is not None:
-        fit = with_mounting(problem, fit, axle.mounting)
+        shared[M(k)] = axle.mounting
     if rolling is not None:
-        fit = with_calibration(problem, fit, rolling.calibration)
-    return fit
+        shared[W(k)] = rolling.calibration
+    for key, value in shared.items():
+        if values.exists(key):
+            values.erase(key)
+        values.insert(key, value)
+    return replace(fit, values=values)
 
 
 def _constraints(

@@ -155,7 +155,7 @@ class _System:
         return _State(x, self._poses(x), factors, scale)
 
     def residuals(self, pairs: AnchorPairs, poses: Sequence[Array]) -> tuple[sparse.csr_array, Array]:
-        """Whitened residuals of the pairs (p, 6), and their derivatives."""
+        """Jacobian of the whitened residuals of the pairs by the corrections, (6 p, c), and these residuals, (p, 6)."""
         r, rows, columns, values = np.empty((len(pairs), 6)), [], [], []
         for n, (of_drives, of_anchors) in enumerate(zip(pairs.drives, pairs.anchors, strict=True)):
             (a, b), (i, j) = of_drives.tolist(), of_anchors.tolist()

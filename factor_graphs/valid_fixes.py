@@ -21,9 +21,8 @@ def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
     """
     lat, lon, alt = geodetic.T
-    is_place = np.isfinite(geodetic).all(axis=1) & ~(
-        (lat == 0) & (lon == 0)
-    )  # what receivers write without a fix
+    is_unknown = (lat == 0) & (lon == 0)  # what receivers write without a fix
+    is_place = np.isfinite(geodetic).all(axis=1) & ~is_unknown
     is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360)
     is_high = is_place & ~(np.abs(alt) <= LARGEST_ALT_M)
     is_place &= ~is_high

@@ -6,11 +6,9 @@ l is how far the IMU sits ahead of the axle, and c the angle at which tyres roll
 Going backwards changes the sign of v_x and nothing else.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.graph import from_values
@@ -64,14 +62,14 @@ class BodyMotion:
         return rows
 
     def by_velocity(self, mounting: Array) -> Array:
-        """How `sliding` changes with the velocity in the imu's axes, (k, 2, 3)."""
+        """Jacobian of `sliding` by the velocity in the imu's axes, (k, 2, 3)."""
         rows = np.tile([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (len(self.velocity), 1, 1))
         rows[:, 0, 0] = -mounting[0] - 2 * mounting[3] * np.abs(self.velocity[:, 0]) * self.yaw_rate
         rows[:, 1, 0] = -mounting[1]
         return rows
 
     def by_state(self, mounting: Array) -> Array:
-        """How `sliding` changes with the tangent of the pose and the velocity in the map, (k, 2, 9).
+        """Jacobian of `sliding` by the tangent of the pose and the velocity in the map, (k, 2, 9).
 
         With v_imu = Rᵀ v and R perturbed on the right, d v_imu = [v_imu]× dθ + Rᵀ dv.
         """
@@ -146,15 +144,6 @@ def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
     R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
     in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
     return BodyMotion(R_imu_map, in_imu, problem.intervals.yaw_rate - biases[:, 5], np.gradient(stamps))
-
-
-def with_mounting(problem: Problem, fit: Fit, mounting: Array) -> Fit:
-    """The same solution with the mounting (4,) among its values, as M(k)."""
-    values, key = gtsam.Values(fit.values), M(len(problem.intervals.keyframes))
-    if values.exists(key):
-        values.erase(key)
-    values.insert(key, mounting)
-    return replace(fit, values=values)
 
 
 def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:

@@ -116,7 +116,7 @@ def direction(mounting: Array) -> Array:
 
 
 def misfit(ahead: Array, yaw_rate: Array, readings: Readings, calibration: Array) -> tuple[Array, Array]:
-    """Speed of the solution less that of the wheels, (k,) m/s, and how it changes with the calibration, (k, 4)."""
+    """Speed of the solution less that of the wheels, (k,) m/s, and its Jacobian by the calibration, (k, 4)."""
     scale, offset, _, left = calibration
     d, w = readings.directions, readings.speeds
     off: Array = ahead - d * (scale * w + offset) + left * yaw_rate
@@ -209,15 +209,6 @@ def _doubt(wheels: Wheels, off: Array, ahead: Array) -> str:
         is_in = f": they are in {unit}, give m/s" if unit else ", expected about 1: give m/s"
         return f"their scale is {scale:.4g}{is_in}"
     return ""
-
-
-def with_calibration(problem: Problem, fit: Fit, calibration: Array) -> Fit:
-    """The same solution with the calibration (4,) of the wheels among its values, as W(k)."""
-    values, key = gtsam.Values(fit.values), W(len(problem.intervals.keyframes))
-    if values.exists(key):
-        values.erase(key)
-    values.insert(key, calibration)
-    return replace(fit, values=values)
 
 
 def wheel_factors(

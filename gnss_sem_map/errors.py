@@ -45,6 +45,11 @@ def counted(number: int, one: str, many: str = "") -> str:
     return f"{number:,} {one if number == 1 else many or f'{one}s'}"
 
 
+def one_line(error: Exception, most: int = 200) -> str:
+    """The message of another library's error, for a message of ours: at most so many characters, in one line."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 def how_to_install(extra: str) -> str:
     """What to type in a clone for an extra: it reaches the environment that runs, whether or not it is active."""
     return f"in the clone: {sys.executable} -m pip install -c constraints.txt -e '.[{extra}]'"

@@ -149,34 +149,41 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     table.add_row("mean", *map(_percent, means))
     console = Console(soft_wrap=True)
     console.print(table)
-    moving = metrics["dynamic"]
-    lines = [
-        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined,"
-        " of the points whose true class the map has",
-        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
-        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %",
-        f"calibration     expected error {_percent(metrics['calibration']['ece'])} %",
-    ]
-    if "trajectory" in metrics:
-        t = metrics["trajectory"]
-        lines.append(
-            f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
-            f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
-            f" {100 * t['rpe_translation_share']:.2f} % relative"
-        )
-        if "position_nees_per_dof" in t:
-            lines.append(
-                f"  squared error over its stated variance (NEES per degree of freedom): position"
-                f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
-                " consistent covariances give 1 on average over many drives"
-            )
-            inside = ", ".join(_percent(t[f"position_inside_{share}"]) for share in (50, 90, 95))
-            lines.append(
-                f"  positions inside the ellipsoids that should hold 50, 90, 95 %: {inside} %; scale gap k"
-                f" {t['position_scale_gap']:.2f}, above 1 the variances are too small"
-            )
-    for line in lines:
+    for line in _single_figures(metrics):
         console.print(line, highlight=False)
+
+
+def _single_figures(metrics: dict[str, Any]) -> Iterator[str]:
+    raw, refined, moving = *(metrics["semantics"][stage] for stage in ("raw", "refined")), metrics["dynamic"]
+    yield (
+        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined,"
+        " of the points whose true class the map has"
+    )
+    yield (
+        f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"
+        f" parked kept {_percent(moving['SA_vehicle'])} %, AA {_percent(moving['AA'])} %"
+    )
+    yield f"calibration     expected error {_percent(metrics['calibration']['ece'])} %"
+    t = metrics.get("trajectory")
+    if t is None:
+        return
+    yield (
+        f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
+        f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
+        f" {100 * t['rpe_translation_share']:.2f} % relative"
+    )
+    if "position_nees_per_dof" not in t:
+        return
+    yield (
+        f"  squared error over its stated variance (NEES per degree of freedom): position"
+        f" {t['position_nees_per_dof']:.2f}, orientation {t['orientation_nees_per_dof']:.2f};"
+        " consistent covariances give 1 on average over many drives"
+    )
+    inside = ", ".join(_percent(t[f"position_inside_{share}"]) for share in (50, 90, 95))
+    yield (
+        f"  positions inside the ellipsoids that should hold 50, 90, 95 %: {inside} %; scale gap k"
+        f" {t['position_scale_gap']:.2f}, above 1 the variances are too small"
+    )
 
 
 def print_cache(report: CacheReport, out: Path) -> None:

@@ -28,6 +28,7 @@ from gnss_sem_map.cli.options import (
     frame_of,
     open_log,
     settings_of,
+    stop_without_segmenter,
 )
 
 if TYPE_CHECKING:
@@ -105,7 +106,6 @@ def run(
         from gnss_sem_map.runs.many_drives import HowMapped, frame_of_all
         from gnss_sem_map.runs.run_folder import claimed_run, places_read
         from gnss_sem_map.runs.source import source_of
-        from gnss_sem_map.segmentation import no_segmenter_message
 
         progress("loading", 1, 1)
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
@@ -113,8 +113,7 @@ def run(
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     is_of_many = len(found) > 1 or align_to is not None
     if is_of_many and segmenter is None:
-        typer.echo(no_segmenter_message(str(found[0])), err=True)
-        raise typer.Exit(1)
+        stop_without_segmenter(found[0])
     sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
     with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
         if dry_run:
@@ -129,8 +128,7 @@ def run(
         [drive] = found
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.cameras:
-            typer.echo(no_segmenter_message(str(drive)), err=True)
-            raise typer.Exit(1)
+            stop_without_segmenter(drive)
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
@@ -183,12 +181,10 @@ def add(
     """Add a drive to a finished map, with the map's settings: the same bytes as a run of all drives at once."""
     from gnss_sem_map.runs.finished_run import Run
     from gnss_sem_map.runs.many_drives import HowMapped, add_drive, has_point_labels
-    from gnss_sem_map.segmentation import no_segmenter_message
 
     Run.open(out)
     if segmenter is None:
-        typer.echo(no_segmenter_message(str(drive)), err=True)
-        raise typer.Exit(1)
+        stop_without_segmenter(drive)
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:

@@ -78,18 +78,9 @@ def train(
     with progress_bars() as progress:
         try:
             report = train_network(
-                learnt,
-                checked,
-                out,
-                open_label_set(classes),
-                taxonomy,
-                ids,
-                settings,
-                initial,
-                device,
-                resume,
-                progress,
-            )
+                learnt, checked, out, open_label_set(classes), taxonomy, ids, settings,
+                initial=initial, device=device, resume=resume, progress=progress,
+            )  # fmt: skip
         except Stopped as stopped:
             stopped.add_note("the same command with --resume continues from the last validation")
             raise

@@ -30,7 +30,7 @@ from gnss_sem_map.datasets import frames, kitti_calibration, kitti_raw
 from gnss_sem_map.datasets.kitti_odometry import read_table
 from gnss_sem_map.datasets.stamps import in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.structured import MOST_YAML_BYTES, parse_yaml
+from gnss_sem_map.files.structured import MOST_YAML_BYTES, fault_of, parse_yaml
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_text, shown
 from gnss_sem_map.sensor_log import Calibration, Image, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, lidar_to_camera
@@ -154,17 +154,10 @@ def _images(
     skips: list[Skip] = []
     for name, camera in zip(names, calibration.cameras, strict=True):
         found = frames.numbered("image", folder / name / IMAGES[name], *frames.IMAGE_SUFFIXES)
-        stamps_ns, lost = kitti_raw.stamps_ns(folder / name / "timestamps.txt")
-        lost += found.skips + frames.missing("image", folder / name, stamps_ns, found.files)
-        of_camera = []
-        for number, path in found.files.items():
-            if number in stamps_ns:
-                stamp = (stamps_ns[number] - epoch_ns) * 1e-9
-                read_it = partial(frames.read_image, path, camera.image_size)
-                of_camera.append(Image(number, stamp, read_it, camera.name))
-            else:
-                lost.append(Skip("image", shown(path), "no stamp for this frame"))
-        images += in_order("image", of_camera, lost)
+        of_camera, lost = kitti_raw.stamped_images(
+            found, folder / name, epoch_ns, camera.image_size, camera.name
+        )
+        images += of_camera
         skips += lost
     return tuple(sorted(images, key=lambda image: image.stamp)), skips
 
@@ -221,11 +214,7 @@ def _fisheye(file: Path) -> tuple[Array, tuple[int, int], Distortion]:
         coefficients = (bent.k1, bent.k2, bent.p1, bent.p2)
         lens = Distortion(model="mei", coefficients=coefficients, xi=about.mirror_parameters.xi)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise DataError(
-            f"{shown(file)}: {place[:100]}: {first['msg'][:200]}; expected the model of Mei"
-        ) from None
+        raise DataError(f"{shown(file)}: {fault_of(error)}; expected the model of Mei") from None
     except ValueError as error:
         raise DataError(f"{shown(file)}: not YAML ({error})") from None
     K = np.array([[projected.gamma1, 0, projected.u0], [0, projected.gamma2, projected.v0], [0, 0, 1.0]])

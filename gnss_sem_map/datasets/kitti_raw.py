@@ -368,13 +368,20 @@ def _images(drive: Path, epoch_ns: int, size: tuple[int, int] | None) -> tuple[t
     found = frames.numbered("image", folder / "data", *frames.IMAGE_SUFFIXES)
     if not found.files:
         return (), found.skips + _all_missing("image", folder)
+    return stamped_images(found, folder, epoch_ns, size)
+
+
+def stamped_images(
+    found: frames.Frames, folder: Path, epoch_ns: int, size: tuple[int, int] | None, camera: str = ""
+) -> tuple[tuple[Image, ...], list[Skip]]:
+    """The images of a camera whose files were found and whose stamps are in its folder, and the skipped frames."""
     stamps, skips = stamps_ns(folder / "timestamps.txt")
     skips += found.skips + frames.missing("image", folder, stamps, found.files)
     images = []
     for number, path in found.files.items():
         if number in stamps:
             stamp = (stamps[number] - epoch_ns) * 1e-9
-            images.append(Image(number, stamp, partial(frames.read_image, path, size)))
+            images.append(Image(number, stamp, partial(frames.read_image, path, size), camera))
         else:
             skips.append(Skip("image", shown(path), "no stamp for this frame"))
     return in_order("image", images, skips), skips

@@ -10,7 +10,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
@@ -50,7 +50,7 @@ def read_base(path: Path, frame: LocalFrame) -> BaseCloud:
     except DataError:
         raise
     except (laspy.errors.LaspyException, lazrs.LazrsError, ProjError, OSError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)
         raise DataError(f"{shown(path)}: cannot be read as LAS or LAZ ({reason})") from None
     points = np.concatenate(parts)
     if not len(points):

@@ -13,7 +13,7 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.measurements import ImuNoise
 from gnss_sem_map.datasets.gnss_files import GnssFile
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.structured import fault_of, read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.sensor_log import Calibration
 from gnss_sem_map.sensor_log.cameras import Camera, Distortion, SensorName, lidar_to_camera
@@ -142,10 +142,8 @@ def read_log_yaml(path: Path) -> LogFile:
     try:
         return LogFile.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        first = error.errors()[0]
-        place = " ".join(".".join(map(str, first["loc"])).split())
         raise DataError(
-            f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; known keys are {sorted(LogFile.model_fields)}"
+            f"{shown(path)}: {fault_of(error)}; known keys are {sorted(LogFile.model_fields)}"
         ) from None
 
 

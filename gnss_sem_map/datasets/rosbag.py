@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuSamples, clean_gnss, clean_imu
+from factor_graphs.measurements import GnssFixes, ImuSamples, clean_gnss, clean_imu
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
@@ -65,27 +65,17 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     if rig.imu is None or rig.gnss is None:
         raise roles.nothing_taken(bag, rig)
     imu = bag.messages(rig.imu.topic)
-    fixes, fix_ns, gnss_skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
+    fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
     epoch_ns = int(fix_ns[0])
-    stamps = fixes[:, 0]
-    valid, invalid = valid_fixes(stamps, fixes[:, 1:4], fixes[:, 4:7])
-    if not valid.any():
-        raise DataError(
-            f"{shown(drive)}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
-        )
-    fixes = fixes[valid]
-    frame = LocalFrame(*(float(v) for v in fixes[0, 1:4]))
-    gnss, repairs = clean_gnss(fixes[:, 0], frame.to_map(*fixes[:, 1:4].T), fixes[:, 4:7])
-    gnss_skips += [Skip("fix", shown(drive), f"{n} fixes: {why}", n) for why, n in invalid.items()]
-    if repairs.dropped:
-        gnss_skips.append(Skip("samples", shown(drive), str(repairs)))
+    gnss, frame, invalid = _usable(fixes, shown(drive))
+    skips += invalid
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
         scans.append(found)
-        gnss_skips += scan_skips
+        skips += scan_skips
     names = list(rig.lidars) if len(scans) > 1 else [""]
     others = zip(names[1:], other_poses(bag, rig), scans[1:], strict=True)
     images, image_skips = _images(bag, rig, epoch_ns, calibration.cameras)
@@ -104,7 +94,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*gnss_skips, *imu_skips, *calibration_skips, *image_skips),
+        skips=(*skips, *imu_skips, *calibration_skips, *image_skips),
     )
 
 
@@ -143,6 +133,22 @@ def _fixes(
     skips += [Skip("fix", messages.topic, f"{count} messages: {why}", count) for why, count in told.items()]
     ns = np.array(stamps, np.int64)
     return np.column_stack([(ns - ns[0]) * 1e-9, np.array(rows)]), ns, skips
+
+
+def _usable(rows: Array, where: str) -> tuple[GnssFixes, LocalFrame, list[Skip]]:
+    """The valid fixes of rows as `_fixes` makes them, in the local frame at the first one, and the skipped ones."""
+    valid, invalid = valid_fixes(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+    if not valid.any():
+        raise DataError(
+            f"{where}: not one of {len(rows)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
+        )
+    rows = rows[valid]
+    frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
+    gnss, repairs = clean_gnss(rows[:, 0], frame.to_map(*rows[:, 1:4].T), rows[:, 4:7])
+    skips = [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
+    if repairs.dropped:
+        skips.append(Skip("samples", where, str(repairs)))
+    return gnss, frame, skips
 
 
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:
@@ -226,9 +232,8 @@ def _images(
 ) -> tuple[tuple[Image, ...], list[Skip]]:
     images: list[Image] = []
     skips: list[Skip] = []
-    for about, camera in zip(
-        rig.cameras.values(), cameras, strict=False
-    ):  # without a LiDAR there is no camera
+    # without a LiDAR there is no camera
+    for about, camera in zip(rig.cameras.values(), cameras, strict=False):
         messages = bag.messages(about.topic)
         said, believed, lost = stamps_of(bag, messages, about.stamps)
         of_camera = [

@@ -208,15 +208,13 @@ def find_segments(
     whole = voxels.merged(clusters, count)
     fits = _is_vehicle_sized(whole, np.asarray(np.bincount(clusters[voxel], beams, count), np.float64))
     number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
-    shown = ~fits[clusters] & (
-        voxels.labelled > 0
-    )  # of clusters that are too large or too small, the labelled part
+    # of clusters that are too large or too small, the labelled part
+    shown = ~fits[clusters] & (voxels.labelled > 0)
     part = cluster(keys[shown], eps_m)
     number[shown] = part + np.int32(fits.sum())
     truncated = np.zeros(part.max(initial=-1) + 1, np.bool_)
-    truncated[part] = (whole.points > whole.labelled)[
-        clusters[shown]
-    ]  # the cluster has points outside of the image
+    # those whose cluster has points outside of the image
+    truncated[part] = (whole.points > whole.labelled)[clusters[shown]]
     row = np.where(is_object | ~shown.take(voxel), voxel, np.int32(-1))
     parts = voxels.without_boxes()
     _keep_labelled(p_map, is_object, voxel, shown, parts.points, parts.sums)

@@ -165,12 +165,17 @@ def classify_motion(
         alone += gone
         if rest := [n for n in members if n not in set(gone)]:
             objects.append(_tracked_object(rest, segments, whole.motion, whole.probability, whole.reason))
-    for n in alone:
-        probability = _probability(misses[n], hits[n])
-        motion = Motion.MOVING if probability > 0.5 else Motion.UNKNOWN
-        reason = f"one scan only: seen through {misses[n]:,.0f} times, hit {hits[n]:,.0f} times"
-        objects.append(_tracked_object([n], segments, motion, probability, reason))
-    return objects
+    return [*objects, *(_motion_of_segment(n, segments, hits, misses) for n in alone)]
+
+
+def _motion_of_segment(
+    n: int, segments: list[Segment], hits: NDArray[np.float64], misses: NDArray[np.float64]
+) -> TrackedObject:
+    """Motion state of a segment by itself, without a track."""
+    probability = _probability(misses[n], hits[n])
+    motion = Motion.MOVING if probability > 0.5 else Motion.UNKNOWN
+    reason = f"one scan only: seen through {misses[n]:,.0f} times, hit {hits[n]:,.0f} times"
+    return _tracked_object([n], segments, motion, probability, reason)
 
 
 def _motion_of_track(

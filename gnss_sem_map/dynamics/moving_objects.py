@@ -111,10 +111,7 @@ def decide(
     if not observations:
         return Decision([], [], (), False)
     places = _places(observations)
-    of_places = _observations_by_others(observations, places, before, settings, SHARP_RATIO)
-    is_sharp = are_sharp(of_places, places)
-    if not is_sharp:
-        of_places = _observations_by_others(observations, places, before, settings, WIDE_RATIO)
+    of_places, is_sharp = _told_by_others(observations, places, before, settings)
 
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         return (of_places[:, place] for place in places)
@@ -134,11 +131,7 @@ def decide(
         objects = joined_to_movers(objects, segments, places, _of_voxels(gone, segments), hits, misses)
         gone = _gone(objects, len(listed))
     is_whole = np.array([not one.truncated for one in listed], np.bool_)
-    stood = is_whole & ~gone & is_occupied(hits, misses)
-    stood_of = (
-        np.int8(2) * whole + ((of_scan.number < 0) & is_occupied(*counted))
-        for whole, of_scan, counted in zip(_of_voxels(stood, segments), segments, counts(), strict=True)
-    )
+    stood_of = _stood_of(is_whole & ~gone & is_occupied(hits, misses), segments, counts())
     moved_of = _either(_of_voxels(gone, segments), free)
     del free  # masks of all scans take 10 MB here, at the peak of memory: others are made one by one
     stays = standing(places, counts(), moved_of, stood_of)
@@ -157,6 +150,29 @@ def decide(
         _with_track(one, listed) for one in objects if listed[one.segments[0]].scan < count
     )
     return Decision(moved[:count], stands[:count], first_seen_here, is_sharp)
+
+
+def _told_by_others(
+    observations: Sequence[Observation],
+    places: Sequence[NDArray[np.int32]],
+    before: Keyframes | None,
+    settings: MotionSettings,
+) -> tuple[NDArray[np.int32], bool]:
+    """Hits and misses of every place (2, p), with a margin as wide as the poses need; whether these are sharp."""
+    counts = _observations_by_others(observations, places, before, settings, SHARP_RATIO)
+    if are_sharp(counts, places):
+        return counts, True
+    return _observations_by_others(observations, places, before, settings, WIDE_RATIO), False
+
+
+def _stood_of(
+    stood: NDArray[np.bool_], segments: Sequence[Segments], counts: Iterable[NDArray[np.int32]]
+) -> Iterator[NDArray[np.integer]]:
+    """For each scan, for its voxels (v,): 2 in a segment that `stood` (s,), 1 for others that stand; see `standing`."""
+    return (
+        np.int8(2) * whole + ((of_scan.number < 0) & is_occupied(*counted))
+        for whole, of_scan, counted in zip(_of_voxels(stood, segments), segments, counts, strict=True)
+    )
 
 
 def _gone(objects: Sequence[TrackedObject], count: int) -> NDArray[np.bool_]:

@@ -37,10 +37,8 @@ def _pixel(x, y, z):
     """Cell of elevation, see `image_rows`, and column without the margin."""
     cell = int32(np.floor((atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / CELL_DEG))
     column = int32(np.floor((atan2_deg(y, x) + 180.0) / COLUMN_DEG))
-    return (
-        cell if 0 <= cell < CELLS else 0,
-        column if 0 <= column < COLUMNS else 0,
-    )  # straight up is in no row
+    # straight up is in no row
+    return cell if 0 <= cell < CELLS else 0, column if 0 <= column < COLUMNS else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

@@ -55,9 +55,7 @@ def write_copc(exported: Exported, path: Path | str) -> None:
         import lazrs
     except ImportError:
         raise ConfigError(f"COPC needs copclib; {how_to_install('copc')}") from None
-    georeference = exported.georeference
-    if georeference is None:
-        raise DataError(f"{exported.title}: COPC needs a georeference; this map is in its drive's own poses")
+    georeference = exported.georeference_for("COPC")
     octree = _Octree.over(exported, georeference)
     header = las_header(exported.map.label_set, georeference, has_times=exported.attributes is not None)
     packing = lazrs.LazVlr.new_for_compression(

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.voxels.attributes import Attributes, TiledAttributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -50,6 +51,14 @@ class Exported:
     def georeference(self) -> Georeference | None:
         """None for a map in its drive's own poses."""
         return None if self.map.frame is None else Georeference(self.map.frame, self.epsg, self.geoid)
+
+    def georeference_for(self, what: str) -> Georeference:
+        """The georeference, for a file that needs one; raises DataError where there is none."""
+        if self.georeference is None:
+            raise DataError(
+                f"{self.title}: {what} needs a georeference; this map is in its drive's own poses"
+            )
+        return self.georeference
 
     @cached_property
     def extent(self) -> Extent:

@@ -16,7 +16,6 @@ import numpy as np
 import shapely
 from pyproj import CRS
 
-from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.georeference import WGS84_EPSG, Georeference
 from gnss_sem_map.export.vectors import LAYERS, features_of
@@ -44,11 +43,7 @@ def write_geopackage(exported: Exported, path: Path | str) -> None:
 
     Raises DataError for a map without a georeference, and when the file cannot be written.
     """
-    georeference = exported.georeference
-    if georeference is None:
-        raise DataError(
-            f"{exported.title}: a GeoPackage needs a georeference; this map is in its drive's own poses"
-        )
+    georeference = exported.georeference_for("a GeoPackage")
     with replacing(path) as file, _new_database(file.name) as database:
         _describe(database, georeference)
         boxes: dict[str, tuple[float, ...]] = {}

@@ -118,11 +118,7 @@ def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
     import rasterio.shutil
     from rasterio.enums import Resampling
 
-    georeference, label_set = exported.georeference, exported.map.label_set
-    if georeference is None:
-        raise DataError(
-            f"{exported.title}: a GeoTIFF needs a georeference; this map is in its drive's own poses"
-        )
+    georeference, label_set = exported.georeference_for("a GeoTIFF"), exported.map.label_set
     cells = _Cells.of(exported.extent, GEOTIFF_LONGEST_SIDE)
     grid = _Grid.over(cells, exported, georeference)
     profile = {

@@ -22,7 +22,6 @@ class Track:
     """Where a drive was mapped."""
 
     length_m: float
-    duration_s: float
     stamps: NDArray[np.float64]
     """(k,) s, of the poses that are kept."""
     positions: NDArray[np.float64]
@@ -49,7 +48,6 @@ def read_track(path: Path, scans_s: tuple[float, float] | None = None) -> Track:
         )
     return Track(
         float(steps.sum()),
-        trajectory.end - trajectory.start,
         kept.stamps,
         kept.positions,
         horizontal,

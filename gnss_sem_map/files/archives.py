@@ -1,7 +1,8 @@
-"""Arrays in an `.npz` file: type and size of each are checked before it is decompressed."""
+"""Arrays in an `.npz` file: when they are read, type and size of each are checked before it is decompressed."""
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import re
@@ -10,14 +11,18 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import MOST_BYTES, open_file, shown
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 MOST_MEMBERS = 100
 MOST_HEADER_BYTES = 10_000
@@ -133,6 +138,14 @@ def open_archive(path: Path, most_bytes: int = MOST_BYTES) -> Iterator[Archive]:
             yield Archive(path, members)
 
 
+def npz_of(arrays: DataclassInstance) -> bytes:
+    """The arrays of a dataclass as the content of an `.npz` file, nothing rounded; those that are None are left out."""
+    named = {field.name: getattr(arrays, field.name) for field in fields(arrays)}
+    file = io.BytesIO()
+    np.savez(file, **{name: array for name, array in named.items() if array is not None})
+    return file.getvalue()
+
+
 def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:
     """Type, order and shape of an array, and the offset of its values."""
     magic = file.read(8)
@@ -156,5 +169,5 @@ def _header(file: IO[bytes]) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]
 
 
 def _damaged(path: Path, error: Exception) -> DataError:
-    why = " ".join(str(error).split())[:200] or type(error).__name__
+    why = one_line(error)
     return DataError(f"{shown(path)}: damaged file, or no .npz of plain arrays ({why})")

@@ -22,6 +22,21 @@ def replacing(path: Path | str) -> Iterator[BinaryIO]:
     Raises DataError when the folder does not exist or may not be written to, and when the disk is full.
     """
     path = Path(path)
+    try:
+        with _beside(path) as file:
+            yield file
+    except OSError as error:
+        raise DataError(_explained(path, error)) from error
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file as `replacing` does; raises OSError."""
+    with _beside(path) as file:
+        file.write(content)
+
+
+@contextmanager
+def _beside(path: Path) -> Iterator[BinaryIO]:
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with beside.open("wb") as file:
@@ -29,8 +44,6 @@ def replacing(path: Path | str) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())  # a full disk must be noticed before the rename
         beside.replace(path)
-    except OSError as error:
-        raise DataError(_explained(path, error)) from error
     finally:
         beside.unlink(missing_ok=True)
 

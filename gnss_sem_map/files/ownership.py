@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.atomic import replacing
+from gnss_sem_map.files.atomic import replacing, write_whole
 
 MARKER = ".gnss-sem-map.json"
 """Name of the list of files in every folder that we write."""
@@ -145,19 +145,6 @@ def _with_lists(folder: Path) -> Iterator[tuple[Path, str]]:
         inside = f"{real.relative_to(parent).as_posix()}/"
         if inside in (read_list(parent) or {}):
             yield parent, inside
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically; raises OSError."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with beside.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def is_partial(name: str) -> bool:

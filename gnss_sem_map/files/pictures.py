@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFile
 
-from gnss_sem_map.errors import DataError, ImageSizeError
+from gnss_sem_map.errors import DataError, ImageSizeError, one_line
 from gnss_sem_map.files.untrusted import read_bytes, shown
 
 MOST_PIXELS, LONGEST_SIDE = 64_000_000, 65_535
@@ -87,7 +87,7 @@ def _opened(where: str, content: bytes) -> Iterator[ImageFile.ImageFile]:
     except DataError:
         raise
     except FAULTS as error:
-        reason = " ".join(str(error).split())[:100]
+        reason = one_line(error, 100)
         raise DataError(f"{where}: damaged image ({reason}); expected PNG or JPEG") from None
 
 

@@ -11,12 +11,15 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from gnss_sem_map.errors import DataError, SemMapError
+from gnss_sem_map.errors import DataError, SemMapError, one_line
 from gnss_sem_map.files.untrusted import read_text, shown
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 MOST_YAML_BYTES, LONGEST_YAML_LINE = 2 << 20, 20_000
 MOST_JSON_BYTES = 64 << 20
@@ -106,7 +109,7 @@ def parse_yaml(text: str) -> Any:
         finally:
             loader.dispose()
     except (yaml.YAMLError, ValueError, TypeError, AttributeError) as error:
-        raise ValueError(" ".join(str(error).split())[:200] or type(error).__name__) from None
+        raise ValueError(one_line(error)) from None
 
 
 def read_yaml(path: Path, error: type[SemMapError] = DataError) -> Any:
@@ -127,10 +130,17 @@ def read_json(path: Path, error: type[SemMapError] = DataError) -> dict[str, Any
     except RecursionError:
         raise error(f"{shown(path)}: damaged (nested too deep)") from None
     except ValueError as problem:
-        raise error(f"{shown(path)}: damaged ({' '.join(str(problem).split())[:200]})") from None
+        raise error(f"{shown(path)}: damaged ({one_line(problem)})") from None
     if not isinstance(content, dict):
         raise error(f"{shown(path)}: damaged (found {type(content).__name__}, expected a mapping)")
     return content
+
+
+def fault_of(error: ValidationError) -> str:
+    """The first fault that pydantic found in the content of a file: its place, and what is wrong, in one line."""
+    first = error.errors()[0]
+    place = " ".join(".".join(map(str, first["loc"])).split())
+    return f"{place[:100]}: {first['msg'][:200]}"
 
 
 def not_finite(content: Any, place: str = "") -> str | None:

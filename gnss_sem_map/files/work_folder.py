@@ -21,6 +21,8 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
@@ -51,6 +53,17 @@ def make(folder: Path) -> None:
             ownership.write_list(folder)
     except OSError as error:
         raise DataError(f"{folder}: cannot be written ({error.strerror}); choose another place") from None
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Raise DataError, with the name of the folder and how to go on, when something cannot be written into it."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+        ) from None
 
 
 def refuse_foreign(folder: Path) -> None:

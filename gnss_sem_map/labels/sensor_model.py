@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import ConfigError, DataError
+from gnss_sem_map.errors import ConfigError, DataError, one_line
 from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.label_set import LabelSet
@@ -136,7 +136,7 @@ def read(file: Path, label_set: LabelSet) -> LabelCalibration:
             temperature=float(content["temperature"]),
         )
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:300]
+        reason = one_line(error, 300)
         raise ConfigError(
             f"{shown(file)}: {type(error).__name__} {reason}; expected a file of `gnss-sem-map calibrate`"
         ) from None

@@ -32,7 +32,7 @@ from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS, Motion, Tra
 from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.chunks import MappedChunk

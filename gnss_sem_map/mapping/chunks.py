@@ -9,7 +9,6 @@ among processes, and after any interruption.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +20,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import TrackedObject
 from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, decide, moved_points
 from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSelector
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import edge_windows
@@ -142,17 +141,6 @@ def _map_chunks(
         if after is None:
             after = _observations(drive, chunks[numbers.stop][:window])
         yield undecided.decided(before, after)
-
-
-@contextmanager
-def writing_to(folder: Path) -> Iterator[None]:
-    """An OSError becomes a DataError that names the folder."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
 
 
 Seen = tuple[LabelledScan, Observation | None]

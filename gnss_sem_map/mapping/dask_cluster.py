@@ -270,9 +270,8 @@ def _read_and_write(work: str, token: str) -> int:
 
 
 def _token_file(work: Path, token: str, number: int) -> Path:
-    return (
-        work / f".{token}.{number}.part"
-    )  # the name of an unfinished file: one that stays behind is cleared away
+    # the name of an unfinished file: one that stays behind is cleared away
+    return work / f".{token}.{number}.part"
 
 
 def _has_nanny(dask_worker: Worker) -> bool:

@@ -22,7 +22,7 @@ from gnss_sem_map.dynamics.moving_objects import Observation
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import RangeImage
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import is_file, read_bytes
 from gnss_sem_map.files.work_folder import EDGES
 

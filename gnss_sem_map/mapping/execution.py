@@ -54,6 +54,26 @@ class Task:
             ) from None
 
 
+def path_of(function: Callable[..., Any]) -> str:
+    """How a task names a module-level function."""
+    return f"{function.__module__}:{function.__name__}"
+
+
+def failure_of(call: Callable[[], object]) -> str:
+    """Make a call, and return why it fails, by an error of ours or of the system; empty when it does not."""
+    try:
+        call()
+    except (SemMapError, FactorGraphError) as error:
+        return str(error) or "failed"
+    except OSError as error:
+        return _told(error)
+    return ""
+
+
+def _told(error: OSError) -> str:
+    return f"{error.filename or 'a file'}: {error.strerror or error}"
+
+
 class Executor(Protocol):
     """Something that calls tasks and yields each with its result, in the order in which they finish."""
 
@@ -129,8 +149,7 @@ def answer(function: str, arguments: str, allowed: str = ALLOWED) -> str:
         kind = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _REMADE), "DataError")
         return json.dumps({"error": kind, "message": str(error)})
     except OSError as error:
-        message = f"{error.filename or 'a file'}: {error.strerror or error}"
-        return json.dumps({"error": "DataError", "message": message})
+        return json.dumps({"error": "DataError", "message": _told(error)})
     except Exception:  # noqa: BLE001 (a defect: it is raised where somebody sees it)
         return json.dumps({"defect": traceback.format_exc()})
 

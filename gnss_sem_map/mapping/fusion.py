@@ -14,9 +14,10 @@ from itertools import groupby
 from pathlib import Path
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
-from gnss_sem_map.mapping.chunks import chunks_of, map_chunks, writing_to
+from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent

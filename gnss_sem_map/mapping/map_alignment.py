@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.scans import registration
 from gnss_sem_map.scans.downsampling import one_per_cube
+from gnss_sem_map.scans.local_maps import cloud_of
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ FARTHEST_M, MOST_TURN_DEG = 3.0, 2.0
 """No georeference has a larger error; such a registration has found another wall."""
 LEAST_POINTS = 300
 """Fewer correspondences give no registration."""
-OPEN_SHARE, OPEN_STDDEV_M = 0.003, 10.0
+DEGENERATE = registration.DegenerateSettings(degenerate_share=0.003)
 """As in LiDAR odometry: a direction that less than this share of the points constrain is not moved."""
 
 
@@ -55,7 +56,9 @@ def match_maps(target: Array, source: Array) -> MapMatch:
     if min(len(target), len(source)) < LEAST_POINTS:
         raise NoMatch(f"one of the maps has less than {LEAST_POINTS} voxels")
     middle = source.mean(axis=0)  # rotations about it do not mix with shifts
-    surfaces, points = _surfaces(target - middle), _surfaces(source - middle)
+    surfaces, points = (
+        cloud_of(one_per_cube(places - middle, SPACING_M), NEIGHBOURS) for places in (target, source)
+    )
     tree, T = small_gicp.KdTree(surfaces), np.eye(4)
     for reach_m in REACHES_M:
         result = small_gicp.align(
@@ -65,18 +68,8 @@ def match_maps(target: Array, source: Array) -> MapMatch:
         if result.num_inliers < LEAST_POINTS:
             raise NoMatch(f"only {result.num_inliers} points of one lie within {reach_m:g} m of the other")
         T = registration.rigid(result.T_target_source)
-    length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
-    known, weight = registration.information(result, points)
-    T, _, _ = registration.close_open_directions(
-        np.eye(4), T, known, weight, length, OPEN_SHARE, OPEN_STDDEV_M
-    )
+    T, _, _ = registration.remap_solution(np.eye(4), T, result, points, DEGENERATE)
     return _checked(T, middle)
-
-
-def _surfaces(p: Array) -> small_gicp.PointCloud:
-    cloud = small_gicp.PointCloud(one_per_cube(p, SPACING_M))
-    small_gicp.estimate_covariances(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
-    return cloud
 
 
 def _checked(T: Array, middle: Array) -> MapMatch:

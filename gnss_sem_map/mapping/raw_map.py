@@ -17,7 +17,7 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, STATIC, ChunkStore
 from gnss_sem_map.mapping.evidence import RunEvidence
-from gnss_sem_map.mapping.execution import Executor, InProcess
+from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
 from gnss_sem_map.voxels import attributes, tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
@@ -142,7 +142,7 @@ def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[st
     return [None] * len(of_tiles)
 
 
-SUM_TILES = f"{sum_tiles.__module__}:{sum_tiles.__name__}"
+SUM_TILES = path_of(sum_tiles)
 
 
 def _parts(folders: Sequence[Path]) -> dict[Tile, dict[str, dict[str, Any]]]:

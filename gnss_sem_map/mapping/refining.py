@@ -26,7 +26,7 @@ from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.execution import Executor, InProcess
+from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles, on_tiles
 from gnss_sem_map.memory import release_memory
@@ -271,7 +271,7 @@ def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:
     return free_space.reach_m(steps.free_space, voxel_size_m) + crumbs.reach_m(steps.crumbs, voxel_size_m)
 
 
-MEASURE_TILES, REFINE_TILES = (f"{f.__module__}:{f.__name__}" for f in (measure_tiles, refine_tiles))
+MEASURE_TILES, REFINE_TILES = path_of(measure_tiles), path_of(refine_tiles)
 
 
 def _sums_file(tile: Tile, made_in: Path) -> Path:

@@ -140,9 +140,8 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
 
     def moment(a: np.intp, b: np.intp) -> NDArray[np.float64]:
         one = on_sidewalk if a == b == ON_SIDEWALK else terms[a] * terms[b]  # a class is 0 or 1: E[s²] = E[s]
-        return np.asarray(
-            np.bincount(ground.cell, one, cells + 1), np.float64
-        )  # -1 finds the last, which is zero
+        # one row more, of zeros: the place -1 finds it
+        return np.asarray(np.bincount(ground.cell, one, cells + 1), np.float64)
 
     rows, columns = np.triu_indices(len(terms))
     own = np.stack([moment(a, b) for a, b in zip(rows, columns, strict=True)], axis=1)

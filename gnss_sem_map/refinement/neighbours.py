@@ -22,10 +22,8 @@ HALF_COLUMNS = OFFSETS[::3] + 1
 
 def pairs_of_neighbours(keys: NDArray[np.int64]) -> NDArray[np.int32]:
     """Places (p, 2) of every two sorted packed voxels (v,) that touch, be it in a corner; each pair once."""
-    pairs, count = (
-        np.empty((len(OFFSETS) * len(keys) + 1, 2), np.int32),
-        0,
-    )  # memory is taken where it is filled in
+    # the system gives memory for pairs only where they are filled in
+    pairs, count = np.empty((len(OFFSETS) * len(keys) + 1, 2), np.int32), 0
     for offset in OFFSETS:
         count += _find_pairs(keys, offset, pairs[count:])
     return pairs[:count]

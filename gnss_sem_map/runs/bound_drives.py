@@ -15,7 +15,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,23 @@ from scipy.spatial import cKDTree
 
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.corrections import Correction
-from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.sessions import components
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import DataError, SemMapError
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.archives import npz_of
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
-from gnss_sem_map.run_stats import Progress, RunStats, silent
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.drive_job import read_job, write_job
 from gnss_sem_map.runs.match_tasks import SavedMatches
+from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
@@ -74,32 +75,27 @@ class BoundDrives:
 def bind_drives(
     sources: Sequence[Source],
     tracks: Mapping[str, Array],
-    settings: Settings,
-    settings_file: Path,
-    frame: LocalFrame,
-    work: Path,
-    executor: Executor,
-    progress: Progress = silent,
+    run: SeveralDrives,
     base: BaseCloud | None = None,
 ) -> BoundDrives:
     """Locate the drives that may have passed the same places, and bind those that did, and what is near a `base`.
 
     `tracks` are of drives by name, (n, 3) m; a drive without one, or that cannot be located, is left as it is.
-    Tasks read the settings from `settings_file`.
     """
+    settings = run.settings
     places = {**tracks, **({} if base is None else {BASE: base.points})}
     groups = [group for group in groups_of(places) if len(group) > 1]
     by_name = {source.name: source for source in sources}
     wanted = [by_name[name] for group in groups for name in group if name != BASE]
     if not (wanted and settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
         return BoundDrives({})
-    reasons = _located(wanted, settings_file, frame, work, executor, progress)
+    reasons = run.call(locate_one, "locating", ((source, (str(run.work),)) for source in wanted))
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
     warnings: list[str] = []
     for group in groups:
         names = [name for name in group if name != BASE and not reasons[name]]
-        found = _bound(names, settings, work, base if BASE in group else None)
+        found = _bound(names, settings, run.work, base if BASE in group else None)
         corrections |= found.corrections
         passes += found.passes
         warnings += found.warnings
@@ -122,40 +118,17 @@ def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:
     return [[names[n] for n in group] for group in groups]
 
 
-def _located(
-    sources: Sequence[Source],
-    settings_file: Path,
-    frame: LocalFrame,
-    work: Path,
-    executor: Executor,
-    progress: Progress,
-) -> dict[str, str]:
-    """Locate drives as tasks; name -> reason of failure, empty for those that could be."""
-    origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
-    function = f"{locate_one.__module__}:{locate_one.__name__}"
-    tasks = [
-        Task(source.name, function, (asdict(source), str(work), str(settings_file), origin))
-        for source in sources
-    ]
-    found = run_tasks(tasks, executor, lambda done, total: progress("locating", done, total), lost=str)
-    return {task.name: reason for task, reason in found}
-
-
-def locate_one(source: Mapping[str, Any], work: str, settings: str, origin: Sequence[float]) -> str:
+def locate_one(source: Mapping[str, Any], settings: str, origin: Sequence[float], work: str) -> str:
     """Locate a drive, and save its trajectory and condensed graph: a task. Returns the reason when it fails.
 
     What was matched stays in the work folder of the drive, where its mapping finds it.
     """
-    try:
-        _locate_one(Source(**source), Path(work), config.load(Path(settings)), LocalFrame(*origin))
-    except (SemMapError, FactorGraphError) as error:
-        return str(error) or "failed"
-    except OSError as error:
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
-    return ""
+    return failure_of(
+        lambda: _locate_one(Source(**source), config.load(Path(settings)), LocalFrame(*origin), Path(work))
+    )
 
 
-def _locate_one(source: Source, work: Path, settings: Settings, frame: LocalFrame) -> None:
+def _locate_one(source: Source, settings: Settings, frame: LocalFrame, work: Path) -> None:
     log, folder = source.open_log().in_our_conventions(settings.sensors), work / BOUND / source.name
     fingerprint = _fingerprint(log, settings, frame)
     if _is_located(folder, fingerprint):  # before an interruption
@@ -205,7 +178,7 @@ def _bound(
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:
             files[name] = work / BOUND / name / CORRECTION
-            write_whole(files[name], _as_bytes(correction))
+            write_whole(files[name], npz_of(correction))
     return BoundDrives(files, together.passes, together.warnings)
 
 
@@ -213,12 +186,6 @@ def _read(folder: Path) -> LocatedDrive:
     _, source, _, log, trajectory = read_job(folder)
     condensed = CondensedDrive.from_bytes(read_bytes(folder / CONDENSED))
     return LocatedDrive(source.name, log, trajectory, condensed.at(trajectory))
-
-
-def _as_bytes(correction: Correction) -> bytes:
-    file = io.BytesIO()
-    np.savez(file, **{part.name: getattr(correction, part.name) for part in fields(Correction)})
-    return file.getvalue()
 
 
 def read_correction(file: str) -> tuple[Correction | None, str]:

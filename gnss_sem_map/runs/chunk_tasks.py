@@ -12,7 +12,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints, fusion
 from gnss_sem_map.mapping.checkpoints import ChunkStore
 from gnss_sem_map.mapping.dask_cluster import Cluster
-from gnss_sem_map.mapping.execution import Task, run_tasks
+from gnss_sem_map.mapping.execution import Task, path_of, run_tasks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
@@ -39,7 +39,7 @@ class ChunkTasks:
         tasks = [
             Task(
                 f"{drive.log.name}, chunks {numbers.start} to {numbers.stop - 1}",
-                "gnss_sem_map.runs.chunk_tasks:map_range",
+                path_of(map_range),
                 (str(work), store.fingerprint, numbers.start, numbers.stop),
             )
             for numbers in fusion.ranges(pending, self._length(len(pending)))

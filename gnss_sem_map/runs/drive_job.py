@@ -6,9 +6,8 @@ FOLDER/job.json          the source, the settings, and the fingerprint that the 
 
 from __future__ import annotations
 
-import io
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,9 @@ import numpy as np
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.ownership import write_whole
-from gnss_sem_map.files.work_folder import JOB, TRAJECTORY
+from gnss_sem_map.files.archives import npz_of
+from gnss_sem_map.files.atomic import write_whole
+from gnss_sem_map.files.work_folder import JOB, TRAJECTORY, writing_to
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -38,16 +38,9 @@ def write_job(
         "fingerprint": fingerprint,
         **more,
     }
-    arrays = {field.name: getattr(trajectory, field.name) for field in fields(Trajectory)}
-    file = io.BytesIO()
-    np.savez(file, **{name: array for name, array in arrays.items() if array is not None})
-    try:
-        write_whole(folder / TRAJECTORY, file.getvalue())
+    with writing_to(folder):
+        write_whole(folder / TRAJECTORY, npz_of(trajectory))
         write_whole(folder / JOB, json.dumps(about).encode())
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
 
 
 def read_job(folder: Path) -> tuple[dict[str, Any], Source, Settings, SensorLog, Trajectory]:

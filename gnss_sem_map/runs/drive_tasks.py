@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
@@ -23,69 +22,48 @@ from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
-from gnss_sem_map.run_stats import Progress
+from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.run_settings import differing, read_settings
+from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
 
 
-def map_all(
-    sources: Sequence[Source],
-    work: Path,
-    bound: BoundDrives,
-    settings_file: Path,
-    force: bool,
-    frame: LocalFrame,
-    executor: Executor,
-    progress: Progress,
-) -> dict[str, str]:
-    """Map every drive into the folder `work`; name -> reason of those that fail."""
-    origin = [frame.lat_deg, frame.lon_deg, frame.alt_m]
-    tasks = []
-    for source in sources:
-        arguments = (
-            asdict(source),
-            str(work / DRIVES / source.name),
-            str(settings_file),
-            origin,
-            force,
-            str(bound.corrections.get(source.name, "")),
-        )
-        tasks.append(Task(source.name, f"{map_one.__module__}:{map_one.__name__}", arguments))
-    found = run_tasks(tasks, executor, lambda done, total: progress("drives", done, total), lost=str)
-    return {task.name: reason.removeprefix(f"{task.name}: ") for task, reason in found if reason}
+def map_all(sources: Sequence[Source], bound: BoundDrives, force: bool, run: SeveralDrives) -> dict[str, str]:
+    """Map every drive into the work folder; name -> reason of those that fail."""
+    more = (
+        (str(run.work / DRIVES / source.name), force, str(bound.corrections.get(source.name, "")))
+        for source in sources
+    )
+    reasons = run.call(map_one, "drives", zip(sources, more, strict=True))
+    return {name: reason.removeprefix(f"{name}: ") for name, reason in reasons.items() if reason}
 
 
 def map_one(
     source: Mapping[str, Any],
-    folder: str,
     settings: str,
     origin: Sequence[float],
+    folder: str,
     force: bool,
     correction: str,
 ) -> str:
     """Map one drive into a folder of its own: a task. Returns the reason when it fails, else nothing."""
-    try:
-        _map_one(
+    return failure_of(
+        lambda: _map_one(
             Source(**source),
-            Path(folder),
             config.load(Path(settings)),
             LocalFrame(*origin),
+            Path(folder),
             force,
             correction,
         )
-    except (SemMapError, FactorGraphError) as error:
-        return str(error)
-    except OSError as error:
-        return f"{error.filename or 'a file'}: {error.strerror or error}"
-    return ""
+    )
 
 
 def _map_one(
-    source: Source, folder: Path, settings: Settings, frame: LocalFrame, force: bool, correction_file: str
+    source: Source, settings: Settings, frame: LocalFrame, folder: Path, force: bool, correction_file: str
 ) -> None:
     log, (correction, digest) = source.open_log(), read_correction(correction_file)
     read = fingerprints.of_log(log, source.labels_from, open_label_set(settings.classes))

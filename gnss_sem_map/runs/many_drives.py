@@ -26,7 +26,6 @@ from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.output_folder import Claim
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
@@ -39,7 +38,8 @@ from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.point_label_files import RAW_LABELS
-from gnss_sem_map.runs.run_settings import SETTINGS, read_settings
+from gnss_sem_map.runs.run_settings import read_settings
+from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.runs.written_drives import write_drives
@@ -107,20 +107,17 @@ def run_drives(
         run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
         executor_of(workers, scheduler, claim.work) as workers_of_run,
     ):
-        executor = workers_of_run or InProcess()
-        file = _begin(claim, settings, how)
-        tracks = _tracks(sources, frame, settings)
+        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
+        _begin(run, how.resume)
         base = None if align_to is None else read_base(align_to, frame)
-        bound = bind_drives(sources, tracks, settings, file, frame, claim.work, executor, progress, base)
-        failed = map_all(sources, claim.work, bound, file, how.force, frame, executor, progress)
+        bound = bind_drives(sources, _tracks(sources, frame, settings), run, base)
+        failed = map_all(sources, bound, how.force, run)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
             raise DataError(f"{out}: no drive could be mapped; {_first(failed)}")
         labelled = [source for source in sources if source.name in done and write_labels]
-        about = write_drives(
-            out, done, settings, frame, failed, claim.work, bound, executor, progress, labelled, align_to
-        )
+        about = write_drives(out, done, failed, bound, run, labelled, align_to)
     return ManyDrives(out, about)
 
 
@@ -158,7 +155,8 @@ def add_drive(
     _check_distinct([*known, (drive.name, drive)])
     added = [how.source(drive)]
     with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
-        about = _changed(out, there, added, settings, frame, how, claim, progress)
+        run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
+        about = _changed(out, there, added, how, run)
     return ManyDrives(out, about)
 
 
@@ -171,8 +169,9 @@ def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrive
     if not stay:
         raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
     with run_folder.claimed_run(out) as claim:
+        run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
         try:
-            about = _changed(out, stay, [], settings, frame, HowMapped(force=True), claim, progress)
+            about = _changed(out, stay, [], HowMapped(force=True), run)
         finally:
             work_folder.remove_drives(claim.work)  # nothing resumes a removal
     return ManyDrives(out, about)
@@ -182,20 +181,18 @@ def _changed(
     out: Path,
     there: Mapping[str, Path],
     added: Sequence[Source],
-    settings: Settings,
-    frame: LocalFrame,
     how: HowMapped,
-    claim: Claim,
-    progress: Progress,
+    run: SeveralDrives,
 ) -> dict[str, Any]:
     """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
-    file, align_to = _begin(claim, settings, how), read_run(out).get("aligned_to")
-    base = None if align_to is None else read_base(Path(align_to), frame)
+    _begin(run, how.resume)
+    aligned_to = read_run(out).get("aligned_to")
+    align_to = None if aligned_to is None else Path(aligned_to)
+    base = None if align_to is None else read_base(align_to, run.frame)
     tracks = {name: _driven(folder) for name, folder in there.items()}
-    tracks |= _tracks(added, frame, settings)
+    tracks |= _tracks(added, run.frame, run.settings)
     known = [_source_of(name, folder) for name, folder in there.items()]
-    sources = [*known, *added]
-    bound = bind_drives(sources, tracks, settings, file, frame, claim.work, InProcess(), progress, base)
+    bound = bind_drives([*known, *added], tracks, run, base)
     for name in there:
         if name in bound.failed:
             raise DataError(
@@ -206,14 +203,11 @@ def _changed(
         source for source in known
         if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
     ]  # fmt: skip
-    failed = map_all([*moved, *added], claim.work, bound, file, how.force, frame, InProcess(), progress)
+    failed = map_all([*moved, *added], bound, how.force, run)
     if failed:
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
-    new = {source.name: claim.work / DRIVES / source.name for source in (*moved, *added)}
-    return write_drives(
-        out, {**there, **new}, settings, frame, {}, claim.work, bound, InProcess(), progress,
-        align_to=None if align_to is None else Path(align_to),
-    )  # fmt: skip
+    new = {source.name: run.work / DRIVES / source.name for source in (*moved, *added)}
+    return write_drives(out, {**there, **new}, {}, bound, run, align_to=align_to)
 
 
 def _source_of(name: str, folder: Path) -> Source:
@@ -250,16 +244,14 @@ def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) ->
     return found
 
 
-def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
-    """Prepare the work folder; returns the file of the settings, for tasks."""
-    if not how.resume:
-        work_folder.remove_drives(claim.work)
-    work_folder.make(claim.work)
-    (claim.work / DRIVES).mkdir(exist_ok=True)
-    work_folder.remove_damaged_drives(claim.work)
-    file = claim.work / DRIVES / SETTINGS
-    file.write_text(settings.to_yaml(), "utf-8")
-    return file
+def _begin(run: SeveralDrives, resume: bool) -> None:
+    """Prepare the work folder, with the settings for tasks."""
+    if not resume:
+        work_folder.remove_drives(run.work)
+    work_folder.make(run.work)
+    (run.work / DRIVES).mkdir(exist_ok=True)
+    work_folder.remove_damaged_drives(run.work)
+    run.settings_file.write_text(run.settings.to_yaml(), "utf-8")
 
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:

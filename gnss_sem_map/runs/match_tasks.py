@@ -11,7 +11,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import lru_cache, reduce
 from operator import add
 from pathlib import Path
@@ -23,11 +23,12 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.archives import npz_of
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import MATCHES
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
@@ -83,7 +84,7 @@ class SavedMatches:
                 yield n
             return
         write_job(folder, self.source, settings, trajectory, fingerprint)
-        function = f"{match_one.__module__}:{match_one.__name__}"
+        function = path_of(match_one)
         tasks = [
             Task(f"{log.name}, section {n} of its scans", function, (str(folder), fingerprint, n))
             for n in pending
@@ -127,21 +128,16 @@ def _opened(folder: str, fingerprint: str) -> tuple[SensorLog, Trajectory, Setti
 
 
 def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> None:
-    file, poses = io.BytesIO(), found.relative_poses
-    np.savez(file, **{field.name: getattr(poses, field.name) for field in fields(RelativePoses)})
+    content = npz_of(found.relative_poses)
     about = {
         "fingerprint": fingerprint,
-        "sha256": hashlib.sha256(file.getvalue()).hexdigest(),
+        "sha256": hashlib.sha256(content).hexdigest(),
         "counts": dict(found.counts),
         "skips": [asdict(skip) for skip in found.skips],
     }
-    try:
-        write_whole(folder / f"{number}.npz", file.getvalue())
+    with work_folder.writing_to(folder):
+        write_whole(folder / f"{number}.npz", content)
         write_whole(folder / f"{number}.json", json.dumps(about).encode())
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
-        ) from None
 
 
 def _read(folder: Path, number: int, fingerprint: str) -> ScanMatches | None:

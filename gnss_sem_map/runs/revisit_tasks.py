@@ -19,7 +19,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.work_folder import REVISITS
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
+from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.local_maps import LocalMaps
@@ -61,7 +61,7 @@ class RevisitTasks:
         stamps = places.stamps.tolist()
         write_job(folder, self.source, settings, trajectory, fingerprint, stamps=stamps)
         groups = [pairs[start : start + PAIRS_PER_TASK] for start in range(0, len(pairs), PAIRS_PER_TASK)]
-        function = f"{register_some.__module__}:{register_some.__name__}"
+        function = path_of(register_some)
         tasks = [
             Task(f"{log.name}, places that are passed again", function, (str(folder), fingerprint, n, group))
             for n, group in enumerate(groups)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
@@ -29,15 +28,15 @@ from gnss_sem_map.files.untrusted import is_folder
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.raw_map import MAP, write_sum
-from gnss_sem_map.run_stats import Progress, RunStats
+from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.runs.run_settings import CALIBRATION, SETTINGS
 from gnss_sem_map.runs.session_changes import changes_in
+from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
@@ -49,63 +48,66 @@ OF_ONE_DRIVE = (SETTINGS, "run.json", "metrics.json", "report.html")
 def write_drives(
     out: Path,
     drives: Mapping[str, Path],
-    settings: Settings,
-    frame: LocalFrame,
     failed: Mapping[str, str],
-    work: Path,
     bound: BoundDrives,
-    executor: Executor,
-    progress: Progress,
+    run: SeveralDrives,
     labelled: Sequence[Source] = (),
     align_to: Path | None = None,
 ) -> dict[str, Any]:
     """Write the map of `drives`, name -> folder, into `out`, and the point labels of those that are `labelled`.
 
-    Intermediate results are kept in the folder `work`. Returns the content of run.json, with the drives that `failed`.
+    Returns the content of run.json, with the drives that `failed`.
     """
-    stats, label_set = RunStats(), open_label_set(settings.classes)
+    settings, stats, label_set = run.settings, RunStats(), open_label_set(run.settings.classes)
+    executor, work = run.executor, run.work
     with new_folder(out) as folder:
         parts = [folder / DRIVES / name for name in sorted(drives)]
         for part in parts:
             _link_all(drives[part.name], part)
         with stats.stage("mapping"):
-            write_sum(parts, folder, frame, settings.classes, out, executor=executor, work=work)
+            write_sum(parts, folder, run.frame, settings.classes, out, executor=executor, work=work)
         # tiles that are taken from an earlier map do not say which points of kerbs are which
         earlier = None if labelled else out
-        refined = pipeline.refine(folder, settings, stats, progress, earlier, executor=executor, work=work)
+        refined = pipeline.refine(
+            folder, settings, stats, run.progress, earlier, executor=executor, work=work
+        )
         if labelled:
-            write_point_labels(
-                folder,
-                (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled),
-                refined.kerbs,
-                settings,
-            )
+            of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
+            write_point_labels(folder, of_drives, refined.kerbs, settings)
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:
-            write_changes(changes, Georeference.of(frame, settings.delivery), label_set, folder)
+            write_changes(changes, Georeference.of(run.frame, settings.delivery), label_set, folder)
         join_movers(parts, folder)
-        about = {
-            "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
-            "merged": [part.name for part in parts],
-            "drives": {part.name: _summary(part) for part in parts},
-            "failed": dict(sorted(failed.items())),
-            "aligned_to": None if align_to is None else str(align_to.resolve()),
-            "warnings": [
-                *bound.warnings,
-                *(
-                    f"{name}: could not be bound to other drives ({bound.failed[name]})"
-                    for name in sorted(bound.failed.keys() & drives)
-                ),
-            ],
-            "passes": [asdict(row) for row in bound.passes]
-            + [row for part in parts for row in read_run(part).get("passes", ())],
-            "local_frame": asdict(frame),
+        about = _about_drives(parts, failed, bound, align_to) | {
+            "local_frame": asdict(run.frame),
             "changes": [change.about(label_set) for change in changes or ()],
             "map": about_map(folder, refined.report),
         }
-        write_merged(folder, settings, about, progress)
+        write_merged(folder, settings, about, run.progress)
     return about
+
+
+def _about_drives(
+    parts: Sequence[Path], failed: Mapping[str, str], bound: BoundDrives, align_to: Path | None
+) -> dict[str, Any]:
+    """What run.json says of the drives of a map, which are in these folders, and of what binds them."""
+    unbound = sorted(bound.failed.keys() & {part.name for part in parts})
+    return {
+        "name": parts[0].name if len(parts) == 1 else f"{len(parts)} drives",
+        "merged": [part.name for part in parts],
+        "drives": {part.name: _summary(part) for part in parts},
+        "failed": dict(sorted(failed.items())),
+        "aligned_to": None if align_to is None else str(align_to.resolve()),
+        "warnings": [
+            *bound.warnings,
+            *(f"{name}: could not be bound to other drives ({bound.failed[name]})" for name in unbound),
+        ],
+        "passes": [
+            *(asdict(row) for row in bound.passes),
+            *(row for part in parts for row in read_run(part).get("passes", ())),
+        ],
+    }
 
 
 def _labelled(source: Source, folder: Path, settings: Settings) -> LabelledDrive:

@@ -45,9 +45,8 @@ def azimuths_deg(rows: NDArray[np.float32]) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _azimuths(rows, azimuths):
-    for i in range(
-        len(azimuths)
-    ):  # rows flat and no branch, else the compiler does not vectorise: a quarter of the time
+    # rows are flat and there is no branch, else the compiler does not vectorise: it takes a quarter of the time
+    for i in range(len(azimuths)):
         x, y = np.float64(rows[4 * i]), np.float64(rows[4 * i + 1])
         angle = atan2_deg(y, x)
         azimuths[i] = angle if (x != 0) | (y != 0) else 0.0

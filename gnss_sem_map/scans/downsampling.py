@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.scans.kernels import coordinates, mark_usable
 from gnss_sem_map.sensor_log import Points
-from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, slot_of
+from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, grown, slot_of
 from gnss_sem_map.voxels.kernels import pack_keys
 
 SLOTS_PER_S = 20.0
@@ -82,9 +82,7 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
             row = table[slot]
             if 2 * count > len(table):
                 bits += 1
-                table = np.full(1 << bits, -1, np.int32)
-                for number in range(count):
-                    table[slot_of(keys[number], keys, table, bits)] = number
+                table = grown(keys, count, bits)
         counts[row] += 1
         means[row, 0] += x
         means[row, 1] += y

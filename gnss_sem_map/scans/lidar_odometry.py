@@ -263,12 +263,9 @@ class _Odometry:
             )
         settled = self._align(points, coarse.T_target_source, SETTLED * settings.voxel_size_m, FINE_M)
         # the information comes from the coarse match: its residuals include moving objects, which makes it smaller
-        information, weight = registration.information(coarse, points)
-        length = float(np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1))))
-        T, covariance, is_open = registration.close_open_directions(
-            guess, registration.rigid(settled.T_target_source), information, weight, length,
-            settings.degenerate_share, settings.degenerate_stddev_m,
-        )  # fmt: skip
+        T, covariance, is_open = registration.remap_solution(
+            guess, registration.rigid(settled.T_target_source), coarse, points, settings
+        )
         # a match in a degenerate direction may slide without harm
         if not is_open and not all(registration.has_converged(result) for result in (coarse, settled)):
             raise _NoMatch(f"the registration did not converge in {registration.MAX_ITERATIONS} iterations")

@@ -35,7 +35,7 @@ def has_converged(result: small_gicp.RegistrationResult) -> bool:
     return bool(result.converged or result.iterations < MAX_ITERATIONS - 1)
 
 
-def information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
+def _information(result: small_gicp.RegistrationResult, points: small_gicp.PointCloud) -> tuple[Array, float]:
     """Information matrix (6, 6) of the pose in source axes from the planes only, and the sum of their normal weights.
 
     The Hessian of the registration also contains the weight along the planes. That is no information about the pose:
@@ -53,25 +53,25 @@ def information(result: small_gicp.RegistrationResult, points: small_gicp.PointC
     return scale * planes, scale * NORMAL_WEIGHT * result.num_inliers
 
 
-def close_open_directions(
+def remap_solution(
     guess: Array,
     T: Array,
-    information: Array,
-    weight: float,
-    length_m: float,
-    degenerate_share: float,
-    degenerate_stddev_m: float,
+    result: small_gicp.RegistrationResult,
+    points: small_gicp.PointCloud,
+    settings: DegenerateSettings,
 ) -> tuple[Array, Array, bool]:
     """Pose and covariance (6, 6) of a match, and whether any direction is degenerate: along those the guess is kept.
 
-    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by `length_m`, so that they are
-    comparable with translations. A direction is degenerate when its information is below a share of `weight`, that of
-    all points across their planes; its standard deviation is then `degenerate_stddev_m`.
+    Solution remapping of Zhang et al. 2016, in a tangent whose rotations are multiplied by the usual distance of the
+    source `points`, so that they are comparable with translations. A direction is degenerate when its information, by
+    the registration `result`, is below a share of that of all points across their planes.
     """
+    information, weight = _information(result, points)
+    length_m = np.sqrt(np.mean(np.sum(points.points()[:, :3] ** 2, axis=1)))
     scale = np.repeat([length_m, 1.0], 3)
     eigenvalues, axes = np.linalg.eigh(information / np.outer(scale, scale))
-    is_open = eigenvalues < degenerate_share * weight
-    variances = np.where(is_open, degenerate_stddev_m**2, 1 / np.where(is_open, 1.0, eigenvalues))
+    is_open = eigenvalues < settings.degenerate_share * weight
+    variances = np.where(is_open, settings.degenerate_stddev_m**2, 1 / np.where(is_open, 1.0, eigenvalues))
     covariance = (axes * variances) @ axes.T / np.outer(scale, scale)
     if is_open.any():
         held = axes[:, ~is_open]

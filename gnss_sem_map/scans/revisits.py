@@ -277,10 +277,6 @@ def register(
         return None
     if not all(map(registration.has_converged, results[JUDGED:])):
         return None
-    information, weight = registration.information(judged, second)
-    length = float(np.sqrt(np.mean(np.sum(second.points()[:, :3] ** 2, axis=1))))
-    T, covariance, _ = registration.close_open_directions(
-        guess, T, information, weight, length, settings.degenerate_share, settings.degenerate_stddev_m
-    )
+    T, covariance, _ = registration.remap_solution(guess, T, judged, second, settings)
     least = np.repeat([settings.rotation_stddev_rad**2, settings.translation_stddev_m**2], 3)
     return T, (covariance + covariance.T) / 2 + np.diag(least)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.output_folder import locked, real_path
-from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.run_stats import Progress, silent

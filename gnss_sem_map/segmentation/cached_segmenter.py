@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.ownership import write_whole
+from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.labels.label_set import OTHER, LabelSet
 from gnss_sem_map.scans.projection import class_image
 from gnss_sem_map.segmentation import Segmenter

@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.backbones import RESNET_BLOCKS
@@ -166,7 +166,7 @@ def _read_safetensors(path: Path) -> Checkpoint:
             path, tensors, tuple(map(str, names)) if names else None, float(about.get("scale", 1.0))
         )
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)
         raise DataError(f"checkpoint {shown(path)}: no safetensors file ({reason}); get it again") from None
 
 

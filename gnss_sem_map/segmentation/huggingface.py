@@ -25,7 +25,7 @@ from transformers import (
 from transformers.image_processing_base import ImageProcessingMixin
 from transformers.utils import logging
 
-from gnss_sem_map.errors import DataError, program
+from gnss_sem_map.errors import DataError, one_line, program
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.segmentation.classes import VOID, named_classes
 from gnss_sem_map.segmentation.networks import NetworkSegmenter, Probabilities, find_device, from_logits
@@ -79,7 +79,7 @@ def _load(model: str) -> tuple[Any, Any]:
             raise DataError(
                 f"hf:{model}: not on this machine; get it once with `{program('hf')} download {model}`"
             ) from None
-        raise DataError(f"hf:{model}: cannot be read ({' '.join(str(error).split())[:200]})") from None
+        raise DataError(f"hf:{model}: cannot be read ({one_line(error)})") from None
     unset = sorted([*report["missing_keys"], *report["mismatched_keys"]])
     if unset:
         raise DataError(
@@ -186,9 +186,8 @@ def _task_tokens(model: str, config: Any) -> Tensor:
         [TASK], padding="max_length", max_length=config.task_seq_len, truncation=True, return_tensors="pt"
     )
     masked: Tensor = tokens["input_ids"] * tokens["attention_mask"]
-    if len(masked.unique()) < len(
-        TASK.split()
-    ):  # without its vocabulary a tokenizer gives every word the same token
+    # without its vocabulary a tokenizer gives every word the same token
+    if len(masked.unique()) < len(TASK.split()):
         raise DataError(
             f"hf:{model}: its tokenizer does not know {TASK!r}; vocab.json and merges.txt are missing"
         )

@@ -113,9 +113,8 @@ class Distortion(BaseModel):
                 ((beside[0] - here[0]) / h, (beside[1] - here[1]) / h) for beside in (beside_a, beside_b)
             )
             dx, dy, area = here[0] - x, here[1] - y, xa * yb - xb * ya
-            area = np.where(
-                (r < LENS_EDGE * out[-1]) & (area > 0), area, np.inf
-            )  # beyond, nothing to be found
+            # beyond the edge there is nothing to be found
+            area = np.where((r < LENS_EDGE * out[-1]) & (area > 0), area, np.inf)
             a, b = a - (yb * dx - xb * dy) / area, b - (xa * dy - ya * dx) / area
             shrink = np.minimum(1.0, most / np.maximum(np.hypot(a, b), 1e-12))
             a, b = a * shrink, b * shrink

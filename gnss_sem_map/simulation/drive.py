@@ -202,9 +202,8 @@ def prepare(
     day, built = day_of(seed, session), session_of(usual, seed, session)
     town, ego, movers = drive_through(built, seconds, day, laps=laps, weaves=laps > 1 or session > 0)
     rng = np.random.default_rng([day, 5])
-    first = 0.05 + (
-        float(rng.uniform(0.0, 0.1)) if session else 0.0
-    )  # no two days' scans are of the same places
+    # no two days' scans are of the same places
+    first = 0.05 + (float(rng.uniform(0.0, 0.1)) if session else 0.0)
     edges = first + 0.1 * np.arange(frames + 1) + np.concatenate([[0.0], rng.uniform(-4e-4, 4e-4, frames)])
     sweeps = np.column_stack([edges[:-1], edges[1:]])
     ticks = np.arange(-EARLY_S + 0.05, seconds + LATE_S - 0.3, 0.01)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import is_folder, read_bytes, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.voxels.map_json import files_of, name_of, tile_of
@@ -129,7 +129,7 @@ def decode(content: bytes, tile: Tile) -> Attributes:
         table = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True).read()
         local, points, last_us, intensity = (numbers_of(table, name) for name in COLUMNS)
     except (pa.ArrowException, OSError, KeyError) as error:
-        raise ValueError(" ".join(str(error).split())[:200]) from None
+        raise ValueError(one_line(error)) from None
     keys = global_keys(tile, local)
     if not (keys[1:] > keys[:-1]).all():
         raise ValueError("its keys are not sorted and unique")

@@ -40,10 +40,17 @@ def _numbered(keys):
         numbers[i] = table[slot]
         if 2 * count > len(table):
             bits += 1
-            table = np.full(1 << bits, -1, np.int32)
-            for number in range(count):
-                table[slot_of(found[number], found, table, bits)] = number
+            table = grown(found, count, bits)
     return found[:count].copy(), numbers
+
+
+@njit(cache=True, nogil=True)
+def grown(found, count, bits):
+    """A table of so many bits with the first `count` keys that were found."""
+    table = np.full(1 << bits, -1, np.int32)
+    for number in range(count):
+        table[slot_of(found[number], found, table, bits)] = number
+    return table
 
 
 @njit(cache=True, nogil=True, inline="always")

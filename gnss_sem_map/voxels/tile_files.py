@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import read_bytes, shown
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.kernels import AXIS_BITS
@@ -106,7 +106,7 @@ def _read(
         _check(columns, len(label_set.names))
         return columns
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)
         raise DataError(f"{shown(path)}: damaged tile ({reason}); make the map again") from None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 
 MOST_BYTES = 1 << 30
 """Of a chunk or a message; recorders write chunks of 1 to 10 MB."""
@@ -22,7 +22,7 @@ def expand(data: bytes, codec: str, where: str, most: int = MOST_BYTES) -> bytes
     try:
         return _DECOMPRESSORS[codec](data, most)
     except (OSError, RuntimeError, ValueError, EOFError) as error:
-        raise DataError(f"{where}: damaged {codec} data ({' '.join(str(error).split())[:100]})") from None
+        raise DataError(f"{where}: damaged {codec} data ({one_line(error, 100)})") from None
 
 
 def _bz2(data: bytes, most: int) -> bytes:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.ros.chunks import Chunks
 from gnss_sem_map.datasets.ros.codecs import MOST_BYTES, expand
 from gnss_sem_map.datasets.ros.open_file import OpenFile
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import shown
 
 Ints = NDArray[np.int64]
@@ -52,7 +52,7 @@ class McapFile:
             self._sizes, self._spans = (np.array(rows, np.int64).reshape(-1, 2) for rows in (sizes, spans))
         except (ReaderError, *DAMAGED) as error:
             raise DataError(
-                f"{shown(path)}: truncated, damaged or not closed ({_line(error)}); repair it: mcap recover"
+                f"{shown(path)}: truncated, damaged or not closed ({one_line(error, 120)}); repair it: mcap recover"
                 f" {shown(path.name)} -o repaired.mcap"
             ) from None
         self._codecs = [chunk.compression for chunk in chunks]
@@ -140,7 +140,3 @@ def _joined(parts: list[tuple[int, NDArray[np.uint64]]]) -> tuple[Ints, Ints]:
         for number, pairs in parts
     ]
     return times, np.concatenate(places)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -13,7 +13,7 @@ from factor_graphs.measurements import ImuNoise
 from gnss_sem_map.datasets.gnss_files import GnssFile
 from gnss_sem_map.datasets.ros.stamps import Clock
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.structured import read_yaml
+from gnss_sem_map.files.structured import fault_of, read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.sensor_log.cameras import Distortion, is_rigid
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -126,11 +126,7 @@ def read_rig(path: Path) -> Rig:
     try:
         return Rig.model_validate(read_yaml(path) or {})
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise DataError(
-            f"{shown(path)}: {place[:100]}: {first['msg'][:200]}; see docs/your_own_log.md"
-        ) from None
+        raise DataError(f"{shown(path)}: {fault_of(error)}; see docs/your_own_log.md") from None
 
 
 def matrix(pose: Pose | None) -> NDArray[np.float64] | None:

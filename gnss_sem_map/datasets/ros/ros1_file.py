@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gnss_sem_map.datasets.ros.chunks import Chunks
 from gnss_sem_map.datasets.ros.codecs import expand
 from gnss_sem_map.datasets.ros.open_file import OpenFile
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import shown
 
 Ints = NDArray[np.int64]
@@ -47,7 +47,7 @@ class Ros1File:
             OSError,
         ) as error:
             raise DataError(
-                f"{shown(path)}: truncated, damaged or not indexed ({_line(error)}); repair it: rosbag reindex"
+                f"{shown(path)}: truncated, damaged or not indexed ({one_line(error, 120)}); repair it: rosbag reindex"
                 f" {shown(path.name)}"
             ) from None
         try:
@@ -106,7 +106,3 @@ class Ros1File:
     def _expanded(self, chunk: int) -> bytes:
         start, size = self._chunk[chunk].tolist()
         return expand(self._file.read(start, size), self._codecs[chunk], f"{shown(self.path)}: chunk {chunk}")
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -46,7 +46,7 @@ def write_job(
         write_whole(folder / JOB, json.dumps(about).encode())
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then run it again"
         ) from None
 
 

@@ -152,25 +152,25 @@ def add_drive(
     progress: Progress = silent,
 ) -> ManyDrives:
     """Add a drive to a finished map, with its settings and in its frame; raises DataError when the drive fails."""
-    settings, frame, there = _opened(out)
     drive = _absolute(drive)
-    known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
-    _check_distinct([*known, (drive.name, drive)])
     added = [how.source(drive)]
     with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
+        settings, frame, there = _opened(out)  # now no other command can change it
+        known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
+        _check_distinct([*known, (drive.name, drive)])
         about = _changed(out, there, added, settings, frame, how, claim, progress)
     return ManyDrives(out, about)
 
 
 def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrives:
     """Take a drive out of a finished map; raises DataError when it is not there, or the only one."""
-    settings, frame, there = _opened(out)
-    stay = {known: folder for known, folder in there.items() if known != name}
-    if len(stay) == len(there):
-        raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
-    if not stay:
-        raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
     with run_folder.claimed_run(out) as claim:
+        settings, frame, there = _opened(out)
+        stay = {known: folder for known, folder in there.items() if known != name}
+        if len(stay) == len(there):
+            raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
+        if not stay:
+            raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
         try:
             about = _changed(out, stay, [], settings, frame, HowMapped(force=True), claim, progress)
         finally:

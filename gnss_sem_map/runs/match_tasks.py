@@ -140,7 +140,7 @@ def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> No
         write_whole(folder / f"{number}.json", json.dumps(about).encode())
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then run it again"
         ) from None
 
 

@@ -159,10 +159,11 @@ def print_metrics(metrics: dict[str, Any]) -> None:
     ]
     if "trajectory" in metrics:
         t = metrics["trajectory"]
+        share = t.get("rpe_translation_share")
         lines.append(
             f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
-            f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
-            f" {100 * t['rpe_translation_share']:.2f} % relative"
+            f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg"
+            + ("" if share is None else f", {100 * share:.2f} % relative")
         )
         if "position_nees_per_dof" in t:
             lines.append(

@@ -28,7 +28,7 @@ Listed = Mapping[str, list[str]]
 
 
 def write_list(folder: Path, all_content: bool = False) -> None:
-    """Write the list of all files in a folder: they are ours. With `all_content`, that of large files counts as well."""
+    """Write the list of all files in a folder: they are ours. With `all_content`, large ones count with theirs, too."""
     _write_marker(folder, {name: [state_of(folder / name, all_content)] for name in _content(folder)})
 
 

@@ -223,8 +223,7 @@ class Run:
             log = replace(self.drive(), frame=self.frame)  # --origin, or another drive, may have given it
             settings, before, stats = self.settings, self.about, RunStats()
             network = open_segmenter(spec, self.label_set, device, log.calibration.image_sizes)
-            is_from_lidar = bool(before.get("from_lidar_odometry"))
-            drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
+            drive = Drive(log, self.trajectory, network, settings)
             with TemporaryDirectory(prefix=".work.", dir=folder) as work:
                 mapped = pipeline.map_drive(
                     drive, folder, Path(work) / "work", stats, progress, labels_from=spec

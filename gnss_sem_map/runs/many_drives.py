@@ -156,6 +156,9 @@ def add_drive(
     added = [how.source(drive)]
     with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
         settings, frame, there = _opened(out)  # now no other command can change it
+        if how.resume and drive.name in there and _is_of(there[drive.name], added[0]):
+            work_folder.clear(claim.work)  # it was killed when the map was there already
+            return ManyDrives(out, read_run(out))
         known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
         _check_distinct([*known, (drive.name, drive)])
         about = _changed(out, there, added, settings, frame, how, claim, progress)
@@ -222,6 +225,11 @@ def _source_of(name: str, folder: Path) -> Source:
     drive = str(inputs.get("drive", folder / name))
     segmenter, frames, drive_format = (inputs.get(key) for key in ("segmenter", "frames", "drive_format"))
     return Source(drive, segmenter, frames, drive_format, called=name)
+
+
+def _is_of(folder: Path, source: Source) -> bool:
+    """Whether a drive of a finished map was made from this."""
+    return inputs_of(folder) == {name: said for name, said in source.inputs.items() if said is not None}
 
 
 def _correction_of(folder: Path) -> str:

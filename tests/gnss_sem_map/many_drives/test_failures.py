@@ -279,6 +279,20 @@ def test_a_changed_byte_of_a_large_file_of_a_finished_drive_is_found(
     assert_same(out, made["ab"])
 
 
+def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
+    stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
+    kept = shutil.copytree(work, tmp_path / "kept")
+    again = replace(how, resume=True)
+    add_drive(out, drives.by_name["c"], again)
+    kept.rename(work)  # as if it had been killed before it removed it
+    add_drive(out, drives.by_name["c"], again)
+    assert_same(out, made["abc"])
+    assert not work.exists()
+
+
 def test_a_drive_that_was_added_while_another_command_began_stays(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,7 +158,6 @@ def test_resuming_something_else_is_refused(drive: Drive, tmp_path: Path) -> Non
     for changed in (
         replace(drive, settings=other),
         replace(drive, log=replace(drive.log, scans=drive.log.scans[2:])),
-        replace(drive, from_lidar_odometry=True),
         by_chunks(drive, 1),
     ):
         with pytest.raises(DataError, match="another drive, trajectory, labels, settings or version"):

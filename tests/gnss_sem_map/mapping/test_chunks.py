@@ -46,7 +46,7 @@ def moving() -> Drive:
 
     scans = [replace(scan, read=damaged) if scan.number == DAMAGED else scan for scan in log.scans]
     assert log.given is not None
-    drive = Drive(replace(log, scans=tuple(scans)), log.given, None, Settings(), from_lidar_odometry=True)
+    drive = Drive(replace(log, scans=tuple(scans)), log.given, None, Settings())
     return by_chunks(drive, WINDOW)
 
 

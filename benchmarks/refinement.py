@@ -187,13 +187,13 @@ def on_raw_drive(data: Path) -> Figures:
         ("the unit's own poses", log.reference),
         ("GNSS and IMU alone", estimate_trajectory(log, alone, RunStats())[0]),
     ):
-        drive = Drive(log, trajectory, segmenter, Settings(), from_lidar_odometry=name == AS_IT_RUNS)
+        drive = Drive(log, trajectory, segmenter, Settings())
         found, cost = timed_mapping(drive)
         figures[name] = (
             tracklets.removal(drive, removed_in_all(drive, found, refined_map(found)), data / RAW_0005) | cost
         )
         figures[f"{name}, paper's rule"] = tracklets.removal(drive, by_the_paper(drive), data / RAW_0005)
-    drive = Drive(log, as_it_runs, None, Settings(), from_lidar_odometry=True)
+    drive = Drive(log, as_it_runs, None, Settings())
     found = mapped(drive)
     removed = removed_in_all(drive, found, refined_map(found))
     return figures | {WITHOUT_LABELS: tracklets.removal(drive, removed, data / RAW_0005)}
@@ -215,7 +215,6 @@ def perfectly_seen(folder: Path) -> Drive:
         estimate_trajectory(log, Settings(), RunStats())[0],
         segmenter,
         Settings(),
-        from_lidar_odometry=True,
     )
 
 

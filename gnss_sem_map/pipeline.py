@@ -148,13 +148,18 @@ def run(
             write(located)
         located = located.in_short()
     release_memory(always=True)  # of graph and local map: holes too small for the arrays of scans
-    drive = Drive(
-        located.log, located.trajectory, segmenter, settings, from_lidar_odometry=from_lidar_odometry
-    )
+    drive = Drive(located.log, located.trajectory, segmenter, settings)
     mapped = map_drive(
         drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
-    return replace(mapped, solution=located.solution, passes=passes, sharpness=sharpness, preflight=page)
+    return replace(
+        mapped,
+        solution=located.solution,
+        passes=passes,
+        sharpness=sharpness,
+        from_lidar_odometry=from_lidar_odometry,
+        preflight=page,
+    )
 
 
 def _in_map(
@@ -244,7 +249,6 @@ def map_drive(
         stats,
         store.objects(),
         store.untracked(),
-        from_lidar_odometry=drive.from_lidar_odometry,
     )
 
 

@@ -167,10 +167,11 @@ def _single_figures(metrics: dict[str, Any]) -> Iterator[str]:
     t = metrics.get("trajectory")
     if t is None:
         return
+    share = t.get("rpe_translation_share")
     yield (
         f"trajectory      {t['ate_m']:.3f} m absolute, {t['ate_aligned_m']:.3f} m aligned,"
-        f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg,"
-        f" {100 * t['rpe_translation_share']:.2f} % relative"
+        f" heading {t['heading_rms_deg']:.3f} deg, tilt {t['tilt_rms_deg']:.3f} deg"
+        + ("" if share is None else f", {100 * share:.2f} % relative")
     )
     if "position_nees_per_dof" not in t:
         return

@@ -151,12 +151,12 @@ def _in_frame_of(out: Path, poses: Trajectory, world: Path) -> Trajectory:
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:
     """Absolute trajectory error without alignment and after the best rigid alignment; relative error over a second.
 
+    With one pose in common, as of a drive of one scan, there is no relative error.
     Where the estimate has covariances, also its mean NEES (normalised estimation error squared) per degree of freedom,
     and the `coverage` of the position and of its horizontal part.
     """
     error = errors(estimate, truth)
     stamps = error.stamps
-    relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
     scores = {
         "ate_m": error.ate_m,
         "horizontal_rms_m": error.horizontal_rms_m,
@@ -164,10 +164,12 @@ def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float
         "heading_rms_deg": error.heading_rms_deg,
         "tilt_rms_deg": error.tilt_rms_deg,
         "ate_aligned_m": _aligned_rms(estimate.at(stamps)[:, :3, 3], truth.at(stamps)[:, :3, 3]),
-        "rpe_translation_m": relative.translation_m,
-        "rpe_translation_share": relative.translation_share,
-        "rpe_rotation_deg": relative.rotation_deg,
     }
+    if len(stamps) > 1:
+        relative = relative_error(estimate, truth, min(ONE_SECOND, len(stamps) - 1))
+        scores["rpe_translation_m"] = relative.translation_m
+        scores["rpe_translation_share"] = relative.translation_share
+        scores["rpe_rotation_deg"] = relative.rotation_deg
     if estimate.covariances is None:
         return scores
     found = pose_nees(estimate, truth)

@@ -92,8 +92,12 @@ def claimed(
 
 
 @contextmanager
-def new_folder(out: Path, by_name: Callable[[str], bool] = lambda name: False) -> Iterator[Path]:
+def new_folder(
+    out: Path, by_name: Callable[[str], bool] = lambda name: False, all_content: bool = False
+) -> Iterator[Path]:
     """A new folder for writing; it is renamed to `out` when the block succeeds, and removed when it fails.
+
+    For `all_content` see `ownership.write_list`.
 
     An earlier result of ours at `out` is replaced, and what was kept for --resume is removed. Raises DataError as
     `claimed` does, when the disk is full, and when the old result can no longer be replaced: then it says where the
@@ -104,7 +108,7 @@ def new_folder(out: Path, by_name: Callable[[str], bool] = lambda name: False) -
         try:
             part.mkdir()
             yield part
-            ownership.write_list(part)
+            ownership.write_list(part, all_content)
             _swap(claim, part)
         except OSError as error:
             raise DataError(

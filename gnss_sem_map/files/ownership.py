@@ -1,7 +1,7 @@
 """Ownership of files: every result folder has a list of its files, and only listed files are ever removed.
 
 The list holds the size of each file, and the content of small ones (those that people edit) as a checksum: what was
-changed since is somebody's work, and no longer ours.
+changed since is somebody's work, and no longer ours. Of intermediate results it holds the checksum of every file.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ Listed = Mapping[str, list[str]]
 """Path within the folder -> accepted states (size, checksum) of our file; folders end in '/'."""
 
 
-def write_list(folder: Path) -> None:
-    """Write the list of all files in a folder: they are ours."""
-    _write_marker(folder, {name: [state_of(folder / name)] for name in _content(folder)})
+def write_list(folder: Path, all_content: bool = False) -> None:
+    """Write the list of all files in a folder: they are ours. With `all_content`, large ones count with theirs, too."""
+    _write_marker(folder, {name: [state_of(folder / name, all_content)] for name in _content(folder)})
 
 
 def read_list(folder: Path) -> Listed | None:
@@ -53,7 +53,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
         if listed is None:
             ours = by_name(name) and not os.path.islink(folder / name)
         else:
-            ours = name in listed and state_of(folder / name) in listed[name]
+            ours = name in listed and _is_as_listed(folder / name, listed[name])
         if not ours:
             return name
     return None
@@ -62,7 +62,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
 def is_whole(folder: Path) -> bool:
     """Whether all files that we wrote into a folder still exist, unchanged."""
     listed = read_list(folder)
-    return listed is not None and all(state_of(folder / name) in states for name, states in listed.items())
+    return listed is not None and all(_is_as_listed(folder / name, states) for name, states in listed.items())
 
 
 def remove(folder: Path) -> None:
@@ -74,7 +74,7 @@ def remove(folder: Path) -> None:
     # the deepest first, so that folders are empty when their turn comes
     for name in sorted(listed, key=lambda name: name.count("/") - name.endswith("/"), reverse=True):
         path = folder / name
-        if state_of(path) in listed[name]:
+        if _is_as_listed(path, listed[name]):
             path.rmdir() if name.endswith("/") else path.unlink()
     remove_partials(folder)
     left = next(_content(folder), None)
@@ -119,7 +119,7 @@ def _amending(folder: Path, states: Mapping[str, str]) -> Iterator[None]:
             listed = dict(read_list(place) or {})
             for name, state in states.items():
                 known = listed.get(inside + name, [])
-                if os.path.lexists(folder / name) and state_of(folder / name) not in known:
+                if os.path.lexists(folder / name) and not _is_as_listed(folder / name, known):
                     raise DataError(
                         f"{folder / name}: was not written by us, or was changed since; move it away"
                     )
@@ -153,8 +153,11 @@ def is_partial(name: str) -> bool:
     return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
 
 
-def state_of(path: Path) -> str:
-    """State of a file: its size, and the checksum of a small one; 'folder', or 'other' for what is neither."""
+def state_of(path: Path, all_content: bool = False) -> str:
+    """State of a file: its size, and the checksum of a small one; 'folder', or 'other' for what is neither.
+
+    With `all_content`, also the checksum of a large one.
+    """
     try:
         if path.is_symlink():
             return "other"
@@ -163,9 +166,17 @@ def state_of(path: Path) -> str:
         if not path.is_file():
             return "other"
         size = path.stat().st_size
-        return _state_of_bytes(path.read_bytes()) if size <= CONTENT_BYTES else str(size)
+        if size > CONTENT_BYTES and not all_content:
+            return str(size)
+        with path.open("rb") as file:
+            return f"{size} {hashlib.file_digest(file, 'sha256').hexdigest()[:32]}"
     except OSError:
         return "other"
+
+
+def _is_as_listed(path: Path, states: list[str]) -> bool:
+    """Whether a file is in one of these states; the checksum of a large one is compared where they have it."""
+    return any(state_of(path, " " in state) == state for state in states)
 
 
 def _state_of_bytes(content: bytes) -> str:

@@ -62,7 +62,7 @@ def writing_to(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DataError(
-            f"{folder}: cannot be written ({error.strerror}); free the disk, then --resume"
+            f"{folder}: cannot be written ({error.strerror}); free the disk, then run it again"
         ) from None
 
 

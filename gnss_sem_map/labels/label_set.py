@@ -227,13 +227,14 @@ def _whole(value: Any, below: int) -> int:
     return value
 
 
+_SHIPPED = resources.files("gnss_sem_map") / "labels"
 _CACHE: dict[str, dict[str, Any]] = {}
 
 
 @cache
 def _shipped() -> list[str]:
     """Names of the class sets and taxonomies that ship with us."""
-    files = [Path(file.name) for file in (resources.files("gnss_sem_map") / "labels").iterdir()]
+    files = [Path(file.name) for file in _SHIPPED.iterdir()]
     return sorted(file.stem for file in files if file.suffix == ".yaml")
 
 
@@ -243,7 +244,7 @@ def _read(name_or_file: str | Path) -> dict[str, Any]:
     if name in _CACHE:
         return _CACHE[name]
     if name in available:
-        file = Path(str(resources.files("gnss_sem_map") / "labels" / f"{name}.yaml"))
+        file = Path(str(_SHIPPED / f"{name}.yaml"))
     elif is_file(Path(name), ConfigError):
         file = Path(name)
     else:

@@ -89,7 +89,7 @@ class ChunkStore:
             self._put(beside, chunk.number)
         except OSError as error:
             raise DataError(
-                f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then --resume"
+                f"{self.folder}: cannot save voxels ({error.strerror}); free the disk, then run it again"
             ) from None
         finally:
             shutil.rmtree(beside, ignore_errors=True)
@@ -189,7 +189,7 @@ class ChunkStore:
             return record
         except (OSError, ValueError, KeyError, TypeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "its checksum differs"
-            raise DataError(f"{path}: damaged chunk ({reason}); --resume maps it again") from None
+            raise DataError(f"{path}: damaged chunk ({reason}); run it again") from None
 
     def _decoded(self, path: Path, tile: Tile, checksum: str) -> Attributes:
         return decode(_content(path, checksum), tile)
@@ -220,9 +220,9 @@ def _content(path: Path, checksum: str) -> bytes:
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: damaged ({error.strerror}); --resume maps the chunk again") from None
+        raise DataError(f"{path}: damaged ({error.strerror}); run it again") from None
     if hashlib.sha256(content).hexdigest() != checksum:
-        raise DataError(f"{path}: damaged (its checksum differs); --resume maps the chunk again")
+        raise DataError(f"{path}: damaged (its checksum differs); run it again")
     return content
 
 

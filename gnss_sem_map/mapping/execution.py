@@ -195,6 +195,6 @@ class Losses:
             task,
             GivenUp(
                 f"{task.name}: given up after {len(reasons)} attempts: {told}; take fewer workers if memory is short, a"
-                " longer time-out if it is slow, and --resume"
+                " longer time-out if it is slow, and run it again"
             ),
         )

@@ -27,7 +27,7 @@ def of_log(log: SensorLog, labels_from: str = "", label_set: LabelSet | None = N
     """Digest of all that is read of a drive, of the labels of its images and of their classes, and of this version."""
     said = [
         VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.conventions, _scans(log), _images(log),
-        _cameras(log), labels_from, _states(labels_from), None if label_set is None else _of_map(label_set),
+        _cameras(log), labels_from, _states(labels_from), None if label_set is None else _classes_of_map(label_set),
     ]  # fmt: skip
     tables = (log.imu, log.gnss, log.wheels, log.given, log.initial_attitude)
     values = (
@@ -52,7 +52,7 @@ def of_map(drive: Drive, labels_from: str) -> str:
     said = [
         VERSION, log.name, log.epoch_ns, labels_from, _classes(drive),
         settings.mapping.model_dump_json(), settings.labelling.model_dump_json(),
-        settings.dynamics.model_dump_json(), drive.from_lidar_odometry,
+        settings.dynamics.model_dump_json(),
         _scans(log), _images(log), _states(labels_from), _cameras(log),
     ]  # fmt: skip
     learnt = sensor_model.opened(settings.calibration, open_label_set(settings.classes))
@@ -79,10 +79,10 @@ def _digest(said: list[Any], arrays: Iterable[NDArray[Any]]) -> str:
 
 def _classes(drive: Drive) -> list[Any]:
     network = [] if drive.segmenter is None else list(drive.segmenter.class_names)
-    return [network, *_of_map(drive.label_set)]
+    return [network, *_classes_of_map(drive.label_set)]
 
 
-def _of_map(label_set: LabelSet) -> list[Any]:
+def _classes_of_map(label_set: LabelSet) -> list[Any]:
     """The classes of the map, and which those of a network are; their file may be changed under its name."""
     return [label_set.names, label_set.sources]
 

@@ -23,6 +23,9 @@ from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Skip
 
+GEOMETRY_ONLY = "the map shows geometry only"
+"""In every warning of a map without labels."""
+
 Elsewhere = Callable[[Drive, ChunkStore, Sequence[int]], Iterator[range]]
 """Maps chunks of these numbers into the store in other processes; yields each range of them when it is done."""
 
@@ -95,13 +98,13 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
 def _warn(drive: Drive, stats: RunStats) -> None:
     if drive.log.images and not drive.log.cameras:
         stats.warnings.append(
-            f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used: the map"
-            " shows geometry only"
+            f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used:"
+            f" {GEOMETRY_ONLY}"
         )
     elif drive.segmenter is None:
-        stats.warnings.append("no segmenter: the map shows geometry only")
+        stats.warnings.append(f"no segmenter: {GEOMETRY_ONLY}")
     elif not drive.log.cameras:
-        stats.warnings.append(f"{drive.log.name} has no images: the map shows geometry only")
+        stats.warnings.append(f"{drive.log.name} has no images: {GEOMETRY_ONLY}")
     for one in drive.by_lidar if drive.settings.dynamics.enabled else ():
         if not one.is_too_sparse:
             continue
@@ -118,7 +121,7 @@ def _check(drive: Drive, stats: RunStats) -> None:
         raise DataError(f"{drive.log.name}: none of {drive.log.scan_count} scans can be used{why}")
     if drive.segmenter is not None and drive.log.cameras and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
-        stats.warnings.append(f"no point got a label, and the map shows geometry only{why}")
+        stats.warnings.append(f"no point got a label, and {GEOMETRY_ONLY}{why}")
 
 
 def _first_reason(stats: RunStats, what: str) -> str:

@@ -58,8 +58,6 @@ class Drive:
     trajectory: Trajectory
     segmenter: Segmenter | None
     settings: Settings
-    from_lidar_odometry: bool = False
-    """Whether the poses come from LiDAR odometry, so that static objects are not blurred."""
 
     @cached_property
     def label_set(self) -> LabelSet:

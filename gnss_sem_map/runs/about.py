@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, astuple, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -17,7 +18,7 @@ from gnss_sem_map.pipeline import Mapped
 from gnss_sem_map.refinement.steps import RefinementReport
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.source import Source
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels import tiles
 
 PACKAGES = ("gnss-sem-map", "numpy", "gtsam", "numba", "opencv-python-headless", "pyproj")
@@ -43,10 +44,6 @@ def metrics_of(mapped: Mapped) -> dict[str, Any]:
 
 def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
     """The name of the drive, skips with their reasons, times and memory, for run.json."""
-    skips = sorted(set(stats.skips), key=astuple)
-    frames: Counter[str] = Counter()
-    for skip in skips:
-        frames[skip.what] += skip.frames
     return {
         "versions": {name: _version(name) for name in PACKAGES},
         "drive": drive,
@@ -55,13 +52,22 @@ def about_run(drive: str, log: SensorLog, stats: RunStats) -> dict[str, Any]:
         "local_frame": None if log.frame is None else asdict(log.frame),
         "counts": dict(sorted(stats.counts.items())),
         "warnings": stats.warnings,
-        "skips": {
-            "count": len(skips),
-            "frames": dict(sorted(frames.items())),
-            "listed": [asdict(skip) for skip in skips],
-        },
+        "skips": about_skips(stats.skips),
         "seconds": seconds_of(stats),
         "peak_memory_mb": {name: round(value) for name, value in stats.peak_memory_mb.items()},
+    }
+
+
+def about_skips(skips: Iterable[Skip]) -> dict[str, Any]:
+    """What was left out, in order, each once, for run.json."""
+    listed = sorted(set(skips), key=astuple)
+    frames: Counter[str] = Counter()
+    for skip in listed:
+        frames[skip.what] += skip.frames
+    return {
+        "count": len(listed),
+        "frames": dict(sorted(frames.items())),
+        "listed": [asdict(skip) for skip in listed],
     }
 
 

@@ -67,7 +67,6 @@ def _write_job(work: Path, source: Source, drive: Drive, store: ChunkStore) -> N
     cache = drive.segmenter.folder.resolve() if isinstance(drive.segmenter, CachedSegmenter) else None
     write_job(
         work, source, drive.settings, drive.trajectory, store.fingerprint,
-        from_lidar_odometry=drive.from_lidar_odometry,
         probabilities=None if cache is None else str(cache),
         chunks=store.count,
     )  # fmt: skip
@@ -83,7 +82,7 @@ def _opened(work: str, fingerprint: str) -> tuple[Drive, ChunkStore]:
         network = CachedSegmenter(
             network, label_set, log.calibration.image_sizes, Path(about["probabilities"])
         )
-    drive = Drive(log, trajectory, network, settings, from_lidar_odometry=about["from_lidar_odometry"])
+    drive = Drive(log, trajectory, network, settings)
     if not fingerprints.of_map(drive, source.labels_from) == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     store = ChunkStore(Path(work), fingerprint, about["chunks"], settings.mapping.voxel_size_m, label_set)

@@ -73,7 +73,7 @@ def _map_one(
     with run_folder.claimed_run(folder, run_folder.places_read([source], settings)) as claim:
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
-        with new_folder(folder) as part:
+        with new_folder(folder, all_content=True) as part:
             mapped = pipeline.run(
                 log, network, settings, part, claim.work,
                 origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),

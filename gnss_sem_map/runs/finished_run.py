@@ -31,22 +31,23 @@ from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.fusion import GEOMETRY_ONLY
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.about import about_map, with_objects
+from gnss_sem_map.runs.about import about_map, about_skips, with_objects
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, LabelledDrive, write_point_labels
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
-from gnss_sem_map.runs.run_settings import differing, read_settings
-from gnss_sem_map.runs.source import absolute, source_of
+from gnss_sem_map.runs.run_settings import SETTINGS, differing, read_settings, write_settings
+from gnss_sem_map.runs.source import Source, absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log import SensorLog, Skip
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.map_json import read_frame
@@ -177,6 +178,9 @@ class Run:
                     shutil.copytree(
                         self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
                     )
+            for known in folder.glob(f"{DRIVES}/*/{SETTINGS}"):
+                known.unlink()  # a second name of that of the run as it was
+                write_settings(known.parent, settings)
             refined = pipeline.refine(folder, settings, stats, work=folder.parent)
             if self.is_merged:
                 before = run_folder.georeference_of(self.settings, self.frame)
@@ -209,34 +213,33 @@ class Run:
 
         Raises DataError for a merged run, and if the drive was moved or removed.
         """
-        self._refuse_merged(
-            "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
-        )
-        log = replace(self.drive(), frame=self.frame)  # --origin, or another drive, may have given it
-        settings = self.settings
-        network = open_segmenter(segmenter, self.label_set, device, log.calibration.image_sizes)
-        is_from_lidar = bool(self.about.get("from_lidar_odometry"))
-        drive = Drive(log, self.trajectory, network, settings, from_lidar_odometry=is_from_lidar)
-        inputs: dict[str, Any] = self.about["inputs"] | {"segmenter": absolute(segmenter)}
-        with_labels = log if is_folder(self.folder / "labels") else None
-        stats = RunStats()
-        reads = run_folder.places_read([source_of(inputs["drive"], segmenter)])
-        with self._rewritten(out, reads) as folder, TemporaryDirectory(prefix="gnss-sem-map-") as work:
-            mapped = pipeline.map_drive(
-                drive, folder, Path(work) / "work", stats, progress, labels_from=segmenter
+        spec = absolute(segmenter.replace("{drive}", str(self.about.get("drive"))))
+        reads = run_folder.places_read([Source(inputs_of(self.folder).get("drive", ""), spec)])
+        # what is read of the run is read when no other command can change it any more
+        with self._rewritten(out, reads) as folder:
+            self._refuse_merged(
+                "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
             )
+            log = replace(self.drive(), frame=self.frame)  # --origin, or another drive, may have given it
+            settings, before, stats = self.settings, self.about, RunStats()
+            network = open_segmenter(spec, self.label_set, device, log.calibration.image_sizes)
+            drive = Drive(log, self.trajectory, network, settings)
+            with TemporaryDirectory(prefix=".work.", dir=folder) as work:
+                mapped = pipeline.map_drive(
+                    drive, folder, Path(work) / "work", stats, progress, labels_from=spec
+                )
             refined = pipeline.refine(folder, settings, stats, progress)
             refined = replace(refined, report=with_objects(refined.report, mapped))
-            run_folder.write_objects(folder, str(self.about["drive"]), mapped, settings)
+            run_folder.write_objects(folder, str(before["drive"]), mapped, settings)
+            skips = [Skip(**skip) for skip in before["skips"]["listed"] if skip["what"] != "labels"]
+            changed = {
+                "inputs": before["inputs"] | {"segmenter": spec},
+                "skips": about_skips([*skips, *stats.skips]),
+                "warnings": [said for said in before["warnings"] if GEOMETRY_ONLY not in said],
+            }
+            with_labels = log if is_folder(self.folder / "labels") else None
             run_folder.write_again(
-                folder,
-                self.folder,
-                self.trajectory,
-                refined,
-                stats,
-                settings,
-                with_labels,
-                {"inputs": inputs},
+                folder, self.folder, self.trajectory, refined, stats, settings, with_labels, changed
             )
         return Run(self.folder if out is None else Path(out))
 

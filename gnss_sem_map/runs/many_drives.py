@@ -149,12 +149,15 @@ def add_drive(
     progress: Progress = silent,
 ) -> ManyDrives:
     """Add a drive to a finished map, with its settings and in its frame; raises DataError when the drive fails."""
-    settings, frame, there = _opened(out)
     drive = _absolute(drive)
-    known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
-    _check_distinct([*known, (drive.name, drive)])
     added = [how.source(drive)]
     with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
+        settings, frame, there = _opened(out)  # now no other command can change it
+        if how.resume and drive.name in there and _is_of(there[drive.name], added[0]):
+            work_folder.clear(claim.work)  # it was killed when the map was there already
+            return ManyDrives(out, read_run(out))
+        known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
+        _check_distinct([*known, (drive.name, drive)])
         run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
         about = _changed(out, there, added, how, run)
     return ManyDrives(out, about)
@@ -162,13 +165,13 @@ def add_drive(
 
 def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrives:
     """Take a drive out of a finished map; raises DataError when it is not there, or the only one."""
-    settings, frame, there = _opened(out)
-    stay = {known: folder for known, folder in there.items() if known != name}
-    if len(stay) == len(there):
-        raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
-    if not stay:
-        raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
     with run_folder.claimed_run(out) as claim:
+        settings, frame, there = _opened(out)
+        stay = {known: folder for known, folder in there.items() if known != name}
+        if len(stay) == len(there):
+            raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
+        if not stay:
+            raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
         run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
         try:
             about = _changed(out, stay, [], HowMapped(force=True), run)
@@ -216,6 +219,11 @@ def _source_of(name: str, folder: Path) -> Source:
     drive = str(inputs.get("drive", folder / name))
     segmenter, frames, drive_format = (inputs.get(key) for key in ("segmenter", "frames", "drive_format"))
     return Source(drive, segmenter, frames, drive_format, called=name)
+
+
+def _is_of(folder: Path, source: Source) -> bool:
+    """Whether a drive of a finished map was made from this."""
+    return inputs_of(folder) == {name: said for name, said in source.inputs.items() if said is not None}
 
 
 def _correction_of(folder: Path) -> str:

@@ -163,7 +163,8 @@ def write_again(
             write_point_labels(folder, [labelled], refined.kerbs, settings)
         write_map_files(folder, [trajectory.during(first, last)], str(about["name"]), settings.delivery)
     tracked = about["map"]["refinement"]
-    about |= changed | {
+    about |= changed
+    about |= {
         "seconds": about["seconds"] | seconds_of(stats),
         "counts": about["counts"] | dict(sorted(stats.counts.items())),
         "warnings": list(dict.fromkeys([*about["warnings"], *stats.warnings])),

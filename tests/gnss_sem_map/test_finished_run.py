@@ -167,6 +167,20 @@ def test_relabelled_it_is_what_a_run_with_those_labels_makes(
     assert again.about["inputs"]["segmenter"] == finished.about["inputs"]["segmenter"]
 
 
+def test_relabelled_it_says_what_a_run_with_those_labels_says_of_them(
+    small_drive: Street, tmp_path: Path
+) -> None:
+    labels = shutil.copytree(small_drive.labels, tmp_path / small_drive.drive.name)
+    sorted(labels.iterdir())[3].unlink()
+    spec = f"labels:{tmp_path}/{{drive}}"
+    bare = run(small_drive.drive, tmp_path / "bare", force=True)
+    again = bare.relabel(spec, tmp_path / "again")
+    once = run(small_drive.drive, tmp_path / "once", spec, force=True)
+    for name in ("skips", "inputs"):
+        assert again.about[name] == once.about[name], name
+    assert not any("geometry only" in said for said in again.about["warnings"])
+
+
 def test_relabelled_it_stays_where_it_was(finished: Run, small_drive: Street, tmp_path: Path) -> None:
     assert finished.frame is not None
     origin = replace(finished.frame, lat_deg=finished.frame.lat_deg + 0.001)

@@ -18,7 +18,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import metrics
 from gnss_sem_map.evaluation.metrics import Tables, confusion, dynamic, dynamic_counts, semantics
-from gnss_sem_map.evaluation.score_run import score_run
+from gnss_sem_map.evaluation.score_run import score_run, score_trajectory
 from gnss_sem_map.files import ownership
 from gnss_sem_map.labels.label_set import open_label_set
 
@@ -224,3 +224,10 @@ def test_reliability_is_told_apart_by_the_looks_at_a_voxel() -> None:
         for low, right in (("1", 0.5), ("2", 1.0), ("5", 1.0), ("100", 0.5))
     } | {"20": [{"points": 1, "confidence": pytest.approx(0.8), "right": 0.0}]}
     assert found["bins"] == [{"points": 9, "confidence": pytest.approx(0.8), "right": pytest.approx(6 / 9)}]
+
+
+def test_a_drive_of_one_scan_has_no_relative_error() -> None:
+    one = Trajectory(np.array([1.0]), np.eye(4)[None])
+    scores = score_trajectory(one, one)
+    assert scores["ate_m"] == 0.0
+    assert not any("rpe" in name for name in scores)

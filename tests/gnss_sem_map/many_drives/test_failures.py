@@ -30,7 +30,7 @@ from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.files.output_folder import RESUMABLE
-from gnss_sem_map.files.ownership import foreign, write_list
+from gnss_sem_map.files.ownership import CONTENT_BYTES, foreign, write_list
 from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import Source
@@ -263,6 +263,49 @@ def test_what_is_damaged_of_an_interrupted_run_is_made_again(
     mapped("ab", drives, out, replace(how, resume=True))
     assert calls == ["a", "b"]
     assert_same(out, made["ab"])
+
+
+def test_a_changed_byte_of_a_large_file_of_a_finished_drive_is_found(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where files are compared by their size alone, it ends up in the map, or stops every run that is resumed."""
+    out, file = tmp_path / "out", tmp_path / ".out.work/drives/a/trajectory.png"
+    stop_of(lambda: mapped("ab", drives, out, how), many_drives, "write_drives")
+    assert file.stat().st_size > CONTENT_BYTES
+    flipped(file)
+    calls = calls_of_the_pipeline(monkeypatch)
+    mapped("ab", drives, out, replace(how, resume=True))
+    assert calls == ["a"]
+    assert_same(out, made["ab"])
+
+
+def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
+    stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
+    kept = shutil.copytree(work, tmp_path / "kept")
+    again = replace(how, resume=True)
+    add_drive(out, drives.by_name["c"], again)
+    kept.rename(work)  # as if it had been killed before it removed it
+    add_drive(out, drives.by_name["c"], again)
+    assert_same(out, made["abc"])
+    assert not work.exists()
+
+
+def test_a_drive_that_was_added_while_another_command_began_stays(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, claimed_run = shutil.copytree(made["a"], tmp_path / "out"), run_folder.claimed_run
+
+    def after_another(*words: Any, **more: Any) -> Any:
+        monkeypatch.setattr(run_folder, "claimed_run", claimed_run)
+        add_drive(out, drives.by_name["b"], how)
+        return claimed_run(*words, **more)
+
+    monkeypatch.setattr(run_folder, "claimed_run", after_another)
+    add_drive(out, drives.by_name["c"], how)
+    assert_same(out, made["abc"])
 
 
 def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed(

@@ -109,6 +109,18 @@ def test_a_map_of_many_drives_that_is_refined_again_keeps_its_drives(
     assert_same(out, made["abc"])
 
 
+def test_the_drives_of_a_map_have_its_settings_also_when_it_is_refined_with_others(
+    made: dict[str, Path], tmp_path: Path
+) -> None:
+    run, other = Run.open(made["ab"]), SETTINGS.changed("refinement.potts_mrf.enabled=false")
+    out = run.refine(other, tmp_path / "out").folder
+    assert [(out / f"drives/{name}/config.yaml").read_text() for name in "ab"] == [
+        (out / "config.yaml").read_text()
+    ] * 2
+    Run.open(out).refine(SETTINGS)
+    assert_same(out, made["ab"])
+
+
 def test_only_a_drive_that_is_there_is_taken_out(made: dict[str, Path]) -> None:
     for name in ("z", "../a", "", "a/map"):
         with pytest.raises(DataError, match=rf"ab: holds no drive '{name}'; expected one of a, b$"):

@@ -46,7 +46,7 @@ def moving() -> Drive:
 
     scans = [replace(scan, read=damaged) if scan.number == DAMAGED else scan for scan in log.scans]
     assert log.given is not None
-    drive = Drive(replace(log, scans=tuple(scans)), log.given, None, Settings(), from_lidar_odometry=True)
+    drive = Drive(replace(log, scans=tuple(scans)), log.given, None, Settings())
     return by_chunks(drive, WINDOW)
 
 
@@ -211,5 +211,5 @@ def test_a_run_folder_holds_what_the_chunks_say(
 
 
 def test_points_that_cannot_wait_are_an_error_in_one_line(moving: Drive, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"nowhere: cannot be written .*--resume"):
+    with pytest.raises(DataError, match=r"nowhere: cannot be written .*run it again"):
         list(map_chunks(moving, range(3), tmp_path / "nowhere", tmp_path))

@@ -98,7 +98,7 @@ def test_a_task_that_kills_its_dask_worker_is_called_again(scheduler: str, tmp_p
     cluster = Cluster(scheduler, work, allowed=ALLOWED)
     tasks = [task("dies", str(twice), int(signal.SIGKILL), 2), *products(4)]
     assert "survived" in results(tasks, cluster).values()
-    with pytest.raises(DataError, match=r"^dies .* 4 x a Dask worker died .*--resume"):
+    with pytest.raises(DataError, match=r"^dies .* 4 x a Dask worker died .*run it again"):
         results([task("dies", str(ever), int(signal.SIGKILL), 99)], cluster)
 
 

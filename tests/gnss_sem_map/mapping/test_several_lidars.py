@@ -77,7 +77,7 @@ def moving() -> Drive:
     points = {k: scenes.sweep(motion, scenes.street([CAR]), k) for k in range(SWEEPS)}
     log = scenes.log_of(points, scenes.trajectory_of(motion, SWEEPS))
     assert log.given is not None
-    return by_chunks(Drive(log, log.given, None, Settings(), from_lidar_odometry=True), 3)
+    return by_chunks(Drive(log, log.given, None, Settings()), 3)
 
 
 def test_scans_of_two_lidars_are_in_the_map_where_those_of_one_would_be(still: Drive) -> None:

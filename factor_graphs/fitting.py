@@ -21,7 +21,7 @@ from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
-from factor_graphs.variance import BiasSteps, imu_noise_shown
+from factor_graphs.variance import BiasSteps, fix_noise_shown, imu_noise_shown
 from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe
 from factor_graphs.wheels import Wheels, observe_wheels, wheel_factors
 
@@ -33,6 +33,8 @@ FITTING_CHI2 = (0.8, 1.3)
 INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 # White noise and walk of the IMU are looked at so often.
 NOISE_ROUNDS = 10
+# Fixes are taken for worse than they say when they are so many times: below that, an inflated IMU does no harm.
+NOTABLE_FIX_NOISE = 1.2
 # A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
@@ -53,23 +55,69 @@ def fit_noise(
     The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only. `tolerance` as
     in `optimise`.
     """
-    loss = "huber" if problem.settings.robust else "quadratic"
-    inflation, of_walk, motion, values = (
-        (1.0, 1.0, motion_graph(problem, 1.0, 1.0), first_values(problem))
-        if start is None
-        else (start.inflation, start.of_walk, start.motion, start.values)
-    )
-    fit = optimise(problem, motion, values, (inflation, of_walk), loss, constraints or [], tolerance)
-    if not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]:
-        return fit
+    if start is None:
+        fit, enough = _as_said(problem, constraints or [], tolerance), INFLATED_CHI2
+    else:
+        noise, enough = (start.inflation, start.of_walk), FITTING_CHI2[1]
+        fit = optimise(
+            problem, start.motion, start.values, noise, _loss(problem), constraints or [], tolerance
+        )
+    return fit if _fits(problem, fit) else _inflated(problem, fit, constraints or [], tolerance, enough)
+
+
+def fit_noise_of_all(problem: Problem) -> tuple[Problem, Fit]:
+    """Fit, with more noise where the residuals show it: of the fixes, then the problem is another; else of the IMU.
+
+    Fixes that are worse than they say would be followed by an IMU that is inflated without end. Only variance
+    components tell one from the other. Not where relative poses bind the keyframes: they may not fit either.
+    """
+    fit = _as_said(problem)
+    if _fits(problem, fit):
+        return problem, fit
+    if not problem.is_bound:
+        noisier, better = problem, fit
+        for _ in range(NOISE_ROUNDS):
+            of_fixes, noise = _noise_shown(noisier, better)
+            if of_fixes == noisier.of_fixes and noise == (better.inflation, better.of_walk):
+                break
+            noisier, motion = noisier.with_fix_noise(of_fixes), motion_graph(problem, *noise)
+            better = optimise(noisier, motion, better.values, noise, fit.loss)
+        if noisier.of_fixes > NOTABLE_FIX_NOISE:
+            return noisier, better
+    return problem, _inflated(problem, fit, [], RELATIVE_TOLERANCE, INFLATED_CHI2)
+
+
+def _loss(problem: Problem) -> str:
+    return "huber" if problem.settings.robust else "quadratic"
+
+
+def _as_said(
+    problem: Problem,
+    constraints: list[gtsam.NonlinearFactor] | None = None,
+    tolerance: float = RELATIVE_TOLERANCE,
+) -> Fit:
+    """The solution with the noise that is expected."""
+    motion, values = motion_graph(problem, 1.0, 1.0), first_values(problem)
+    return optimise(problem, motion, values, (1.0, 1.0), _loss(problem), constraints or [], tolerance)
+
+
+def _fits(problem: Problem, fit: Fit) -> bool:
+    """Whether the noise is to stay as it is."""
+    return not problem.settings.inflate_imu_noise or fit.chi2_per_dof <= FITTING_CHI2[1]
+
+
+def _inflated(
+    problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor], tolerance: float, enough: float
+) -> Fit:
+    """The solution with so much noise of the IMU that chi2 per degree of freedom is at most `enough`."""
     stiff, loosest = fit, MAX_INFLATION
     for _ in range(INFLATION_ROUNDS):
         step = float(np.clip(stiff.chi2_per_dof, 1.25, 8.0))
         inflation = min(stiff.inflation * step, float(np.sqrt(stiff.inflation * loosest)))
         noise = inflation, stiff.of_walk * inflation / stiff.inflation
         motion = motion_graph(problem, *noise)
-        fit = optimise(problem, motion, fit.values, noise, loss, constraints or [], tolerance)
-        if FITTING_CHI2[0] <= fit.chi2_per_dof <= (INFLATED_CHI2 if start is None else FITTING_CHI2[1]):
+        fit = optimise(problem, motion, fit.values, noise, fit.loss, constraints, tolerance)
+        if FITTING_CHI2[0] <= fit.chi2_per_dof <= enough:
             return fit
         if fit.chi2_per_dof < FITTING_CHI2[0]:
             loosest = inflation
@@ -85,15 +133,20 @@ def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
 
     A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
     """
-    k, loss = len(problem.intervals.keyframes), fit.loss
     for _ in range(NOISE_ROUNDS):
-        steps = BiasSteps(k)
-        covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
-        noise = imu_noise_shown(problem, fit, covariances, steps)
+        _, noise = _noise_shown(problem, fit)
         if noise == (fit.inflation, fit.of_walk):
             break
-        fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, loss)
+        fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, fit.loss)
     return fit
+
+
+def _noise_shown(problem: Problem, fit: Fit) -> tuple[float, tuple[float, float]]:
+    """How many times more noise than they say the fixes show, and white noise and walk of the IMU."""
+    k = len(problem.intervals.keyframes)
+    steps = BiasSteps(k)
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
+    return fix_noise_shown(problem, fit, covariances), imu_noise_shown(problem, fit, covariances, steps)
 
 
 def calibrate(

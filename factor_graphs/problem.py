@@ -66,7 +66,8 @@ class Problem:
     """Measurements ready for the graph, keyframes, first guess.
 
     `used` (m,) and `relative_used` (r,) say which of the fixes and relative poses given take part; `at` and
-    `relative_at` (k, 2) are the keyframes of those that do. `late` (m,) s: a fix after its keyframe.
+    `relative_at` (k, 2) are the keyframes of those that do. `late` (m,) s: a fix after its keyframe. Fixes have
+    `of_fixes` times the standard deviations that they say.
     """
 
     settings: SmootherSettings
@@ -84,6 +85,13 @@ class Problem:
     attitude: AttitudePrior
     guess: tuple[Array, Array]
     notes: tuple[str, ...]
+    of_fixes: float = 1.0
+
+    def with_fix_noise(self, of_fixes: float) -> "Problem":
+        """The same with fixes of so many times the standard deviations that they say."""
+        f = self.fixes
+        fixes = GnssFixes(f.stamps, f.positions, f.stddevs * (of_fixes / self.of_fixes))
+        return replace(self, fixes=fixes, of_fixes=of_fixes)
 
     def antennas_found(self, T: Array, velocities: Array) -> Array:
         """Where the fixes say that the antenna is at their keyframes, (m, 3) m, by keyframes (k, 4, 4) and (k, 3)."""

@@ -16,8 +16,8 @@ from factor_graphs.fitting import (
     FITTING_CHI2,
     calibrate,
     constrain,
-    fit_noise,
     fit_noise_by_components,
+    fit_noise_of_all,
     reject,
 )
 from factor_graphs.geodesy import LocalFrame
@@ -55,6 +55,7 @@ class Solution:
     outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
     `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
     standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected, its walk aside;
+    fixes have `fix_inflation` times the standard deviations that they say;
     `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
     where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
     slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
@@ -72,6 +73,7 @@ class Solution:
     relative_rejected: NDArray[np.bool_]
     chi2_per_dof: float
     inflation: float
+    fix_inflation: float
     imu_noise: ImuNoise
     calibration: Calibration
     iterations: int
@@ -122,8 +124,9 @@ def smooth(
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
         lever = calibration.p_imu_antenna
-        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
-        return problem, fit_noise(problem)
+        return fit_noise_of_all(
+            pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
+        )
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
@@ -183,6 +186,7 @@ def _solution(
         relative_rejected=relative_rejected,
         chi2_per_dof=fit.chi2_per_dof,
         inflation=fit.inflation,
+        fix_inflation=problem.of_fixes,
         imu_noise=noise,
         calibration=calibration,
         iterations=fit.iterations,
@@ -225,6 +229,11 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
         yield (
             f"the IMU fits with {fit.inflation:.1f} times the noise that was expected,"
             f" {fit.of_walk:.1f} times the walk of its biases"
+        )
+    if problem.of_fixes > 1:
+        yield (
+            f"the fixes scatter {problem.of_fixes:.1f} times as much as they say: taken into account; do all come from"
+            " one antenna, with its lever arm?"
         )
     if fit.chi2_per_dof > FITTING_CHI2[1]:
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"

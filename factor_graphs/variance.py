@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import Places
 from factor_graphs.elimination import PLACES, SIZE, split_key
-from factor_graphs.graph import from_values
-from factor_graphs.problem import Fit, Problem
+from factor_graphs.graph import from_values, motion_from
+from factor_graphs.problem import GATE, GOOD_MEAN, Fit, Problem
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,21 @@ def imu_noise_shown(problem: Problem, fit: Fit, covariances: Array, steps: BiasS
         _corrected(fit.inflation, *of_white, ENOUGH),
         _corrected(fit.of_walk, *of_walk, ENOUGH_OF_WALK),
     )
+
+
+def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
+    """How many times more noise the fixes have than they say, at least 1; as the problem has it if it fits.
+
+    By the good ones, and the state covariances (k, 15, 15) of a fit: outliers are no noise.
+    """
+    good = fit.squares < GATE
+    at, (x, y, z) = problem.at[good], problem.p_imu_antenna
+    R_map_imu = motion_from(fit.values)[0][at, :3, :3]
+    lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rows = np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2) / problem.fixes.stddevs[good, :, None]
+    taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
+    expected = GOOD_MEAN / 3 * (3 * good.sum() - taken)
+    return _corrected(problem.of_fixes, float(fit.squares[good].sum()), float(expected), ENOUGH)
 
 
 def _corrected(now: float, squares: float, redundancy: float, enough: float) -> float:

@@ -29,6 +29,7 @@ WORDS = {
     "heading_rms_deg": "heading error, rms (°)",
     "tilt_rms_deg": "tilt error, rms (°)",
     "imu_noise_inflation": "factor on the noise of the IMU",
+    "fix_noise_inflation": "factor on the standard deviations of the fixes",
     "p_imu_antenna_m": "antenna: ahead, left, above of the IMU (m)",
     "chi2_per_dof": "squared residuals divided by their variances (chi2 per degree of freedom)",
     "position_nees_per_dof": "squared position error / claimed variance (NEES per degree of freedom)",

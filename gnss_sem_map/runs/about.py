@@ -110,6 +110,7 @@ def about_solution(solution: Solution | None) -> dict[str, Any] | None:
     return {
         "chi2_per_dof": solution.chi2_per_dof,
         "imu_noise_inflation": solution.inflation,
+        "fix_noise_inflation": solution.fix_inflation,
         "iterations": solution.iterations,
         "fixes": len(solution.rejected),
         "fixes_rejected": int((solution.rejected & ~solution.outside_imu).sum()),

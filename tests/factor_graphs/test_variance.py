@@ -11,9 +11,10 @@ from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.elimination import state_keys
 from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import ImuNoise
+from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.problem import pose_problem
 from factor_graphs.settings import SmootherSettings
+from factor_graphs.simulation import simulate_gnss
 from factor_graphs.smoothing import smooth
 from factor_graphs.variance import BiasSteps, _redundancy, imu_noise_shown
 
@@ -92,6 +93,30 @@ def test_an_honest_imu_is_believed(simulate):
         inflations.append(smooth(drive.imu, drive.fixes, FRAME, None, LEVER).inflation)
     assert np.median(inflations) == 1.0
     assert max(inflations) < 1.4
+
+
+@pytest.mark.parametrize("share", [3.0, 10.0])
+def test_fixes_worse_than_they_say_are_found_out_and_the_imu_is_believed(simulate, share):
+    """The solution is that of fixes that say what they are; before, the IMU followed them, up to 30 m off."""
+    drive = simulate(550, seconds=200.0, noise=ImuNoise(), outages=[(80.0, 110.0)])
+    boasting = GnssFixes(drive.fixes.stamps, drive.fixes.positions, drive.fixes.stddevs / share)
+    found, honest = (smooth(drive.imu, fixes, FRAME, None, LEVER) for fixes in (boasting, drive.fixes))
+    assert found.fix_inflation == pytest.approx(share, rel=0.15)
+    assert honest.fix_inflation == 1.0
+    assert found.inflation < 1.5
+    assert any("as much as they say" in note for note in found.notes)
+    apart = np.linalg.norm(found.keyframes.positions - honest.keyframes.positions, axis=1)
+    assert np.all(apart < 0.5 * np.linalg.norm(honest.keyframes.position_stddevs, axis=1))
+    np.testing.assert_allclose(found.keyframes.position_stddevs, honest.keyframes.position_stddevs, rtol=0.25)
+
+
+def test_good_fixes_are_believed_beside_a_bad_imu(simulate):
+    drive = simulate(551, seconds=100.0, noise=ImuNoise().scaled(30.0))
+    rng = np.random.default_rng(1)
+    precise = simulate_gnss(drive.motion, drive.fixes.stamps, (0.02, 0.02, 0.04), LEVER, rng)
+    found = smooth(drive.imu, precise, FRAME, None, LEVER)
+    assert found.fix_inflation == 1.0
+    assert 20.0 < found.inflation < 45.0
 
 
 def test_without_information_nothing_is_said(simulate):

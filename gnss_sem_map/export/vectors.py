@@ -124,7 +124,7 @@ def _ground(
     cells[1:-1, 1:-1] = NOTHING
     heights, confidence = np.zeros(cells.shape, np.float32), np.zeros(cells.shape, np.float32)
     cells[y, x] = kind[chosen]  # in order of height: of a column the highest stays
-    heights[y, x], confidence[y, x] = z + 1, piece.confidence[chosen]
+    heights[y, x], confidence[y, x] = z + 0.5, piece.confidence[chosen]  # surfaces are amid their voxels
     seen = confidence > 0
     inner = features.sieve(
         np.ascontiguousarray(cells[1:-1, 1:-1]), round(SMALLEST_AREA_M2 / size**2), connectivity=4

@@ -234,6 +234,7 @@ def merge(
     from gnss_sem_map.runs.merged_run import merge_run_folders
 
     about = merge_run_folders(first, second, out, match)
+    warn(about["warnings"])
     if as_json:
         typer.echo(json.dumps(about))
     else:

@@ -104,8 +104,7 @@ def write_drives(
             "changes": [change.about(label_set) for change in changes or ()],
             "map": about_map(folder, refined.report),
         }
-        write_merged(folder, settings, about, progress)
-    return about
+        return write_merged(folder, settings, about, progress)
 
 
 def _labelled(source: Source, folder: Path, settings: Settings) -> LabelledDrive:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from gnss_sem_map.cli.console import refuse_unlabelled
+
 if TYPE_CHECKING:
     from factor_graphs.geodesy import LocalFrame
     from gnss_sem_map.config import Settings
@@ -31,7 +33,6 @@ def print_plan(
     from gnss_sem_map.datasets.laz_cloud import read_base
     from gnss_sem_map.mapping.trajectory import check_georeference
     from gnss_sem_map.runs.run_folder import georeference_of
-    from gnss_sem_map.segmentation import no_segmenter_message
 
     seconds = memory_mb = 0.0
     if align_to is not None and origin is not None:
@@ -39,8 +40,7 @@ def print_plan(
     for source in sources:
         log = source.open_log()
         if source.segmenter is None and log.cameras:
-            typer.echo(no_segmenter_message(source.drive), err=True)
-            raise typer.Exit(1)
+            refuse_unlabelled(source.drive)
         source.open_network(settings, log)
         log.check_scans()
         origin = origin or log.frame

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
+from gnss_sem_map.cli.console import (
+    print_many,
+    print_merged,
+    print_run,
+    progress_bars,
+    refuse_unlabelled,
+    warn,
+)
 from gnss_sem_map.cli.dry_run import print_plan
 from gnss_sem_map.cli.options import (
     Config,
@@ -105,7 +112,6 @@ def run(
         from gnss_sem_map.runs.many_drives import HowMapped, frame_of_all
         from gnss_sem_map.runs.run_folder import claimed_run, places_read
         from gnss_sem_map.runs.source import source_of
-        from gnss_sem_map.segmentation import no_segmenter_message
 
         progress("loading", 1, 1)
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
@@ -113,8 +119,7 @@ def run(
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     is_of_many = len(found) > 1 or align_to is not None
     if is_of_many and segmenter is None:
-        typer.echo(no_segmenter_message(str(found[0])), err=True)
-        raise typer.Exit(1)
+        refuse_unlabelled(found[0])
     sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
     with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
         if dry_run:
@@ -129,8 +134,7 @@ def run(
         [drive] = found
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.cameras:
-            typer.echo(no_segmenter_message(str(drive)), err=True)
-            raise typer.Exit(1)
+            refuse_unlabelled(drive)
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
@@ -183,12 +187,10 @@ def add(
     """Add a drive to a finished map, with the map's settings: the same bytes as a run of all drives at once."""
     from gnss_sem_map.runs.finished_run import Run
     from gnss_sem_map.runs.many_drives import HowMapped, add_drive, has_point_labels
-    from gnss_sem_map.segmentation import no_segmenter_message
 
     Run.open(out)
     if segmenter is None:
-        typer.echo(no_segmenter_message(str(drive)), err=True)
-        raise typer.Exit(1)
+        refuse_unlabelled(drive)
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
@@ -65,6 +65,16 @@ def warn(warnings: Iterable[str]) -> None:
         PROGRAM.warning("%s", warning)
         if Chosen.terminal is not Terminal.QUIET:
             typer.echo(f"warning: {warning}", err=True)
+
+
+def refuse_unlabelled(drive: Path | str) -> NoReturn:
+    """Say which sources of labels there are, and end with exit code 1."""
+    from gnss_sem_map.segmentation import no_segmenter_message
+
+    message = no_segmenter_message(str(drive))
+    PROGRAM.error("%s", message)
+    typer.echo(message, err=True)
+    raise typer.Exit(1)
 
 
 def print_run(about: dict[str, Any], out: Path, as_json: bool, stages: Container[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from gnss_sem_map.cli.options import stop_without_segmenter
+from gnss_sem_map.cli.console import refuse_unlabelled
 
 if TYPE_CHECKING:
     from factor_graphs.geodesy import LocalFrame
@@ -40,7 +40,7 @@ def print_plan(
     for source in sources:
         log = source.open_log()
         if source.segmenter is None and log.cameras:
-            stop_without_segmenter(source.drive)
+            refuse_unlabelled(source.drive)
         source.open_network(settings, log)
         log.check_scans()
         origin = origin or log.frame

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars
+from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
 from gnss_sem_map.cli.options import Crs, Device, Geoid, Json, Set, delivered_in
+
+if TYPE_CHECKING:
+    from gnss_sem_map.config import Settings
+    from gnss_sem_map.runs.finished_run import Run
 
 Finished = Annotated[Path, typer.Argument(help="Folder of a finished run.")]
 Other = Annotated[
@@ -31,6 +35,7 @@ def refine(
     finished = Run.open(run)
     again = finished.refine(delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid), out)
     about = again.about
+    _warn_of_coordinates(again, again.settings)
     if "drives" in about:
         print_many(about, again.folder, as_json)
     elif again.is_merged and not as_json:
@@ -76,11 +81,22 @@ def export(
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
-    delivery = delivered_in(finished.settings, crs, geoid).delivery
+    settings = delivered_in(finished.settings, crs, geoid)
     with progress_bars() as progress:
-        files = finished.export([name.strip() for name in formats.split(",")], out, delivery, progress)
+        files = finished.export(
+            [name.strip() for name in formats.split(",")], out, settings.delivery, progress
+        )
+    _warn_of_coordinates(finished, settings)
     for file in files:
         typer.echo(str(file))
+
+
+def _warn_of_coordinates(finished: Run, settings: Settings) -> None:
+    """Say how inaccurate the coordinates of files are, where they are."""
+    from gnss_sem_map.runs.run_folder import georeference_of
+
+    georeference = georeference_of(settings, finished.frame)
+    warn([georeference.doubt] if georeference is not None and georeference.doubt else [])
 
 
 def view(

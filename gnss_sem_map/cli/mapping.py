@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gnss_sem_map.cli.console import print_many, print_merged, print_run, progress_bars, warn
+from gnss_sem_map.cli.console import (
+    print_many,
+    print_merged,
+    print_run,
+    progress_bars,
+    refuse_unlabelled,
+    warn,
+)
 from gnss_sem_map.cli.dry_run import print_plan
 from gnss_sem_map.cli.options import (
     Config,
@@ -28,7 +35,6 @@ from gnss_sem_map.cli.options import (
     frame_of,
     open_log,
     settings_of,
-    stop_without_segmenter,
 )
 
 if TYPE_CHECKING:
@@ -113,7 +119,7 @@ def run(
         raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
     is_of_many = len(found) > 1 or align_to is not None
     if is_of_many and segmenter is None:
-        stop_without_segmenter(found[0])
+        refuse_unlabelled(found[0])
     sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
     with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
         if dry_run:
@@ -128,7 +134,7 @@ def run(
         [drive] = found
         log = open_log(drive, drive_format, frames)
         if segmenter is None and log.cameras:
-            stop_without_segmenter(drive)
+            refuse_unlabelled(drive)
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
@@ -184,7 +190,7 @@ def add(
 
     Run.open(out)
     if segmenter is None:
-        stop_without_segmenter(drive)
+        refuse_unlabelled(drive)
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:
@@ -230,6 +236,7 @@ def merge(
     from gnss_sem_map.runs.merged_run import merge_run_folders
 
     about = merge_run_folders(first, second, out, match)
+    warn(about["warnings"])
     if as_json:
         typer.echo(json.dumps(about))
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -103,14 +103,6 @@ def open_log(drive: Path, drive_format: str | None, frames: str | None) -> Senso
         return log.between(frames)
     except ConfigError as error:
         raise typer.BadParameter(str(error), param_hint="--frames") from None
-
-
-def stop_without_segmenter(drive: Path | str) -> NoReturn:
-    """End with the help on segmenters: this drive has images, and nobody said where labels come from."""
-    from gnss_sem_map.segmentation import no_segmenter_message
-
-    typer.echo(no_segmenter_message(str(drive)), err=True)
-    raise typer.Exit(1)
 
 
 def drives_of(words: list[str]) -> list[Path]:

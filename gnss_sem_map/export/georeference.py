@@ -18,6 +18,8 @@ from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError
 
 WGS84_EPSG = 4326
+RIGHT_TO_M = 1.0
+"""What PROJ says of a datum that it holds for equal to WGS 84 but for the motion of plates, such as ETRS89."""
 VERTICAL_EPSG = "target_crs_epsg_code"
 """Tag of PROJ's GeoTIFF grids: the vertical CRS that they lead to."""
 
@@ -29,7 +31,8 @@ class Georeference:
     Without `epsg`, the CRS is the UTM zone (WGS 84) of the map's origin. Without `geoid`, heights are above the WGS 84
     ellipsoid; with one, a grid of PROJ (GeoTIFF or GTX) of its undulations, they are orthometric. Raises ConfigError
     for a code that is no projected CRS in metres, for a file that PROJ cannot read, and where either does not cover
-    the origin of the map. A datum that PROJ holds for equal to WGS 84, such as ETRS89, is taken for equal.
+    the origin of the map, or a point that is asked for. A datum that PROJ holds for equal to WGS 84, such as ETRS89, is
+    taken for equal.
     """
 
     frame: LocalFrame
@@ -63,7 +66,9 @@ class Georeference:
         lat_deg, lon_deg, alt_m = self.frame.to_geodetic(p_map)
         if self.geoid is not None:
             *_, alt_m = _undulation(self.geoid).transform(lon_deg, lat_deg, alt_m)
-        return np.stack([*_projection(self.horizontal_epsg).transform(lon_deg, lat_deg), alt_m], axis=-1)
+        placed = np.stack([*_projection(self.horizontal_epsg).transform(lon_deg, lat_deg), alt_m], axis=-1)
+        self._refuse_outside(placed, lat_deg, lon_deg)
+        return placed
 
     def to_map(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inverse: easting, northing, height (n, 3) m -> points (n, 3) m of the map frame."""
@@ -71,7 +76,19 @@ class Georeference:
         lon_deg, lat_deg = _projection(self.horizontal_epsg).transform(easting, northing, direction="INVERSE")
         if self.geoid is not None:
             *_, alt_m = _undulation(self.geoid).transform(lon_deg, lat_deg, alt_m, direction="INVERSE")
-        return self.frame.to_map(lat_deg, lon_deg, alt_m)
+        p_map = self.frame.to_map(lat_deg, lon_deg, alt_m)
+        self._refuse_outside(p_map, lat_deg, lon_deg)
+        return p_map
+
+    def _refuse_outside(self, places: NDArray[np.float64], *degrees: NDArray[np.float64]) -> None:
+        """Raise ConfigError for places (..., 3) that are not finite, with the first one's latitude and longitude."""
+        outside = ~np.isfinite(places).all(axis=-1)
+        if outside.any():
+            what = f"geoid: {self.geoid}" if self.geoid else f"crs: EPSG:{self.horizontal_epsg}"
+            raise ConfigError(
+                f"delivery.{what} does not cover all of the map: found a place at"
+                f" {_degrees(*(float(each[outside][0]) for each in degrees))}; choose one of the whole map"
+            )
 
     @property
     def horizontal_epsg(self) -> int:
@@ -102,9 +119,24 @@ class Georeference:
         """CRS and heights in one line."""
         return f"EPSG:{self.horizontal_epsg} ({projected_crs(self.horizontal_epsg).name}), heights {self.heights}"
 
+    @property
+    def doubt(self) -> str:
+        """How inaccurate the way from WGS 84 to the datum of the CRS is; empty where PROJ holds it for right to 1 m."""
+        way = _projection(self.horizontal_epsg)
+        way.transform(self.frame.lon_deg, self.frame.lat_deg)
+        used = way.get_last_used_operation()
+        if 0 <= used.accuracy <= RIGHT_TO_M:
+            return ""
+        how = f"right to {used.accuracy:g} m only" if used.accuracy > 0 else "not known to be right"
+        return (
+            f"delivery.crs: EPSG:{self.horizontal_epsg} has a datum of its own, and coordinates in it are {how} (PROJ:"
+            f" {used.description}); a grid of that place may do better, see docs/formats.md"
+        )
+
     def about(self) -> dict[str, Any]:
         """For run.json."""
-        return {"epsg": self.horizontal_epsg, "crs": self.name, "heights": self.heights}
+        said = {"epsg": self.horizontal_epsg, "crs": self.name, "heights": self.heights}
+        return said | ({"doubt": self.doubt} if self.doubt else {})
 
     @cached_property
     def _vertical(self) -> CRS | None:

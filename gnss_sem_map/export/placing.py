@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.longitudes import near
 
@@ -21,8 +22,8 @@ def fitted_placing(georeference: Georeference, low: ArrayLike, high: ArrayLike) 
     """Easting, northing, height (m), latitude and longitude (degrees) in the box between two corners (3,) m of the map.
 
     `coefficients` has a row for each of the five: the value is the sum of its numbers times x^i y^j z^k, with i, j, k
-    from `powers` and x, y, z from `centre` in units of `half`. Longitudes go on beyond 180 degrees. None where the
-    geoid does not cover the box.
+    from `powers` and x, y, z from `centre` in units of `half`. Longitudes go on beyond 180 degrees. None where CRS or
+    geoid do not cover the box.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     centre, half = (low + high) / 2, np.maximum((high - low) / 2, 1.0)
@@ -31,8 +32,9 @@ def fitted_placing(georeference: Georeference, low: ArrayLike, high: ArrayLike) 
     p_map = centre + unit * half
     lat_deg, lon_deg, _ = georeference.frame.to_geodetic(p_map)
     lon_deg = near(lon_deg, georeference.frame.lon_deg)
-    places = np.column_stack([georeference.from_map(p_map), lat_deg, lon_deg])
-    if not np.isfinite(places).all():
+    try:
+        places = np.column_stack([georeference.from_map(p_map), lat_deg, lon_deg])
+    except ConfigError:
         return None
     means = places.mean(axis=0)
     coefficients = np.linalg.lstsq(terms(unit), places - means)[0].T

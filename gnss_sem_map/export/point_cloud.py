@@ -165,9 +165,9 @@ def las_header(
         header.vlrs.append(
             laspy.VLR("LASF_Spec", TEXT_AREA, "CRS and heights", _plain(georeference.words).encode())
         )
-    lookup = ClassificationLookupVlr()
-    for code, name in zip(label_set.asprs_codes.tolist(), label_set.names, strict=True):
-        lookup[code] = _plain(name)[:15]
+    lookup, codes = ClassificationLookupVlr(), label_set.asprs_codes
+    for code in np.unique(codes).tolist():
+        lookup[code] = "/".join(_plain(label_set.names[i]) for i in np.flatnonzero(codes == code))[:15]
     header.vlrs.append(lookup)
     return header
 

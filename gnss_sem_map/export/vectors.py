@@ -33,8 +33,6 @@ SIMPLIFIED_M = 0.5
 OUTLINE_M = 0.3
 """Outlines differ by so much from those of the cells: Douglas and Peucker (1973)."""
 SHORTEST_KERB_M = 1.0
-FEWEST_VOXELS = 30
-"""Of an object."""
 GROUND = ("road", "sidewalk")
 NOTHING, AROUND = 0, 255
 
@@ -86,11 +84,11 @@ def features_of(tiled_map: TiledMap, georeference: Georeference) -> Iterator[Fea
     """All features of a map, read tile by tile; layers of classes that it has not stay empty."""
     names, size = tiled_map.label_set.names, tiled_map.voxel_size_m
     standing = [
-        _Standing(layer, names.index(name), gap, size)
-        for layer, name, gap in (
-            ("buildings", "building", 3.0),
-            ("vehicles", "vehicle", 1.5),
-            ("poles", "pole", 1.5),
+        _Standing(layer, names.index(name), gap, size, fewest)
+        for layer, name, gap, fewest in (
+            ("buildings", "building", 3.0, 30),
+            ("vehicles", "vehicle", 1.5, 30),
+            ("poles", "pole", 1.5, 10),  # one of 2 m may be one column
         )
         if name in names
     ]
@@ -124,7 +122,7 @@ def _ground(
     cells[1:-1, 1:-1] = NOTHING
     heights, confidence = np.zeros(cells.shape, np.float32), np.zeros(cells.shape, np.float32)
     cells[y, x] = kind[chosen]  # in order of height: of a column the highest stays
-    heights[y, x], confidence[y, x] = z + 1, piece.confidence[chosen]
+    heights[y, x], confidence[y, x] = z + 0.5, piece.confidence[chosen]  # surfaces are amid their voxels
     seen = confidence > 0
     inner = features.sieve(
         np.ascontiguousarray(cells[1:-1, 1:-1]), round(SMALLEST_AREA_M2 / size**2), connectivity=4
@@ -193,6 +191,8 @@ class _Standing:
     label: int
     gap_voxels: float
     voxel_size_m: float
+    fewest_voxels: int
+    """Of an object."""
     open: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 5), np.int64))
     """(n, 5): index x and y, lowest and highest z, voxels."""
     confidence: Array = field(default_factory=lambda: np.empty(0))
@@ -214,7 +214,7 @@ class _Standing:
         self.open, self.confidence = columns[stays], confidence[stays]
         order = np.argsort(clusters, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(clusters[order])) + 1):
-            if len(rows) and not stays[rows[0]] and columns[rows, 4].sum() >= FEWEST_VOXELS:
+            if len(rows) and not stays[rows[0]] and columns[rows, 4].sum() >= self.fewest_voxels:
                 yield columns[rows], confidence[rows]
 
 

@@ -24,6 +24,9 @@ from gnss_sem_map.files.untrusted import is_file, shown
 OTHER = "other"
 """Name of the class for everything that is none of the map's classes."""
 
+SHIPPED_CLASS_SETS = ("urban",)
+"""The other files in `labels/` are taxonomies."""
+
 UNLABELLED = -1
 """Label of a voxel or point without a class."""
 
@@ -158,7 +161,8 @@ class Taxonomy:
 
 def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> LabelSet:
     """Read a class set: the name of a shipped one, the user's YAML file, or what `about` gave. Raises ConfigError."""
-    content = name_or_file if isinstance(name_or_file, Mapping) else _read(name_or_file)
+    is_content = isinstance(name_or_file, Mapping)
+    content = name_or_file if is_content else _read(name_or_file, "class set", SHIPPED_CLASS_SETS)
     try:
         classes = content["classes"]
         return LabelSet(
@@ -187,7 +191,8 @@ def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> La
 
 def taxonomy(name_or_file: str | Path) -> Taxonomy:
     """Read a taxonomy: the name of a shipped one, or the user's YAML file. Raises ConfigError."""
-    content = _read(name_or_file)
+    shipped = [name for name in _shipped() if name not in SHIPPED_CLASS_SETS]
+    content = _read(name_or_file, "taxonomy", shipped)
     try:
         classes, kinds = content["classes"], [_word(kind) for kind in content["ids"]]
         void = content.get("void", {})
@@ -238,17 +243,16 @@ def _shipped() -> list[str]:
     return sorted(file.stem for file in files if file.suffix == ".yaml")
 
 
-def _read(name_or_file: str | Path) -> dict[str, Any]:
-    available = _shipped()
+def _read(name_or_file: str | Path, what: str, available: Sequence[str]) -> dict[str, Any]:
     name = str(name_or_file)
-    if name in _CACHE:
+    if name in available and name in _CACHE:
         return _CACHE[name]
     if name in available:
         file = Path(str(_SHIPPED / f"{name}.yaml"))
     elif is_file(Path(name), ConfigError):
         file = Path(name)
     else:
-        raise ConfigError(f"no class set {shown(name)!r}: expected one of {available} or a YAML file")
+        raise ConfigError(f"no {what} {shown(name)!r}: expected one of {list(available)} or a YAML file")
     content = read_yaml(file, ConfigError)
     if not isinstance(content, dict):
         raise ConfigError(f"{name}: found {type(content).__name__}, expected a mapping with name and classes")

@@ -78,7 +78,7 @@ def _map_one(
                 log, network, settings, part, claim.work,
                 origin=frame, resume=True, match=SavedMatches(source, claim.work, resume=True),
                 labels_from=source.labels_from, force=force, correction=correction,
-                write=partial(run_folder.write_trajectory_files, part),
+                write=partial(run_folder.write_trajectory_files, part, delivery=settings.delivery),
             )  # fmt: skip
             run_folder.write_drive(part, source, mapped, settings, read, digest)
 

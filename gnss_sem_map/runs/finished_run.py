@@ -97,7 +97,7 @@ def run(
                     log, network, settings, folder, claim.work, progress,
                     origin=origin, resume=resume, match=match, registrar_of=register, elsewhere=elsewhere,
                     labels_from=source.labels_from, force=force,
-                    write=partial(run_folder.write_trajectory_files, folder),
+                    write=partial(run_folder.write_trajectory_files, folder, delivery=settings.delivery),
                 )  # fmt: skip
                 refined = pipeline.refine(
                     folder, settings, mapped.stats, progress, executor=executor, work=claim.work

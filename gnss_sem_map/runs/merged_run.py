@@ -54,18 +54,17 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
         "match": _about(merged.alignment),
     }
     keep_tracks(folder, tracks_of(first))
-    write_merged(folder, settings, about)
-    return about
+    return write_merged(folder, settings, about)
 
 
 def write_merged(
     folder: Path, settings: Settings, about: dict[str, Any], progress: Progress = silent
-) -> None:
-    """Write the files of a run of several drives beside its maps and tracks, which are there already."""
+) -> dict[str, Any]:
+    """Write the files of a run of several drives beside its maps and tracks, which are there; returns run.json."""
     write_map_files(
         folder, tracks_of(folder), str(about["name"]), settings.delivery, about.get("changes", ()), progress
     )
-    write_about(folder, settings, about, {})
+    return write_about(folder, settings, about, {})
 
 
 def _about(alignment: Alignment) -> dict[str, Any]:

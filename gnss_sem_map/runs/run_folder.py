@@ -207,15 +207,24 @@ def georeference_of(settings: Settings, frame: LocalFrame | None) -> Georeferenc
     return None if frame is None else Georeference.of(frame, delivery)
 
 
-def write_about(folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]) -> None:
-    """Write settings, run.json, metrics.json and the report."""
+def write_about(
+    folder: Path, settings: Settings, about: dict[str, Any], metrics: dict[str, Any]
+) -> dict[str, Any]:
+    """Write settings, run.json, metrics.json and the report; returns the content of run.json.
+
+    A doubt about the coordinates is one of its warnings, in place of that about earlier ones.
+    """
     frame = about.get("local_frame")
     georeference = georeference_of(settings, None if frame is None else LocalFrame(**frame))
-    about = about | {"delivery": None if georeference is None else georeference.about()}
+    before, delivery = about.get("delivery") or {}, None if georeference is None else georeference.about()
+    warnings = [each for each in about.get("warnings", ()) if each != before.get("doubt")]
+    doubts = [delivery["doubt"]] if delivery and "doubt" in delivery else []
+    about = about | {"delivery": delivery, "warnings": [*warnings, *doubts]}
     write_settings(folder, settings)
     _write_json(folder / "run.json", about)
     _write_json(folder / "metrics.json", metrics)
     write_report(folder, about, metrics)
+    return about
 
 
 def write_trajectory_run(
@@ -240,9 +249,14 @@ def write_trajectory_run(
     return about
 
 
-def write_trajectory_files(folder: Path, located: Located) -> None:
-    """Write a trajectory in every format, and that before it was bound, if it was."""
+def write_trajectory_files(folder: Path, located: Located, delivery: DeliverySettings | None = None) -> None:
+    """Write a trajectory in every format, and that before it was bound, if it was.
+
+    Raises ConfigError where files of its map could not be delivered in the coordinates that are asked for.
+    """
     trajectory, frame = located.trajectory, located.log.frame
+    if frame is not None and delivery is not None:
+        Georeference.of(frame, delivery).from_map(trajectory.positions)
     trajectory.save(folder / "trajectory.parquet")
     if located.alone is not None:
         located.alone.save(folder / "trajectory_alone.parquet")

@@ -84,8 +84,7 @@ def write_drives(
             "changes": [change.about(label_set) for change in changes or ()],
             "map": about_map(folder, refined.report),
         }
-        write_merged(folder, settings, about, run.progress)
-    return about
+        return write_merged(folder, settings, about, run.progress)
 
 
 def _about_drives(

@@ -177,6 +177,10 @@ def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
     assert "nowhere" in log.read_text()
     assert log.read_text().splitlines()[-1].endswith("exit code 1")
 
+    no_labels = program("--log-file", log, "run", small_drive.drive, "-o", tmp_path / "other")
+    assert no_labels.returncode == 1
+    assert no_labels.stderr.strip() in log.read_text()
+
     refused = program("--log-file", tmp_path / "no" / "log", *words)
     assert refused.returncode == 1
     assert len(refused.stderr.splitlines()) == 1

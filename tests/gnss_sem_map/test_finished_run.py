@@ -305,11 +305,17 @@ def test_moving_points_are_read_as_scans_need_them_though_one_was_skipped(
 def test_the_coordinates_of_all_files_change_together_and_the_map_stays(
     finished: Run, tmp_path: Path
 ) -> None:
-    """In place nothing is written in other coordinates than those that config.yaml says."""
+    """In place nothing is written in other coordinates than those that config.yaml says.
+
+    DHDN is known to some metres only, without a grid of it: that is a warning as long as files are in it.
+    """
     delivery = finished.settings.changed("delivery.crs=25832").delivery
     with pytest.raises(ConfigError, match="need a folder of their own"):
         finished.export(["laz"], delivery=delivery)
-    again = finished.refine(finished.settings.changed("delivery.crs=25832"), tmp_path / "etrs89")
+    old_datum = finished.refine(finished.settings.changed("delivery.crs=31467"), tmp_path / "dhdn")
+    assert old_datum.about["warnings"] == [*finished.about["warnings"], old_datum.about["delivery"]["doubt"]]
+    again = old_datum.refine(finished.settings.changed("delivery.crs=25832"), tmp_path / "etrs89")
+    assert again.about["warnings"] == finished.about["warnings"]
     assert files(again.folder / "refined") == files(finished.folder / "refined")
     assert again.about["delivery"]["epsg"] == 25832
     assert finished.about["delivery"]["heights"] == "above the WGS 84 ellipsoid"

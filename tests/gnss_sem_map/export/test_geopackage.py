@@ -15,9 +15,10 @@ from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.geopackage import write_geopackage
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.vectors import LAYERS
+from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
-from gnss_sem_map.voxels.voxel_map import pack
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 
 def read(path: Path, layer: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -50,8 +51,8 @@ def test_areas_and_kerbs_are_those_of_the_street(package: Path) -> None:
         assert shapely.area(shapes).sum() == pytest.approx(area, rel=0.005)
         np.testing.assert_allclose(columns["area_m2"].sum(), area, rtol=0.005)
         assert ((columns["confidence"] > 0.5) & (columns["confidence"] < 1)).all()
-        top = 115.0 + (0.2 if name == "road" else 0.4)
-        np.testing.assert_allclose(columns["height_m"], top, atol=0.05)
+        middle = 115.0 + (0.1 if name == "road" else 0.3)  # of the uppermost voxels, as in map.laz
+        np.testing.assert_allclose(columns["height_m"], middle, atol=0.005)
     lines, columns = read(package, "kerbs")
     assert shapely.length(lines).sum() == pytest.approx(60.0, rel=0.005)
     road, _ = read(package, "road")
@@ -139,6 +140,26 @@ def test_each_outline_of_a_building_has_its_own_voxels_and_heights(
     assert columns["voxels"].tolist() == [len(wall), len(wall)]
     assert sorted(columns["base_m"]) == pytest.approx([115.0, 117.0], abs=0.01)
     assert sorted(columns["top_m"]) == pytest.approx([123.0, 125.0], abs=0.01)
+
+
+def test_a_pole_of_one_column_is_listed_and_single_voxels_are_not(
+    karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    urban = open_label_set().about()
+    pole = {"name": "pole", "colour": [9, 9, 9], "semantic_kitti_id": 80, "asprs_code": 5}
+    classes = open_label_set(urban | {"classes": [*urban["classes"], pole]})
+    sign = np.column_stack([np.full(12, 5), np.full(12, 7), np.arange(12)])
+    crumbs = np.array([[20, 20, 3], [20, 20, 9]])
+    keys = np.sort(pack(np.concatenate([sign, crumbs])))
+    voxels = VoxelMap(0.2, classes, keys, np.zeros((len(keys), 6), np.int32), np.ones(len(keys), np.uint32))
+    states = np.full(len(keys), State.OBSERVED, np.uint8)
+    whole = SemanticMap(voxels, np.full(len(keys), 5, np.int8), np.ones(len(keys), np.float32), states)
+    write_geopackage(Exported(tiles.in_memory(whole, karlsruhe)), tmp_path / "map.gpkg")
+    [place], columns = read(tmp_path / "map.gpkg", "poles")
+    middle = Georeference(karlsruhe).from_map(np.array([[1.1, 1.5, 0.0]]))[0]
+    assert np.hypot(place.x - middle[0], place.y - middle[1]) < 0.001
+    assert columns["voxels"].tolist() == [12]
+    assert columns["top_m"] - columns["base_m"] == pytest.approx(2.4)
 
 
 def test_a_map_without_georeference_is_refused(street: SemanticMap, tmp_path: Path) -> None:

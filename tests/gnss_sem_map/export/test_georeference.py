@@ -1,5 +1,6 @@
 """Coordinates of a delivery: any projected CRS, heights above ellipsoid or geoid, and files that say which."""
 
+import re
 from pathlib import Path
 
 import laspy
@@ -105,6 +106,35 @@ def test_a_crs_or_a_geoid_of_another_place_is_refused(karlsruhe: LocalFrame, tmp
         Georeference(karlsruhe, 27700)
     with pytest.raises(ConfigError, match=r"does not cover the origin"):
         Georeference(LocalFrame(-33.9, 151.2, 0), None, geoid(tmp_path / "g.tif"))
+
+
+@pytest.mark.parametrize(
+    ("epsg", "place", "doubted"),
+    [
+        (None, (49.0, 8.4, 115.0), ""),
+        (25832, (49.0, 8.4, 115.0), ""),  # ETRS89
+        (2056, (47.0, 8.0, 400.0), ""),
+        (26910, (45.0, -122.0, 50.0), "EPSG:26910 .* right to 4 m only .*NAD83 to WGS 84"),
+        (7855, (-35.0, 147.0, 50.0), "EPSG:7855 .* right to 3 m only .*GDA2020"),
+    ],
+)
+def test_a_datum_that_proj_reaches_only_to_metres_is_doubted(
+    epsg: int | None, place: tuple[float, float, float], doubted: str
+) -> None:
+    georeference = Georeference(LocalFrame(*place), epsg)
+    assert bool(georeference.doubt) == bool(doubted)
+    assert re.search(doubted, georeference.doubt)
+    assert georeference.about().get("doubt", "") == georeference.doubt
+
+
+def test_a_geoid_of_a_part_of_the_map_is_refused_both_ways(karlsruhe: LocalFrame, tmp_path: Path) -> None:
+    """The grid ends at 48.5 and 9.5 degrees or beyond: 60 km south of the origin nothing is known."""
+    georeference = Georeference(karlsruhe, None, geoid(tmp_path / "g.tif"))
+    beyond = np.array([[0.0, 0.0, 0.0], [0.0, -300_000.0, 7000.0]])
+    with pytest.raises(ConfigError, match=r"g\.tif does not cover all of the map: found a place at 46\.3"):
+        georeference.from_map(beyond)
+    with pytest.raises(ConfigError, match=r"does not cover all of the map"):
+        georeference.to_map(Georeference(karlsruhe).from_map(beyond))
 
 
 def test_what_is_no_grid_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -18,11 +18,12 @@ from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.point_cloud import (
     NOT_DATED,
     adjusted_gps_time,
+    las_header,
     write_laz,
     write_ply,
     write_removed,
 )
-from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -123,6 +124,14 @@ def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
     assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
     assert las.header.number_of_points_by_return[0] == len(order)
     assert las.header.creation_date == NOT_DATED
+
+
+def test_a_code_of_several_classes_has_the_names_of_all() -> None:
+    urban = open_label_set().about()
+    bush = {"name": "bush", "colour": [9, 9, 9], "semantic_kitti_id": 71, "asprs_code": 5}
+    header = las_header(open_label_set(urban | {"classes": [*urban["classes"], bush]}), None)
+    names = header.vlrs.get("ClassificationLookupVlr")[0].lookups
+    assert names == {5: "vegetation/bush", 6: "building", 11: "road", 64: "vehicle", 65: "sidewalk"}
 
 
 def test_a_reader_that_knows_no_flags_sees_no_ghost_in_the_map(

@@ -71,6 +71,11 @@ def test_a_user_s_class_set_is_read_and_checked(tmp_path: Path) -> None:
         open_label_set(file)
     with pytest.raises(ConfigError, match="no class set 'nothing'"):
         open_label_set("nothing")
+    # what ships with us for the ids of label images has no colours and codes of a map
+    with pytest.raises(ConfigError, match=r"no class set 'cityscapes': expected one of \['urban'\] or"):
+        open_label_set("cityscapes")
+    with pytest.raises(ConfigError, match=r"no taxonomy 'urban': expected one of \['camvid', 'cityscapes'"):
+        taxonomy("urban")
 
 
 def test_a_user_s_taxonomy_needs_only_a_table_in_the_class_set(tmp_path: Path) -> None:

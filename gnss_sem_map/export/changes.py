@@ -15,7 +15,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.evaluation.changes import ChangedObject
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.longitudes import DEGREE_DIGITS, HEIGHT_DIGITS, near
-from gnss_sem_map.export.point_cloud import colours, las_header
+from gnss_sem_map.export.point_cloud import labelled_points, las_header, laz_writer
 from gnss_sem_map.files.atomic import link_or_copy, replacing
 from gnss_sem_map.labels.label_set import LabelSet
 
@@ -90,10 +90,7 @@ def _place_again(
     for name in set(points.point_format.dimension_names) - {"X", "Y", "Z"}:
         points[name] = known[name]
     points.x, points.y, points.z = after.from_map(before.to_map(np.asarray(known.xyz))).T
-    with (
-        replacing(target) as out,
-        laspy.open(out, mode="w", header=header, do_compress=True, closefd=False) as writer,
-    ):
+    with laz_writer(target, header) as writer:
         writer.write_points(points)
 
 
@@ -130,28 +127,14 @@ def _write_laz(
     """The voxels of all objects: class and colour of each, `user_data` 1 appeared or 2 vanished, `point_source_id` the
     number of the object in the GeoJSON file.
     """
-    import laspy
-
     header = las_header(label_set, georeference)
-    with (
-        replacing(path) as file,
-        laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
-    ):
+    with laz_writer(path, header) as writer:
         for number, change in enumerate(changes):
             thing = change.thing
             labels = np.full(len(thing.voxels), thing.label, np.int8)
-            points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
-            points.x, points.y, points.z = georeference.from_map(thing.voxels.centres).T
-            points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)
-            points.return_number[:] = 1
-            points.number_of_returns[:] = 1
-            points.classification = _code(labels, label_set)
-            points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
+            places = georeference.from_map(thing.voxels.centres)
+            points = labelled_points(places, labels, label_set, header)
             points.hits = thing.voxels.hits
             points.user_data[:] = APPEARED if thing.appeared else VANISHED
             points.point_source_id[:] = number % (1 << 16)
             writer.write_points(points)
-
-
-def _code(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
-    return np.where(labels < 0, 1, label_set.asprs_codes[labels]).astype(np.uint8)

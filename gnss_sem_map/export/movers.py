@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
-from pyproj import CRS
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.dynamics.movers import Mover
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.dates import date_of
+from gnss_sem_map.export.geoparquet import write_shapes
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.export.longitudes import DEGREE_DIGITS, box_around, line_through
 from gnss_sem_map.files.atomic import replacing
@@ -26,7 +26,6 @@ from gnss_sem_map.files.untrusted import is_file, shown
 
 PARQUET, GEOJSON = "objects.parquet", "objects.geojson"
 DIGITS = 3
-WGS84_3D_EPSG = 4979
 TRACK = {
     "stamp_s": pa.float64(),
     "east_m": pa.float64(),
@@ -148,16 +147,13 @@ def _places(mover: Mover, frame: LocalFrame | None) -> dict[str, Any]:
 
 def _write(table: pa.Table, is_georeferenced: bool, folder: Path) -> None:
     shapes = shapely.from_wkb(table["geometry"].to_pylist())
-    types = sorted({f"{shape.geom_type} Z" for shape in shapes})
-    about: dict[str, Any] = {"encoding": "WKB", "geometry_types": types}
-    about["crs"] = CRS.from_epsg(WGS84_3D_EPSG).to_json_dict() if is_georeferenced else None
+    types = {f"{shape.geom_type} Z" for shape in shapes}
+    bbox: list[float] = []
     if len(table):
         at = shapely.get_coordinates(shapes, include_z=True)
         flat = [*at.min(axis=0).tolist(), *at.max(axis=0).tolist()]
-        about["bbox"] = box_around(at) if is_georeferenced else flat
-    geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": about}}
-    with replacing(folder / PARQUET) as file:
-        pq.write_table(table.replace_schema_metadata({"geo": json.dumps(geo)}), file, compression="zstd")
+        bbox = box_around(at) if is_georeferenced else flat
+    write_shapes(table, types, bbox, is_georeferenced, folder / PARQUET)
     if is_georeferenced:
         rows = table.drop_columns(["geometry"]).to_pylist()
         features = [_feature(*pair) for pair in zip(rows, shapes, strict=True)]

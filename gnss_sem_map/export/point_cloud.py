@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import date, timedelta
 from importlib.metadata import version
 from pathlib import Path
@@ -122,14 +124,9 @@ def write_removed(exported: Exported, path: Path | str) -> None:
 
 
 def _write_points(exported: Exported, path: Path | str, removed: bool) -> None:
-    import laspy
-
     georeference = exported.georeference
     header = las_header(exported.map.label_set, georeference, has_times=exported.attributes is not None)
-    with (
-        replacing(path) as file,
-        laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
-    ):
+    with laz_writer(path, header) as writer:
         last_us = 0
         for piece, attributes in exported.tiles():
             chosen = np.flatnonzero((piece.states == State.REMOVED) == removed)
@@ -140,6 +137,18 @@ def _write_points(exported: Exported, path: Path | str, removed: bool) -> None:
                 if of_part is not None:
                     last_us = max(last_us, int(of_part.last_us.max()))
         writer.header.creation_date += timedelta(microseconds=last_us)
+
+
+@contextmanager
+def laz_writer(path: Path | str, header: laspy.LasHeader) -> Iterator[laspy.LasWriter]:
+    """What writes the points of a LAZ file, which is there when it is complete; raises DataError."""
+    import laspy
+
+    with (
+        replacing(path) as file,
+        laspy.open(file, mode="w", header=header, do_compress=True, closefd=False) as writer,
+    ):
+        yield writer
 
 
 def las_header(
@@ -184,22 +193,32 @@ def las_points(
     header: laspy.LasHeader,
 ) -> laspy.ScaleAwarePointRecord:
     """One point for every voxel."""
-    import laspy
-
-    labels, states, label_set = piece.labels, piece.states, piece.voxels.label_set
-    points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
-    points.x, points.y, points.z = _placed(piece.voxels.centres, georeference).T
-    points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
-    points.return_number[:] = 1
-    points.number_of_returns[:] = 1
-    unlabelled = np.where(states == State.UNOBSERVED, NEVER_CLASSIFIED, UNCLASSIFIED)
-    points.classification = np.where(labels < 0, unlabelled, label_set.asprs_codes[labels])
+    labels, states = piece.labels, piece.states
+    points = labelled_points(
+        _placed(piece.voxels.centres, georeference), labels, piece.voxels.label_set, header
+    )
+    points.classification[(labels < 0) & (states == State.UNOBSERVED)] = NEVER_CLASSIFIED
     points.withheld, points.user_data = states == State.REMOVED, piece.told_reasons
-    points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
     points.confidence, points.hits, points.state = piece.confidence, piece.voxels.hits, states
     if attributes is not None:
         points.gps_time = adjusted_gps_time(attributes.last_us)
         points.intensity = 257 * attributes.intensity.astype(np.uint16)  # to 16 bit
+    return points
+
+
+def labelled_points(
+    p: NDArray[np.float64], labels: NDArray[np.int8], label_set: LabelSet, header: laspy.LasHeader
+) -> laspy.ScaleAwarePointRecord:
+    """Points at (n, 3) m, in the coordinates of the file, with codes and colours of their labels (n,), -1: none."""
+    import laspy
+
+    points = laspy.ScaleAwarePointRecord.zeros(len(labels), header=header)
+    points.x, points.y, points.z = p.T
+    points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
+    points.return_number[:] = 1
+    points.number_of_returns[:] = 1
+    points.classification = np.where(labels < 0, UNCLASSIFIED, label_set.asprs_codes[labels])
+    points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
     return points
 
 

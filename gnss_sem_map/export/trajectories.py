@@ -7,16 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from pyproj import CRS
 
 from factor_graphs import tum
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.dates import are_dates
+from gnss_sem_map.export.geoparquet import GEOMETRY, write_shapes
 from gnss_sem_map.export.longitudes import box_around, line_through
 from gnss_sem_map.files.atomic import replacing
-
-WGS84_3D_EPSG = 4979
 
 
 def write_tum(trajectory: Trajectory, path: Path | str) -> None:
@@ -67,7 +65,6 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     (WKB). Raises DataError when the file cannot be written.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     lat_deg, lon_deg, alt_m = frame.to_geodetic(trajectory.positions)
     places = np.column_stack([lon_deg, lat_deg, alt_m])
@@ -83,19 +80,5 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     if trajectory.covariances is not None:
         names = (f"stddev_{axis}_m" for axis in ("east", "north", "up"))
         columns |= dict(zip(names, trajectory.position_stddevs.T, strict=True))
-    columns["geometry"] = pa.array(shapely.to_wkb(shapely.points(places), byte_order=1).tolist(), pa.binary())
-    about = {
-        "version": "1.1.0",
-        "primary_column": "geometry",
-        "columns": {
-            "geometry": {
-                "encoding": "WKB",
-                "geometry_types": ["Point Z"],
-                "crs": CRS.from_epsg(WGS84_3D_EPSG).to_json_dict(),
-                "bbox": box_around(places),
-            }
-        },
-    }
-    table = pa.table(columns).replace_schema_metadata({"geo": json.dumps(about)})
-    with replacing(path) as file:
-        pq.write_table(table, file, compression="zstd")
+    columns[GEOMETRY] = pa.array(shapely.to_wkb(shapely.points(places), byte_order=1).tolist(), pa.binary())
+    write_shapes(pa.table(columns), ["Point Z"], box_around(places), True, path)

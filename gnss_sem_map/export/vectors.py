@@ -110,34 +110,21 @@ def _ground(
     piece: SemanticMap, tile: Tile, ground: NDArray[np.uint8], georeference: Georeference
 ) -> Iterator[Feature]:
     """Areas and kerbs of one tile."""
-    from rasterio import Affine, features
-
     size, edge = piece.voxels.voxel_size_m, 1 << TILE_BITS
     kind = ground[piece.labels]
     chosen = np.flatnonzero((kind > 0) & (piece.states != State.REMOVED))
     if not len(chosen):
         return
-    x, y, z = (piece.voxels.indices[chosen] - (tile[0] * edge - 1, tile[1] * edge - 1, 0)).T
+    corner = tile[0] * edge - 1, tile[1] * edge - 1
+    x, y, z = (piece.voxels.indices[chosen] - (*corner, 0)).T
     cells = np.full((edge + 2, edge + 2), AROUND, np.uint8)
     cells[1:-1, 1:-1] = NOTHING
     heights, confidence = np.zeros(cells.shape, np.float32), np.zeros(cells.shape, np.float32)
     cells[y, x] = kind[chosen]  # in order of height: of a column the highest stays
     heights[y, x], confidence[y, x] = z + 0.5, piece.confidence[chosen]  # surfaces are amid their voxels
     seen = confidence > 0
-    inner = features.sieve(
-        np.ascontiguousarray(cells[1:-1, 1:-1]), round(SMALLEST_AREA_M2 / size**2), connectivity=4
-    )
-    cells[1:-1, 1:-1] = inner
-    parts, kinds = _parts(cells)
-    corner = ((tile[0] * edge - 1) * size, (tile[1] * edge - 1) * size)
-    to_metres = Affine(size, 0, corner[0], 0, size, corner[1])
-    found = list(features.shapes(parts, connectivity=4, transform=to_metres))
-    numbers = np.array([int(number) for _, number in found])
-    shapes = shapely.coverage_simplify(
-        np.array([_polygon(shape["coordinates"]) for shape, _ in found]),
-        SIMPLIFIED_M,
-        simplify_boundary=False,
-    )
+    parts, kinds = _parts(_sieved(cells, size))
+    shapes, numbers = _shapes(parts, corner, size)
     of_part = parts.ravel()
     weights = np.bincount(of_part, seen.ravel())
     mean_height, mean_confidence = (
@@ -155,6 +142,32 @@ def _ground(
     for line, sure in _kerbs(*areas["road"], *areas["sidewalk"]):
         placed, _ = _placed(line, [float(heights[seen].mean()) * size], georeference)
         yield Feature("kerbs", placed, (line.length, sure))
+
+
+def _sieved(cells: NDArray[np.uint8], size: float) -> NDArray[np.uint8]:
+    """The cells of a tile, those of small areas given to what is around them; the ring around it stays."""
+    from rasterio import features
+
+    sieved = cells.copy()
+    least = round(SMALLEST_AREA_M2 / size**2)
+    sieved[1:-1, 1:-1] = features.sieve(np.ascontiguousarray(cells[1:-1, 1:-1]), least, connectivity=4)
+    return sieved
+
+
+def _shapes(
+    parts: NDArray[np.int32], corner: tuple[int, int], size: float
+) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """Simplified outlines (n,) of parts in metres of the map, and the number of the part of each.
+
+    `corner`: index of the cell in the lowest row and column.
+    """
+    from rasterio import Affine, features
+
+    to_metres = Affine(size, 0, corner[0] * size, 0, size, corner[1] * size)
+    found = list(features.shapes(parts, connectivity=4, transform=to_metres))
+    polygons = np.array([_polygon(shape["coordinates"]) for shape, _ in found])
+    numbers = np.array([int(number) for _, number in found])
+    return shapely.coverage_simplify(polygons, SIMPLIFIED_M, simplify_boundary=False), numbers
 
 
 def _parts(cells: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:

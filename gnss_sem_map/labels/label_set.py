@@ -148,6 +148,11 @@ class Taxonomy:
     void: Mapping[str, tuple[int, ...]]
     """For each kind of id: the ids without a class."""
 
+    @property
+    def usual_ids(self) -> str:
+        """The kind of ids that is meant where none is named: the first."""
+        return next(iter(self.ids))
+
     def lookup(self, label_set: LabelSet, kind: str, size: int = 256) -> NDArray[np.int16]:
         """Table from id to class index: c is `other`, -1 void, -2 an unknown id."""
         table = np.full(size, -2, np.int16)

@@ -48,8 +48,7 @@ class CachedLabels:
         self._files, suffix = _label_files(folder, list(self._sizes) or [""])
         self._evidence: NDArray[np.uint8] | None = None
         if suffix == ".png":
-            self._ids = ids or _default_ids(taxonomy)
-            self._unknown, self._evidence = _evidence_of_ids(label_set, taxonomy, self._ids)
+            self._ids, self._unknown, self._evidence = _evidence_of_ids(label_set, taxonomy, ids)
             self.class_names: tuple[str, ...] = (*label_set.names, OTHER)
         elif ids is not None:
             raise ConfigError(
@@ -174,13 +173,12 @@ def _numbered(paths: list[Path], suffix: str) -> dict[int, Path]:
     return files
 
 
-def _default_ids(name: str) -> str:
-    return next(iter(taxonomy(name).ids))
-
-
-def _evidence_of_ids(label_set: LabelSet, name: str, ids: str) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
-    """For every 8-bit id: whether it is unknown (256,), and its evidence (256, c + 1) as round(255 p)."""
+def _evidence_of_ids(
+    label_set: LabelSet, name: str, ids: str | None
+) -> tuple[str, NDArray[np.bool_], NDArray[np.uint8]]:
+    """The kind of ids, and of every 8-bit id whether it is unknown (256,) and evidence (256, c + 1) as round(255 p)."""
     source = taxonomy(name)
+    ids = ids or source.usual_ids
     if ids not in source.ids:
         raise ConfigError(f"labels: taxonomy {name!r} has no ids {ids!r}; expected one of {list(source.ids)}")
     classes = source.lookup(label_set, ids)
@@ -189,4 +187,4 @@ def _evidence_of_ids(label_set: LabelSet, name: str, ids: str) -> tuple[NDArray[
     softened = np.where(np.eye(count, dtype=bool), HARD_LABEL_PROBABILITY, rest)
     evidence = np.zeros((256, count), np.uint8)
     evidence[classes >= 0] = np.rint(255 * softened[classes[classes >= 0]])
-    return classes < UNLABELLED, evidence
+    return ids, classes < UNLABELLED, evidence

@@ -49,5 +49,6 @@ def named_classes(
 def _expand(item: str, label_set: LabelSet) -> list[str]:
     if item not in label_set.sources:
         return [item]
-    ids = next(iter(taxonomy(item).ids.values()))
+    source = taxonomy(item)
+    ids = source.ids[source.usual_ids]
     return sorted(ids, key=lambda name: ids[name])

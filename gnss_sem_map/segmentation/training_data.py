@@ -80,7 +80,7 @@ def labelled_images(
     when there are none or an image has no labels, ConfigError for ids that the taxonomy does not have.
     """
     source = taxonomy(taxonomy_name)
-    kind = ids or next(iter(source.ids))
+    kind = ids or source.usual_ids
     if kind not in source.ids:
         raise ConfigError(
             f"taxonomy {taxonomy_name!r} has no ids {kind!r}; expected one of {list(source.ids)}"

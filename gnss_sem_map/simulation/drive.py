@@ -374,11 +374,16 @@ def write_stamps(path: Path, morning_ns: int, stamps: Floats) -> None:
     path.write_text("".join(str(time).replace("T", " ") + "\n" for time in times))
 
 
+def write_scan(drive: Path, name: str, scan: SimulatedScan) -> None:
+    """The points and the true labels of a sweep."""
+    (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
+    (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
+
+
 def _write_frame(simulation: Simulation, k: int, drive: Path) -> npt.NDArray[np.uint16]:
     """Render and write one scan and one image with their truth; returns the instances that the image shows."""
     name, scan, image = f"{k:010d}", simulation.scan(k), simulation.image(k)
-    (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
-    (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
+    write_scan(drive, name, scan)
     write_photo(drive / "image_02" / "data" / f"{name}.png", image.rgb)
     write_ids(drive / "truth" / "train_ids" / f"{name}.png", image.train_ids)
     alone = seen_alone(image, *simulation.project(k, scan))

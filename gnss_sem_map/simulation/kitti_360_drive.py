@@ -12,7 +12,7 @@ from gnss_sem_map.datasets.kitti_360 import IMAGES, T_IMU_POSE, geodetic_to_worl
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.simulation.camera import Camera
 from gnss_sem_map.simulation.compiled import Floats
-from gnss_sem_map.simulation.drive import Simulation, write_oxts, write_stamps, write_truth
+from gnss_sem_map.simulation.drive import Simulation, write_oxts, write_scan, write_stamps, write_truth
 from gnss_sem_map.simulation.kitti_rig import transform
 from gnss_sem_map.simulation.png_files import write_ids, write_photo
 from gnss_sem_map.simulation.rigs import MountedCamera
@@ -59,9 +59,8 @@ def write_kitti_360(
 
 
 def _write_frame(simulation: Simulation, k: int, drive: Path, images: Path) -> None:
-    name, scan = f"{k:010d}", simulation.scan(k)
-    (drive / "velodyne_points" / "data" / f"{name}.bin").write_bytes(scan.points.astype("<f4").tobytes())
-    (drive / "truth" / "labels" / f"{name}.label").write_bytes(scan.labels.astype("<u4").tobytes())
+    name = f"{k:010d}"
+    write_scan(drive, name, simulation.scan(k))
     for number, camera in enumerate(simulation.rig.cameras):
         image = simulation.image(k, number)
         folder = images / camera.name / IMAGES[camera.name]

@@ -194,9 +194,9 @@ def _axes(seen: Seen, gain: TurnGain | None) -> tuple[list[Finding], AxesMistake
     mistake = fitting[0]
     if mistake is not axes.RIGHT:
         alternatives = _alternatives(fitting)
-        level = "GNSS track" if mistake.mirrored else "IMU axes"
+        check = "GNSS track" if mistake.mirrored else "IMU axes"
         words = " or ".join(m.name for m in alternatives)
-        return [red(level, evidence, words, "; or ".join(m.remedy for m in alternatives))], mistake
+        return [red(check, evidence, words, "; or ".join(m.remedy for m in alternatives))], mistake
     return [green("IMU axes", evidence), *_mounting(seen)], mistake
 
 

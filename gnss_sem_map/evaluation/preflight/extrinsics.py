@@ -168,11 +168,31 @@ def _rotation(
     sample: Sample, motions: _Motions, ways: Array, moved: NDArray[np.bool_], R: Array
 ) -> tuple[Array, Array, list[str]]:
     """The rotation (3, 3) that fits best, its standard deviations (3,) about the imu's axes, and what it is seen by."""
+    A, B, weights, seen = _directions(sample, motions, ways, moved, R)
+    if len(A) < 1:
+        return R, np.full(3, np.inf), seen
+    # what nothing tells stays as given
+    information = np.einsum("n,nij->ij", weights, np.eye(3) - B[:, :, None] * B[:, None, :])
+    values, axes = np.linalg.eigh(information)
+    known = values > 1 / np.radians(5.0) ** 2
+    fitted = _wahba(A, B, weights, R)
+    turn = Rotation.from_matrix(fitted @ R.T).as_rotvec()
+    if not known.all():
+        turn = axes[:, known] @ (axes[:, known].T @ turn)
+    spread = np.sqrt(np.einsum("ij,j,ij->i", axes, 1 / np.maximum(values, 1e-9), axes))
+    yaw_pitch = np.sqrt(motions.attitude_variances[:, 1:].max(axis=1))
+    common = np.array([0.0, *np.repeat(np.median(yaw_pitch), 2)])
+    return Rotation.from_rotvec(turn).as_matrix() @ R, np.hypot(spread, common), seen
+
+
+def _directions(
+    sample: Sample, motions: _Motions, ways: Array, moved: NDArray[np.bool_], R: Array
+) -> tuple[Array, Array, Array, list[str]]:
+    """Unit vectors (n, 3) that the LiDAR sees, the same in the imu frame, their weights (n,), and what they are."""
     a: list[Array] = []
     b: list[Array] = []
     variances: list[float] = []
     seen = []
-    yaw_pitch = np.sqrt(motions.attitude_variances[:, 1:].max(axis=1))
     for k in np.flatnonzero(moved).tolist():
         way = float(np.linalg.norm(motions.ways_lidar[k]))
         a.append(motions.ways_lidar[k] / max(way, 1e-9))
@@ -195,21 +215,7 @@ def _rotation(
             variances.append(GROUND_STDDEV_RAD**2)
     if any(normal is not None for _, normal in grounds):
         seen.append("the ground")
-    if len(a) < 1:
-        return R, np.full(3, np.inf), seen
-    weights = 1 / np.array(variances)
-    A, B = np.array(a), np.array(b)
-    # what nothing tells stays as given
-    information = np.einsum("n,nij->ij", weights, np.eye(3) - B[:, :, None] * B[:, None, :])
-    values, axes = np.linalg.eigh(information)
-    known = values > 1 / np.radians(5.0) ** 2
-    fitted = _wahba(A, B, weights, R)
-    turn = Rotation.from_matrix(fitted @ R.T).as_rotvec()
-    if not known.all():
-        turn = axes[:, known] @ (axes[:, known].T @ turn)
-    spread = np.sqrt(np.einsum("ij,j,ij->i", axes, 1 / np.maximum(values, 1e-9), axes))
-    common = np.array([0.0, *np.repeat(np.median(yaw_pitch), 2)])
-    return Rotation.from_rotvec(turn).as_matrix() @ R, np.hypot(spread, common), seen
+    return np.array(a), np.array(b), 1 / np.array(variances), seen
 
 
 def _wahba(a: Array, b: Array, weights: Array, R: Array) -> Array:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gnss_sem_map.evaluation.preflight.planes import Planes, jacobians, normals_of
 from gnss_sem_map.scans.registration import exp, inverse
 from gnss_sem_map.sensor_log import Points, Scan
 from gnss_sem_map.voxels.hash_unique import distinct
@@ -30,13 +30,11 @@ Rates = tuple[Array, Array]
 STEPS = (1, 3, 6, 9)
 """Sweeps of a stretch, counted from its first."""
 NEAREST_M, FARTHEST_M = 2.5, 50.0
-EDGE_M, NEIGHBOURS = 0.6, 8
-"""One point per cube of this edge is matched, with the plane of so many neighbours."""
+EDGE_M = 0.6
+"""One point per cube of this edge is matched."""
 LEAST_POINTS = 150
 FIRST_M, NEXT_M, AGAIN_M = (3.0, 2.0, 1.0, 0.5), (2.0, 1.0, 0.5, 0.3), (0.5, 0.3)
 """How far a point may lie from its surface, step by step: unknown speed, known speed, deskewed once more."""
-SOFT_M = 0.05
-"""Residuals beyond this count less (Huber)."""
 LOST_M = 0.3
 LEAST_HELD = 0.01
 """A motion is known along a direction that so much of the points' weight holds."""
@@ -131,28 +129,24 @@ class Target:
     """A sweep that others are matched with, point to plane."""
 
     def __init__(self, p_lidar: Array, normals: Array) -> None:
-        self._p, self._normals, self._tree = p_lidar, normals, small_gicp.KdTree(p_lidar)
-        self._has_plane = (normals != 0).any(axis=1)
+        self._planes = Planes(p_lidar, normals)
 
     def match(self, p: Array, guess: Array, steps_m: tuple[float, ...]) -> Match | None:
         """Register the points (m, 3) of another sweep to this one; None if too few have a correspondence."""
         T, share, off, held = guess, 0.0, 0.0, 0.0
         for within_m in steps_m:
-            moved = p @ T[:3, :3].T + T[:3, 3]
-            places, squares = (np.asarray(a) for a in self._tree.batch_nearest_neighbor_search(moved))
-            use = np.flatnonzero((squares < within_m**2) & self._has_plane[places])
-            if len(use) < LEAST_POINTS / 2:
+            at, n, residuals = self._planes.near(p @ T[:3, :3].T + T[:3, 3], within_m)
+            if len(at) < LEAST_POINTS / 2:
                 return None
-            share, n, at = len(use) / len(p), self._normals[places[use]], moved[use]
-            residuals = np.einsum("ij,ij->i", n, at - self._p[places[use]])
+            share = len(at) / len(p)
             off = (1 - share) * LOST_M**2 + share * float(np.minimum(residuals**2, LOST_M**2).mean())
-            J = np.hstack([np.cross(at, n), n])
-            weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(residuals), 1e-9))[:, None]
-            # a little weight on the guess: along an open street nothing holds, and nothing may run away
-            T = exp(-np.linalg.solve(J.T @ weighted + 0.1 * np.eye(6), weighted.T @ residuals)) @ T
+            J, weighted = jacobians(at, n, residuals)
             H = J.T @ weighted
+            # a little weight on the guess: along an open street nothing holds, and nothing may run away
+            step = np.linalg.solve(H + 0.1 * np.eye(6), weighted.T @ residuals)
+            T = exp(-np.asarray(step, np.float64)) @ T
             along = H[3:, 3:] - H[3:, :3] @ np.linalg.lstsq(H[:3, :3], H[:3, 3:], rcond=None)[0]
-            held = float(np.linalg.eigvalsh(along)[0] / len(use))
+            held = float(np.linalg.eigvalsh(along)[0] / len(at))
         return Match(T, share, off, held)
 
 
@@ -203,7 +197,7 @@ def thinned(points: Points, stamp: float) -> Sweep | None:
     return Sweep(
         stamp,
         p,
-        _normals(p),
+        normals_of(p),
         None if after is None else after[one],
         cloud[dense],
         None if after is None else after[dense],
@@ -213,12 +207,6 @@ def thinned(points: Points, stamp: float) -> Sweep | None:
 def turns(p: NDArray[np.floating]) -> Array:
     """How far a clockwise scanner had turned at each point (n, 3): -0.5 and 0.5 at the rear, 0 in front."""
     return np.asarray(-np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi), np.float64)
-
-
-def _normals(p: Array) -> Array:
-    cloud = small_gicp.PointCloud(p)
-    small_gicp.estimate_normals(cloud, small_gicp.KdTree(cloud), NEIGHBOURS)
-    return np.asarray(cloud.normals())[:, :3].copy()
 
 
 def _surfaces(clouds: list[Array]) -> Surfaces:

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-import small_gicp
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
@@ -20,6 +19,7 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.planes import SOFT_M, Planes, jacobians, normals_of
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, points_in_map
 from gnss_sem_map.scans.downsampling import one_per_cube
@@ -33,8 +33,8 @@ AROUND_S = (-2.0, -1.0, -0.4, 0.0, 0.4, 1.0, 2.0)
 AT_MOST_S = 0.3
 """Farther from where it was wanted, no sweep is taken."""
 NEAREST_M, FARTHEST_M = 2.5, 40.0
-EDGE_M, NEIGHBOURS = 0.3, 8
-"""One point per cube of this edge counts, the mean, with the plane of so many neighbours."""
+EDGE_M = 0.3
+"""One point per cube of this edge counts, the mean."""
 LEAST_POINTS = 150
 STEPS_M = (3.0, 2.0, 1.0, 0.5, 0.3, 0.2)
 """How far a point may lie from its surface, step by step."""
@@ -42,8 +42,6 @@ REPEATS, STILL = 6, 2e-3
 """Each step is repeated at most so often, until the next motion is smaller than this, rad and m."""
 NEAR_M = 1.0
 """Of points within this distance of a surface, the median distance is told."""
-SOFT_M = 0.05
-"""Residuals beyond this count less (Huber)."""
 LEAST_SHARE = 0.35
 """A match is believed when so many of the points lie within the last step of a surface."""
 POINTS_PER_SURFACE = 100
@@ -65,11 +63,7 @@ ground alone holds it level."""
 class _Moment:
     """Surfaces by the first LiDAR, and points of the other one, both in the imu frame of one moment."""
 
-    p_surface: Array
-    """(n, 3) m"""
-    normals: Array
-    """(n, 3); zero where there is no plane."""
-    tree: small_gicp.KdTree
+    surfaces: Planes
     p: Array
     """(m, 3) m"""
     up: Array
@@ -167,7 +161,7 @@ def _on_surfaces(moment: _Moment, Ts: Array) -> NDArray[np.int64]:
     """For each motion (k, 4, 4), how many points it brings into a cell with a surface, or beside one: (k,)."""
     size = int(2 * FARTHEST_M / CELL_M) + 3  # an empty cell on every side
     occupied = np.zeros((size,) * 3, np.bool_)
-    occupied[tuple((moment.p_surface / CELL_M).astype(np.int64).T + size // 2)] = True
+    occupied[tuple((moment.surfaces.p / CELL_M).astype(np.int64).T + size // 2)] = True
     occupied = binary_dilation(occupied, np.ones((3, 3, 3), np.bool_))
     hits = np.empty(len(Ts), np.int64)
     for k, T in enumerate(Ts):
@@ -219,10 +213,8 @@ def _moment(first: SensorLog, other: SensorLog, stamp: float, trajectory: Trajec
     surface = one_per_cube(np.concatenate(clouds), EDGE_M)
     if len(surface) < LEAST_POINTS:
         return None
-    cloud, tree = small_gicp.PointCloud(surface), small_gicp.KdTree(surface)
-    small_gicp.estimate_normals(cloud, tree, NEIGHBOURS)
-    normals = np.asarray(cloud.normals())[:, :3].copy()
-    return _Moment(surface, normals, tree, one_per_cube(p, EDGE_M), np.asarray(T_imu_map[:3, 2]))
+    surfaces = Planes(surface, normals_of(surface))
+    return _Moment(surfaces, one_per_cube(p, EDGE_M), np.asarray(T_imu_map[:3, 2]))
 
 
 def _nearest(scans: tuple[Scan, ...], stamp: float) -> Scan | None:
@@ -242,11 +234,7 @@ def _points(log: SensorLog, scan: Scan | None, trajectory: Trajectory, T_imu_map
 
 def _residuals(moment: _Moment, T: Array, within_m: float) -> tuple[Array, Array, Array]:
     """Points (k, 3) within a distance of a surface, its normals there (k, 3), and their distances across it (k,)."""
-    moved = moment.p @ T[:3, :3].T + T[:3, 3]
-    places, squares = (np.asarray(a) for a in moment.tree.batch_nearest_neighbor_search(moved))
-    use = (squares < within_m**2) & (moment.normals[places] != 0).any(axis=1)
-    at, n = moved[use], moment.normals[places[use]]
-    return at, n, np.einsum("ij,ij->i", n, at - moment.p_surface[places[use]])
+    return moment.surfaces.near(moment.p @ T[:3, :3].T + T[:3, 3], within_m)
 
 
 def _distance(moments: list[_Moment], T: Array) -> float:
@@ -269,8 +257,7 @@ def _step(moments: list[_Moment], T: Array, within_m: float) -> _Fit:
     found = [_residuals(moment, T, within_m) for moment in moments]
     at, n, r = (np.concatenate(parts) for parts in zip(*found, strict=True))
     share = len(r) / sum(len(moment.p) for moment in moments)
-    J = np.hstack([np.cross(at, n), n])
-    weighted = J * np.minimum(1.0, SOFT_M / np.maximum(np.abs(r), 1e-9))[:, None]
+    J, weighted = jacobians(at, n, r)
     scatter = 1.48 * float(np.median(np.abs(r))) if len(r) else np.inf
     H = J.T @ weighted + np.eye(6)  # a little weight on where it is: what no surface holds stays
     T = exp(-np.linalg.solve(H, weighted.T @ r)) @ T

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.measurements import ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral
+from gnss_sem_map.evaluation.preflight.response import regression
 from gnss_sem_map.evaluation.preflight.track import Track
 
 Array = NDArray[np.float64]
@@ -32,14 +33,10 @@ def rate_response(imu: ImuSamples, attitude: Trajectory) -> Array:
     sums = SmoothedIntegral.of(imu.stamps, imu.angular_rate).at(stamps, 0.0)
     design, said = turned / duration, (sums[count:] - sums[:-count]) / duration
     design = np.column_stack([design, np.ones(len(design))])
-    normal = design.T @ design + 1e-12 * np.eye(4)
-    found = np.linalg.solve(normal, design.T @ said)
-    rest = said - design @ found
-    spread = np.sqrt(np.mean(rest**2, axis=0).max() * count)
-    stddevs = spread * np.sqrt(np.diag(np.linalg.inv(normal)))[:3]
+    found, stddevs = regression(design, said, 1e-12, count)
     columns = found[:3].T
     size = np.linalg.norm(columns, axis=0)
-    return np.where(stddevs < MOST_STDDEV * size, columns, np.nan)
+    return np.where(stddevs[:3] < MOST_STDDEV * size, columns, np.nan)
 
 
 def course_errors(attitude: Trajectory, track: Track) -> tuple[float, float] | None:

@@ -49,10 +49,8 @@ class ForceResponse:
     stddevs: Array
 
 
-def turn_gain(
-    turned: SmoothedIntegral, track: Track, lag_s: float = 0.0, gain: float | None = None
-) -> TurnGain | None:
-    """The gain that fits best (or a given one), with fixes `lag_s` later than stamped; None: no course."""
+def turn_gain(turned: SmoothedIntegral, track: Track, lag_s: float = 0.0) -> TurnGain | None:
+    """The gain that fits best, with fixes `lag_s` later than stamped; None: no course."""
     courses, stamps, moving = track.courses, track.stamps, track.is_moving
     if moving.sum() < LEAST_INTERVALS:
         return None
@@ -71,17 +69,11 @@ def turn_gain(
         return None
     by_course, by_gyro = course[last] - course[first], heading[last] - heading[first]
     overlap = max(1.0, span / float(np.median(np.diff(stamps))))
-    if gain is None:
-        gain = _median_ratio(by_course, by_gyro)
+    gain = _median_ratio(by_course, by_gyro)
     misfit = np.abs(by_course - gain * by_gyro)
     excited = float(np.sqrt(np.sum(by_gyro**2)))
     stddev = MEDIAN_LOSS * MAD * float(np.median(misfit)) * np.sqrt(overlap) / max(excited, 1e-12)
-    return TurnGain(
-        gain,
-        stddev,
-        float(misfit.mean()),
-        int(len(first) / overlap),
-    )
+    return TurnGain(gain, stddev, float(misfit.mean()), int(len(first) / overlap))
 
 
 def force_response(
@@ -110,12 +102,20 @@ def force_response(
     if len(first) / overlap < LEAST_INTERVALS:
         return None
     # a millionth of g holds what the track does not excite
-    normal = design.T @ design + 1e-10 * np.eye(3)
-    found = np.linalg.solve(normal, design.T @ means[:, :3])
-    rest = means[:, :3] - design @ found
-    spread = np.sqrt(np.mean(rest**2, axis=0).max() * overlap)
-    stddevs = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+    found, stddevs = regression(design, means[:, :3], 1e-10, overlap)
     return ForceResponse(found[0], found[1], found[2], stddevs)
+
+
+def regression(design: Array, values: Array, damping: float, overlap: float) -> tuple[Array, Array]:
+    """Least squares of `values` (n, k) by `design` (n, p): (p, k), and standard deviations (p,) of the worst column.
+
+    So many rows as `overlap` share what they measure, and count as one; `damping` holds what no row excites.
+    """
+    normal = design.T @ design + damping * np.eye(design.shape[1])
+    found = np.linalg.solve(normal, design.T @ values)
+    rest = values - design @ found
+    spread = np.sqrt(np.mean(rest**2, axis=0).max() * overlap)
+    return np.asarray(found), np.asarray(spread * np.sqrt(np.diag(np.linalg.inv(normal))))
 
 
 def _span(track: Track) -> float:

@@ -79,7 +79,7 @@ def link_or_copy(source: Path | str, target: Path | str) -> None:
 
 def _explained(path: Path, error: OSError) -> str:
     if error.errno in NO_ROOM:
-        return f"{path}: no room to write it ({os.strerror(error.errno)}); free space there and export again"
+        return f"{path}: no room to write it ({os.strerror(error.errno)}); free space there and try again"
     if error.errno == errno.ENOENT:
         return f"{path}: the folder {path.parent} does not exist; create it first"
     return f"{path}: cannot be written ({error.strerror or error}); check the folder and its permissions"

@@ -11,7 +11,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
     """
     listed = read_list(folder)
     for name in _content(folder):
-        if is_partial(name) and not os.path.islink(folder / name):
+        if is_partial(name, listed or ()) and not os.path.islink(folder / name):
             continue
         if listed is None:
             ours = by_name(name) and not os.path.islink(folder / name)
@@ -71,12 +71,12 @@ def remove(folder: Path) -> None:
     What is not ours stays, and so does the folder that holds it: then that is the error.
     """
     listed = read_list(folder) or {}
+    remove_partials(folder)
     # the deepest first, so that folders are empty when their turn comes
     for name in sorted(listed, key=lambda name: name.count("/") - name.endswith("/"), reverse=True):
         path = folder / name
         if _is_as_listed(path, listed[name]):
             path.rmdir() if name.endswith("/") else path.unlink()
-    remove_partials(folder)
     left = next(_content(folder), None)
     if left is None:
         (folder / MARKER).unlink(missing_ok=True)
@@ -84,9 +84,11 @@ def remove(folder: Path) -> None:
 
 
 def remove_partials(folder: Path) -> None:
-    """Remove unfinished lists and pages of killed processes; raises OSError."""
-    for path in folder.glob(".*.part") if folder.is_dir() else ():
-        if is_partial(path.name):
+    """Remove unfinished files of killed processes; raises OSError."""
+    listed = read_list(folder) or ()
+    for path in folder.rglob(".*.part") if folder.is_dir() else ():
+        is_file = path.is_file() and not path.is_symlink()
+        if is_file and is_partial(path.relative_to(folder).as_posix(), listed):
             path.unlink()
 
 
@@ -147,10 +149,11 @@ def _with_lists(folder: Path) -> Iterator[tuple[Path, str]]:
             yield parent, inside
 
 
-def is_partial(name: str) -> bool:
-    """Whether a path is that of an unfinished list or page of a killed process."""
-    files = "|".join(map(re.escape, (MARKER, "report.html", "metrics.json", "check.html")))
-    return re.fullmatch(rf"\.({files})\.\d+\.part", name) is not None
+def is_partial(name: str, listed: Container[str] = ()) -> bool:
+    """Whether a path is that of an unfinished list, page, or file that is listed, of a killed process."""
+    found = re.fullmatch(r"(.*/)?\.([^/]+)\.\d+\.part", name)
+    file = "" if found is None else (found[1] or "") + found[2]
+    return file in (MARKER, "report.html", "metrics.json", "check.html") or file in listed
 
 
 def state_of(path: Path, all_content: bool = False) -> str:

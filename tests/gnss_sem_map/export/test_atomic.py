@@ -81,5 +81,11 @@ def test_what_a_format_writes_into_a_run_is_listed_with_its_folders_and_goes_wit
     with pytest.raises(DataError, match=r"0_1_0.js: was not written by us"):
         ownership.amend_all(run, exported)
     (run / "viewer/0_1_0.js").unlink()
+    for name in (".viewer.html.7.part", "viewer/.0_1_0.js.7.part"):  # the process was killed
+        (run / name).write_text("half of it")
+    assert ownership.foreign(run) is None
+    (run / ".thesis.tex.7.part").write_text("half of a thesis")
+    assert ownership.foreign(run) == ".thesis.tex.7.part"
+    (run / ".thesis.tex.7.part").unlink()
     ownership.remove(run)
     assert not run.exists()

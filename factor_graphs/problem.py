@@ -144,7 +144,7 @@ def pose_problem(
     relative: RelativePoses = NO_RELATIVE_POSES,
 ) -> Problem:
     """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
-    used, notes = _usable(fixes, imu, settings.max_speed_mps)
+    used, notes = usable_fixes(fixes, imu, settings.max_speed_mps)
     relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
     relative = relative[relative_used]
     correlation_times_s = correlation_times(fixes[used], settings, relative.stamps)
@@ -185,7 +185,9 @@ def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
     return np.asarray(np.abs(others[nearest(others, stamps)] - stamps) <= CARRIED_S)
 
 
-def _usable(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> tuple[NDArray[np.bool_], list[str]]:
+def usable_fixes(
+    fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float
+) -> tuple[NDArray[np.bool_], list[str]]:
     """Which fixes (n,) are within the IMU's span and need no impossible speed, and what is to be said of the others.
 
     Raises MeasurementError below three.

@@ -23,6 +23,7 @@ import factor_graphs
 import gnss_sem_map
 from gnss_sem_map import config
 from gnss_sem_map.cli import app
+from gnss_sem_map.datasets.log_yaml import LogFile
 
 COMMANDS: Any = typer.main.get_command(app)
 OTHERS = {"cd", "dask", "export", "git", "make", "source", "python3", ".venv/bin/pip"}
@@ -126,6 +127,12 @@ def test_a_snippet_runs(block: Block, tmp_path: Path) -> None:
 )
 def test_a_file_of_settings_is_yaml(block: Block) -> None:
     assert isinstance(yaml.safe_load(block.text), dict)
+
+
+def test_every_key_of_a_csv_log_has_its_meaning() -> None:
+    pages = "".join((ROOT / "docs" / name).read_text("utf-8") for name in ("your_own_log.md", "trust.md"))
+    rows = "".join(line.split("|")[1] for line in pages.splitlines() if line.startswith("| `"))
+    assert [key for key in LogFile.model_fields if f"`{key}`" not in rows] == []
 
 
 # --- links ------------------------------------------------------------------------------------------------------

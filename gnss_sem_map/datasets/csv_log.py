@@ -45,7 +45,7 @@ from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, r
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.untrusted import is_file, read_bytes, shown
+from gnss_sem_map.files.untrusted import inside, is_file, is_folder, read_bytes, shown
 from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -55,6 +55,7 @@ MOST_TABLE_BYTES = 1 << 30
 MOST_DIGITS = 19
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
+STAMPS = "stamps.csv"
 FORMAT, SIGNS = "table", "imu.csv and gnss.csv (CSV log)"
 
 
@@ -183,15 +184,18 @@ def _whole(text: str) -> int | None:
 def _stamped(what: str, folder: Path, *suffixes: str) -> tuple[list[tuple[int, float, Path]], list[Skip]]:
     """Number, stamp and file of every frame that has a stamp and a file; and the skipped frames."""
     found = frames.numbered(what, folder, *suffixes)
-    if not found.files and not is_file(folder / "stamps.csv"):
+    if not found.files and is_folder(folder) and (n := sum(path.name != STAMPS for path in inside(folder))):
+        name = f"{what}s are named by their numbers, such as 0000000007{suffixes[0]}"
+        found.skips.append(Skip(what, shown(folder), f"found {n} others; {name}", n))
+    if not found.files and not is_file(folder / STAMPS):
         return [], found.skips
-    stamps, skips = _stamps(folder / "stamps.csv", what)
+    stamps, skips = _stamps(folder / STAMPS, what)
     skips += [
         Skip(what, shown(path), "no stamp for this frame")
         for number, path in found.files.items()
         if number not in stamps
     ]
-    skips += frames.missing(what, folder, stamps, found.files) + found.skips
+    skips += found.skips + frames.missing(what, folder, stamps, found.files)
     return [(number, stamps[number], path) for number, path in found.files.items() if number in stamps], skips
 
 

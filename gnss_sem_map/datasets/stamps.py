@@ -44,12 +44,20 @@ def check_unit(stamps: NDArray[np.float64], longest_step_s: float, where: str) -
 
 
 def check_date(stamp: float, epoch_ns: int, where: str) -> None:
-    """Raise DataError when a stamp, s after the epoch, is later than any drive, or as long before 1970."""
+    """Raise DataError when a stamp, s after the epoch, is later than any drive, or as long before 1970.
+
+    With an epoch it is a date; before the first of GPS the epoch is not in nanoseconds.
+    """
     year = 1970 + (stamp + epoch_ns * 1e-9) / (365.2425 * 86400)
     if abs(year - 1970) > LAST_YEAR - 1970:
         raise DataError(
             f"{where}: the stamp {stamp:.10g} s is of the year {year:.0f}, expected one up to {LAST_YEAR}; seconds are"
             " those since `epoch_ns` of log.yaml, or Unix time without it"
+        )
+    if epoch_ns and year < FIRST_YEAR:
+        raise DataError(
+            f"{where}: with `epoch_ns: {epoch_ns}` of log.yaml the stamp {stamp:.10g} s is of the year {year:.0f},"
+            f" expected one from {FIRST_YEAR}; `epoch_ns` is the Unix time of stamp zero in nanoseconds"
         )
 
 

@@ -285,9 +285,10 @@ class SensorLog:
         """Raise DataError when the LiDAR that all else is relative to has no scan: then there is nothing to map."""
         if not self.scans:
             of = f" of {self.lidar}" if self.lidar else ""
+            why = next((f" ({skip.where}: {skip.reason})" for skip in self.skips if skip.what == "scan"), "")
             raise DataError(
-                f"{self.name}: has no LiDAR scan{of} to map, or none that --frames names; for the trajectory alone:"
-                " gnss-sem-map trajectory"
+                f"{self.name}: has no LiDAR scan{of} to map, or none that --frames names{why}; for the trajectory"
+                " alone: gnss-sem-map trajectory"
             )
 
     @property

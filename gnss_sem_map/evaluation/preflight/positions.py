@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes
+from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.problem import usable_fixes
 from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.evaluation.preflight import poses
 from gnss_sem_map.evaluation.preflight.clocks import FARTHEST_S, LEAP_S
@@ -51,6 +53,8 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield from _place(log.gnss, log.frame, found)
     yield from _heights(log.gnss, log.frame)
     yield _movement(log.gnss, found)
+    if log.imu is not None:
+        yield from _with_imu(log.gnss, log.imu, sample.settings.trajectory.max_speed_mps)
     yield _frozen(log.gnss, found)
     yield _accuracy(log, log.gnss)
     if sample.diagnosis is not None:
@@ -110,6 +114,20 @@ def _movement(fixes: GnssFixes, found: Fixes) -> Finding:
             "check the stamps (s) and the positions (degrees) of these rows; they will not be used",
         )
     return green("GNSS track", evidence)
+
+
+def _with_imu(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> Iterator[Finding]:
+    """A finding where too few fixes belong to the IMU's time, so that there is no trajectory."""
+    try:
+        usable_fixes(fixes, imu, max_speed_mps)
+    except MeasurementError as error:
+        times = f"{fixes.stamps.min():.3f}..{fixes.stamps.max():.3f} s" if len(fixes) else "none"
+        yield red(
+            "GNSS with IMU",
+            f"{error}; stamps of fixes: {times}",
+            "fixes and IMU have other clocks, other units of stamps, or are of other drives",
+            "give the stamps of both in seconds of one clock",
+        )
 
 
 def _frozen(fixes: GnssFixes, found: Fixes) -> Finding:

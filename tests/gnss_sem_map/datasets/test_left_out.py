@@ -12,6 +12,7 @@ import street
 from street import Street
 
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import SensorLog
 
 
@@ -146,3 +147,21 @@ def test_rows_of_the_imu_that_fill_a_gap_are_left_out_and_counted(copy: Path) ->
     log = open_drive(copy)
     np.testing.assert_allclose(log.imu.specific_force, np.delete(rows[:, 11:14], range(4, 9), axis=0))
     assert left_out(log) == [("oxts", 5, "5 rows on straight lines that fill gaps")]
+
+
+def test_frames_that_are_named_otherwise_are_counted_and_named(small_drive: Street, tmp_path: Path) -> None:
+    """A log without a scan says why; images that are not found make no map without classes in silence."""
+    drive = street.write_table_log(tmp_path, small_drive)
+    scans, images = (sorted(drive.glob(pattern)) for pattern in ("lidar/*.bin", "images/*.png"))
+    for path in (*scans, *images):
+        path.rename(path.with_name(f"frame_{path.name}"))
+    for folder in ("lidar", "images"):
+        (drive / folder / "stamps.csv").unlink()
+    log = open_drive(drive)
+    assert [skip[::2] for skip in left_out(log)] == [
+        ("scan", "found 12 others; scans are named by their numbers, such as 0000000007.bin"),
+        ("image", f"found {len(images)} others; images are named by their numbers, such as 0000000007.png"),
+    ]
+    assert [skip.frames for skip in log.skips] == [len(scans), len(images)]
+    with pytest.raises(DataError, match=r"no LiDAR scan .*lidar: found 12 others; scans are named by"):
+        log.check_scans()

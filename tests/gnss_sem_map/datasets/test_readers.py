@@ -214,6 +214,10 @@ def test_a_broken_table_of_wheel_speeds_is_refused(
         (9 * 10**18, r"imu\.csv: the stamp .* of the year 2255, expected one up to 2200"),
         (-9 * 10**18, r"imu\.csv: the stamp .* of the year 1685"),
         (10**30, r"log\.yaml: epoch_ns"),
+        (
+            1_317_000_000,
+            r"imu\.csv: with `epoch_ns: 1317000000` .* of the year 1970.* in nanoseconds",
+        ),  # in seconds
     ],
 )
 def test_a_table_log_of_an_impossible_year_is_refused(

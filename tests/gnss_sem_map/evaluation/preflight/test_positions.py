@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.evaluation.preflight.findings import Level
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 from gnss_sem_map.simulation import Camera, Lidar, prepare
@@ -72,6 +74,19 @@ def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s
     offset = float(said[0].split("gnss_time_offset_s: ")[1])
     assert offset == pytest.approx(-late_s, abs=0.2)
     assert wrong(findings(late, SensorConventions(gnss_time_offset_s=offset))) == []
+
+
+@pytest.mark.parametrize("stamps", [lambda t: 1000 * t + 200, lambda t: t + 86400])
+def test_fixes_of_another_time_than_the_imu_are_red(
+    right: SensorLog, stamps: Callable[[Array], Array]
+) -> None:
+    """As `run` refuses them, which finds none to smooth with: stamps in milliseconds, and those of another day."""
+    fixes = fixes_of(right)
+    apart = replace(right, gnss=GnssFixes(stamps(fixes.stamps), fixes.positions, fixes.stddevs))
+    [said] = [each for each in findings(apart) if each.check == "GNSS with IMU"]
+    assert said.level is Level.RED
+    assert "0 usable GNSS fixes" in said.evidence
+    assert not [each for each in findings(right) if each.check == "GNSS with IMU"]
 
 
 @pytest.mark.parametrize(("start", "seconds"), [(20.0, 10.0), (30.0, 30.0), (80.0, 60.0), (0.0, 200.0)])

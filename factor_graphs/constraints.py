@@ -13,12 +13,16 @@ from gtsam.symbol_shorthand import M, V, X
 from numpy.typing import NDArray
 
 from factor_graphs.intervals import ImuIntervals
+from factor_graphs.measurements import GnssFixes
 from factor_graphs.vehicle import MOUNTING_STDDEVS, BodyMotion
 
 Array = NDArray[np.float64]
 
 # A vehicle that stands: slower than this, m/s, and its IMU not much noisier than in its quietest tenth.
 STANDING_SPEED, QUIET = 0.3, 2.0
+# It creeps when its fixes go faster than the first, m/s, by so many standard deviations: fixes of a vehicle that stands
+# wander a little. Slower than the last, m/s, it may stand or creep.
+CREEP, SURELY, CREEPING_SPEED = 0.05, 4.0, 0.6
 
 
 def non_holonomic_factors(
@@ -48,11 +52,41 @@ def zero_velocity_factors(
         yield gtsam.PriorFactorVector(V(i), np.zeros(3), model)
 
 
-def standing(quiet: NDArray[np.bool_], velocities: Array) -> NDArray[np.bool_]:
+def standing(
+    quiet: NDArray[np.bool_], velocities: Array, speed_mps: float = STANDING_SPEED
+) -> NDArray[np.bool_]:
     """The keyframes at which the vehicle stands, (k,): slow there, and the IMU quiet on both sides."""
-    slow = np.linalg.norm(velocities, axis=1) < STANDING_SPEED
+    slow = np.linalg.norm(velocities, axis=1) < speed_mps
     still: NDArray[np.bool_] = slow & np.append(quiet, True) & np.append(True, quiet)
     return still
+
+
+def creeping(slow: NDArray[np.bool_], fixes: GnssFixes, at: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Of the keyframes (k,) that may stand, those of a time in which the fixes, at keyframes `at` (m,), go on.
+
+    A boat, a lift or a train may be as quiet while it moves. A straight line through the fixes of such a time tells how
+    fast they go, and how surely.
+    """
+    which = np.cumsum(slow & ~np.append(False, slow[:-1])) * slow
+    stand, k = which[at], which.max(initial=0) + 1
+    creeps = np.zeros(k, dtype=bool)
+    for place, stddev in zip(fixes.positions.T, fixes.stddevs.T, strict=True):
+        w = stddev**-2
+        t, y = (
+            values - (np.bincount(stand, w * values, k) / _sums(stand, w, k))[stand]
+            for values in (fixes.stamps, place)
+        )
+        spread = _sums(stand, w * t**2, k)
+        speed = np.bincount(stand, w * t * y, k) / spread
+        creeps |= np.abs(speed) > CREEP + SURELY / np.sqrt(spread)
+    creeps[0] = False
+    crept: NDArray[np.bool_] = creeps[which]
+    return crept
+
+
+def _sums(which: NDArray[np.intp], values: Array, n: int) -> Array:
+    """Sums of values by group, (n,), never zero: they are divided by."""
+    return np.maximum(np.bincount(which, values, n), 1e-12)
 
 
 def quiet_intervals(intervals: ImuIntervals) -> NDArray[np.bool_]:

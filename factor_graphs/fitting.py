@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from factor_graphs.calibration import Calibration, correct
 from factor_graphs.constraints import (
+    CREEPING_SPEED,
+    creeping,
     non_holonomic_factors,
     quiet_intervals,
     standing,
@@ -194,7 +196,7 @@ def constrain(
     slip: tuple[Slip, Slip] | None = None
     known: tuple[Slip, Slip] | None = None
     for n in range(CONSTRAINT_ROUNDS):
-        stands = standing(quiet, motion.velocity)
+        stands = _standing(problem, fit, quiet, motion)
         if rolling is not None:
             stands &= ~rolling.readings.moving
         if settled and stood is not None and np.array_equal(stands, stood):
@@ -252,6 +254,13 @@ def _quiet(problem: Problem) -> NDArray[np.bool_]:
     if problem.settings.standing_stddev_mps is None:
         return np.zeros(len(problem.intervals.keyframes) - 1, dtype=bool)
     return quiet_intervals(problem.intervals)
+
+
+def _standing(problem: Problem, fit: Fit, quiet: NDArray[np.bool_], motion: BodyMotion) -> NDArray[np.bool_]:
+    """The keyframes (k,) at which a solution stands, and the fixes that fit it, too."""
+    slow, fits = standing(quiet, motion.velocity, CREEPING_SPEED), fit.weights > 0.5
+    creeps = creeping(slow, problem.fixes[fits], problem.at[fits])
+    return standing(quiet, motion.velocity) & ~creeps
 
 
 def _with_shared(problem: Problem, fit: Fit, axle: Vehicle | None, rolling: Wheels | None) -> Fit:

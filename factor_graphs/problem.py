@@ -67,7 +67,7 @@ class Problem:
 
     `used` (m,) and `relative_used` (r,) say which of the fixes and relative poses given take part; `at` and
     `relative_at` (k, 2) are the keyframes of those that do. `late` (m,) s: a fix after its keyframe. Fixes have
-    `of_fixes` times the standard deviations that they say.
+    `of_fixes` times the standard deviations that they say. `heading_in_doubt`: another heading fits as well.
     """
 
     settings: SmootherSettings
@@ -86,6 +86,7 @@ class Problem:
     guess: tuple[Array, Array]
     notes: tuple[str, ...]
     of_fixes: float = 1.0
+    heading_in_doubt: bool = False
 
     def with_fix_noise(self, of_fixes: float) -> "Problem":
         """The same with fixes of so many times the standard deviations that they say."""

@@ -49,5 +49,7 @@ class SmootherSettings(BaseModel):
         "auto", description="Speed of the wheels, where a log has it. auto: where it fits the drive."
     )
     start_tilt_stddev_rad: float = Field(0.2, gt=0, description="Unknown roll and pitch of the first guess.")
-    start_heading_stddev_rad: float = Field(0.7, gt=0, description="Unknown heading of the first guess.")
+    start_heading_stddev_rad: float = Field(
+        1.8, gt=0, description="Unknown heading of the first guess; by default any heading is as likely."
+    )
     max_iterations: int = Field(50, gt=0, description="The optimiser fails when it needs more.")

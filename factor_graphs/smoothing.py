@@ -22,6 +22,7 @@ from factor_graphs.fitting import (
 )
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
+from factor_graphs.heading import of_any_heading, with_heading
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
 from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
@@ -124,9 +125,8 @@ def smooth(
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
         lever = calibration.p_imu_antenna
-        return fit_noise_of_all(
-            pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
-        )
+        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
+        return fit_noise_of_all(with_heading(problem))
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
@@ -166,6 +166,8 @@ def _solution(
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
     of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
+    if problem.heading_in_doubt:
+        of_poses += of_any_heading(R, problem.p_imu_antenna)
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
     noise = problem.noise.scaled(fit.inflation, fit.of_walk)
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)

@@ -1,14 +1,16 @@
 import gtsam
 import numpy as np
+import pytest
 from gtsam.symbol_shorthand import M, V, X
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors
-from factor_graphs.constraints import non_holonomic_factors, quiet_intervals, standing
+from factor_graphs.constraints import creeping, non_holonomic_factors, quiet_intervals, standing
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import split
-from factor_graphs.measurements import ImuNoise
+from factor_graphs.measurements import GnssFixes, ImuNoise
 from factor_graphs.settings import SmootherSettings
+from factor_graphs.simulation import Motion, follow
 from factor_graphs.smoothing import smooth
 from factor_graphs.vehicle import BodyMotion
 
@@ -71,3 +73,31 @@ def test_stops_and_the_axle_each_improve_an_outage(simulate):
             gains[name].append(worst[name] / worst["plain"])
     assert np.mean(gains["standing"]) < 1.0
     assert np.mean(gains["vehicle"]) < 0.8
+
+
+def test_what_creeps_as_quietly_as_it_stands_is_not_held_still(simulate):
+    """A boat or a lift: an IMU without vibrations, at 0.2 m/s. Held still, it was metres off, or without a solution."""
+
+    def creep(seconds: float, rng: np.random.Generator) -> Motion:
+        return follow(
+            np.column_stack([np.linspace(0, 60, 20), np.zeros(20), np.zeros(20)]),
+            [0.0, 1.0, seconds], [0.2, 0.2, 0.2],
+        )  # fmt: skip
+
+    for seed in range(2):
+        drive = simulate(70 + seed, noise=ImuNoise(), moves=creep)
+        s = smooth(drive.imu, drive.fixes, FRAME, None, np.zeros(3))
+        still = smooth(drive.imu, drive.fixes, FRAME, SmootherSettings(standing_stddev_mps=None), np.zeros(3))
+        np.testing.assert_allclose(s.keyframes.positions, still.keyframes.positions, atol=1e-3)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.03, 0.2])
+def test_only_a_stand_whose_fixes_go_on_surely_creeps(speed):
+    rng, stamps = np.random.default_rng(4), np.arange(120.0)
+    positions = speed * np.column_stack([stamps, 0 * stamps, 0 * stamps]) + rng.standard_normal((120, 3))
+    fixes = GnssFixes(stamps, positions, np.ones((120, 3)))
+    slow = np.ones(120, dtype=bool)
+    slow[40:45] = False
+    found = creeping(slow, fixes, np.arange(120))
+    assert np.array_equal(found, slow & (speed > 0.1))
+    assert not creeping(np.zeros(120, dtype=bool), fixes, np.arange(120)).any()

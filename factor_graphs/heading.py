@@ -1,0 +1,77 @@
+"""Which way does a slow vehicle look? Its course hardly tells, so several first guesses are tried.
+
+The optimiser goes to the nearest valley, and a covariance knows of no other. Where another heading fits as well, it is
+not known at all.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from factor_graphs.alignment import AttitudePrior
+from factor_graphs.chi_square import quantile
+from factor_graphs.errors import EstimationError
+from factor_graphs.graph import motion_from
+from factor_graphs.problem import Fit, Problem, first_values, motion_graph, optimise
+
+Array = NDArray[np.float64]
+
+# Slower than this, m/s, nearly always, the course does not tell the heading; a prior below this, rad, does.
+SLOW_MPS, UNKNOWN = 3.0, 1.0
+TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
+# Another heading, so far away, rad, fits as well when its cost is that of a good one of 999 in a thousand.
+APART, AS_GOOD = 0.5, quantile(0.999, 1)
+# Standard deviation of a heading that may be any, rad.
+ANY = np.pi / np.sqrt(3)
+
+
+def with_heading(problem: Problem) -> Problem:
+    """The problem with the first guess of which the solution is best, and with the doubt whether another is as good."""
+    speeds = np.linalg.norm(problem.guess[1], axis=1)
+    if problem.is_bound or problem.attitude.stddevs[2] < UNKNOWN or np.quantile(speeds, 0.9) > SLOW_MPS:
+        return problem
+    tried = [_solved(_turned(problem, turn)) for turn in TURNS_DEG]
+    found = [one for one in tried if one is not None]
+    if not found:
+        return problem
+    costs = np.array([2 * fit.graph.error(fit.values) for _, fit in found])
+    R_map_imu = np.stack([motion_from(fit.values)[0][len(speeds) // 2, :3, :3] for _, fit in found])
+    best, best_fit = found[int(costs.argmin())]
+    off = Rotation.from_matrix(R_map_imu @ R_map_imu[int(costs.argmin())].T).as_rotvec()[:, 2]
+    as_good = costs - costs.min() < AS_GOOD
+    in_doubt = bool(np.any(as_good & (np.abs(off) > APART)))
+    return replace(best, guess=motion_from(best_fit.values), heading_in_doubt=in_doubt)
+
+
+def of_any_heading(R_map_imu: Array, p_imu_antenna: Array) -> Array:
+    """Covariance (k, 6, 6) of poses with rotations (k, 3, 3) that may look anywhere: the antenna is where it is."""
+    up = R_map_imu[:, 2]
+    vertical = up[:, :, None] * up[:, None]
+    radius = np.linalg.norm(np.cross(up, p_imu_antenna), axis=1)
+    covariances = np.zeros((len(up), 6, 6))
+    covariances[:, :3, :3] = ANY**2 * vertical
+    covariances[:, 3:, 3:] = radius[:, None, None] ** 2 * (np.eye(3) - vertical)
+    return covariances
+
+
+def _turned(problem: Problem, turn_deg: float) -> Problem:
+    """The same with another heading of the first guess, the antenna where it was."""
+    turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+    T, velocities = problem.guess[0].copy(), problem.guess[1]
+    antenna = T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna
+    T[:, :3, :3] = turn @ T[:, :3, :3]
+    T[:, :3, 3] = antenna - T[:, :3, :3] @ problem.p_imu_antenna
+    attitude = AttitudePrior(turn @ problem.attitude.R_map_imu, problem.attitude.stddevs)
+    return replace(problem, guess=(T, velocities), attitude=attitude)
+
+
+def _solved(problem: Problem) -> tuple[Problem, Fit] | None:
+    """A guess and its solution with the noise that is expected, if there is one."""
+    loss = "huber" if problem.settings.robust else "quadratic"
+    try:
+        fit = optimise(problem, motion_graph(problem, 1.0, 1.0), first_values(problem), (1.0, 1.0), loss)
+    except EstimationError:
+        return None
+    return problem, fit

@@ -232,9 +232,6 @@ def _whole(value: Any, below: int) -> int:
     return value
 
 
-_CACHE: dict[str, dict[str, Any]] = {}
-
-
 @cache
 def _shipped() -> list[str]:
     """Names of the class sets and taxonomies that ship with us."""
@@ -243,21 +240,23 @@ def _shipped() -> list[str]:
 
 
 def _read(name_or_file: str | Path) -> dict[str, Any]:
-    available = _shipped()
     name = str(name_or_file)
-    if name in _CACHE:
-        return _CACHE[name]
-    if name in available:
-        file = Path(str(resources.files("gnss_sem_map") / "labels" / f"{name}.yaml"))
-    elif is_file(Path(name), ConfigError):
-        file = Path(name)
-    else:
-        raise ConfigError(f"no class set {shown(name)!r}: expected one of {available} or a YAML file")
+    if name in _shipped():
+        return _read_shipped(name)
+    if not is_file(Path(name), ConfigError):
+        raise ConfigError(f"no class set {shown(name)!r}: expected one of {_shipped()} or a YAML file")
+    return _read_file(Path(name))
+
+
+@cache
+def _read_shipped(name: str) -> dict[str, Any]:
+    return _read_file(Path(str(resources.files("gnss_sem_map") / "labels" / f"{name}.yaml")))
+
+
+def _read_file(file: Path) -> dict[str, Any]:
     content = read_yaml(file, ConfigError)
     if not isinstance(content, dict):
-        raise ConfigError(f"{name}: found {type(content).__name__}, expected a mapping with name and classes")
-    if name in available:
-        _CACHE[name] = content
+        raise ConfigError(f"{file}: found {type(content).__name__}, expected a mapping with name and classes")
     return content
 
 

@@ -241,7 +241,6 @@ def _whole(value: Any, below: int) -> int:
 
 
 _SHIPPED = resources.files("gnss_sem_map") / "labels"
-_CACHE: dict[str, dict[str, Any]] = {}
 
 
 @cache
@@ -253,19 +252,22 @@ def _shipped() -> list[str]:
 
 def _read(name_or_file: str | Path, what: str, available: Sequence[str]) -> dict[str, Any]:
     name = str(name_or_file)
-    if name in available and name in _CACHE:
-        return _CACHE[name]
     if name in available:
-        file = Path(str(_SHIPPED / f"{name}.yaml"))
-    elif is_file(Path(name), ConfigError):
-        file = Path(name)
-    else:
+        return _read_shipped(name)
+    if not is_file(Path(name), ConfigError):
         raise ConfigError(f"no {what} {shown(name)!r}: expected one of {list(available)} or a YAML file")
+    return _read_file(Path(name))
+
+
+@cache
+def _read_shipped(name: str) -> dict[str, Any]:
+    return _read_file(Path(str(_SHIPPED / f"{name}.yaml")))
+
+
+def _read_file(file: Path) -> dict[str, Any]:
     content = read_yaml(file, ConfigError)
     if not isinstance(content, dict):
-        raise ConfigError(f"{name}: found {type(content).__name__}, expected a mapping with name and classes")
-    if name in available:
-        _CACHE[name] = content
+        raise ConfigError(f"{file}: found {type(content).__name__}, expected a mapping with name and classes")
     return content
 
 

@@ -20,6 +20,7 @@ from gnss_sem_map.export.run_files import listed
 from gnss_sem_map.export.track import Track, read_track
 from gnss_sem_map.export.verdict import verdict_of
 from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_file, read_text
 from gnss_sem_map.voxels import tiles
 
@@ -95,12 +96,14 @@ def _overviews(folder: Path) -> dict[str, Overview]:
 
 
 def _tracks(folder: Path, run: Mapping[str, Any]) -> dict[str, Track]:
-    """Of every drive of the map, by name; empty where the folder has none."""
-    if "drives" in run:
-        places = {name: folder / "drives" / name / "trajectory.parquet" for name in run["drives"]}
-        return {name: read_track(path) for name, path in places.items() if is_file(path)}
-    path, scans_s = folder / "trajectory.parquet", run.get("scans_s")
-    return {str(run.get("name", folder.name)): read_track(path, scans_s)} if is_file(path) else {}
+    """Of every drive of the map, by name, the part with scans; empty where the folder has none."""
+    parts = {name: folder / "drives" / name for name in run.get("drives", {})}
+    found = {}
+    for name, part in (parts or {str(run.get("name", folder.name)): folder}).items():
+        if is_file(path := part / "trajectory.parquet"):
+            about = read_run(part) if parts else run
+            found[name] = read_track(path, about.get("scans_s"))
+    return found
 
 
 def _facts(run: Mapping[str, Any]) -> list[str]:

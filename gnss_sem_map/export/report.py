@@ -79,7 +79,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
     }  # fmt: skip
     for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined),
                  _movers(refinement, moved, "drives" in run),
-                 _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
+                 _passed(run), _left_out(run.get("skips", {})), _refined(about_map),
                  _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
         content |= part
     amend(folder, "report.html", page("report.html.j2", **content))
@@ -307,13 +307,14 @@ def _left_out(skips: Mapping[str, Any]) -> dict[str, Any]:
     return {"skips": rows, "more_skips": skips.get("count", len(listed)) - len(rows) if rows else 0}
 
 
-def _refined(refinement: Mapping[str, Any]) -> dict[str, Any]:
+def _refined(about_map: Mapping[str, Any]) -> dict[str, Any]:
     """Steps of the refinement, and how many vehicles it found to stand or move."""
+    refinement = about_map.get("refinement", {})
     motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
     figures: dict[str, Any] = {
         f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))
     }
-    if "systematic_errors" in refinement:
+    if "systematic_errors" in refinement and any(about_map.get("labelled", {}).get("raw", {}).values()):
         share = percent(refinement["systematic_errors"])
         figures["systematic label error rate, estimated without truth"] = share
     steps = [

@@ -167,6 +167,12 @@ def test_the_date_is_that_of_the_first_scan_where_stamps_are_dates(
     assert (date or "not georeferenced") in text
 
 
+def test_a_map_without_labels_has_no_rate_of_wrong_ones(tmp_path: Path) -> None:
+    about_map = RUN["map"] | {"labelled": {"raw": {"road": 0}, "refined": {"road": 0}}}
+    page = report(tmp_path, RUN | {"map": about_map}, {})
+    assert not [row for row in page.rows if row and row[0].startswith("systematic label error rate")]
+
+
 def test_what_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
     verdict = report(tmp_path, {"name": "x"}, {}).verdict
     for missing in ("driven length", "mapped area", "accuracy of the positions", "accuracy of the classes"):

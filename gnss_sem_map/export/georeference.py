@@ -161,7 +161,7 @@ def check_delivery(epsg: int | None, geoid: Path | None) -> None:
 
 @lru_cache(maxsize=16)
 def projected_crs(epsg: int) -> CRS:
-    """A projected CRS in metres; raises ConfigError for any other code."""
+    """A projected CRS in metres that WKT 1 can describe, as LAZ and GeoPackage want it; raises ConfigError for others."""
     try:
         crs = CRS.from_epsg(epsg)
     except CRSError:
@@ -171,6 +171,13 @@ def projected_crs(epsg: int) -> CRS:
         raise ConfigError(
             f"delivery.crs: found EPSG:{epsg} ({crs.name}), expected a projected CRS in metres, such as 25832"
         )
+    try:
+        crs.to_wkt("WKT1_GDAL")
+    except CRSError:
+        raise ConfigError(
+            f"delivery.crs: found EPSG:{epsg} ({crs.name}), whose projection WKT 1 has no name for, which LAZ and"
+            " GeoPackage need; choose another CRS of that place"
+        ) from None
     return crs
 
 

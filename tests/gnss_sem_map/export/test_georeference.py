@@ -94,6 +94,7 @@ def test_without_a_geoid_the_words_say_that_heights_are_ellipsoidal(karlsruhe: L
         (2263, "expected a projected CRS in metres"),  # feet
         (7423, "expected a projected CRS in metres"),  # compound
         (99, "no EPSG code"),
+        (6247, r"EPSG:6247 \(MAGNA-SIRGAS / Bogota urban grid\), whose projection WKT 1 has no name for"),
     ],
 )
 def test_what_is_no_projected_crs_in_metres_is_refused(epsg: int, said: str) -> None:

@@ -161,7 +161,7 @@ def check_delivery(epsg: int | None, geoid: Path | None) -> None:
 
 @lru_cache(maxsize=16)
 def projected_crs(epsg: int) -> CRS:
-    """A projected CRS in metres that WKT 1 can describe, as LAZ and GeoPackage want it; raises ConfigError for others."""
+    """A projected CRS in metres that WKT 1, and so LAZ and GeoPackage, can hold; raises ConfigError for other codes."""
     try:
         crs = CRS.from_epsg(epsg)
     except CRSError:

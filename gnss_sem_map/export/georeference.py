@@ -143,9 +143,9 @@ class Georeference:
         """The vertical CRS that the grid names, else one that is called after it; None without a geoid."""
         if self.geoid is None:
             return None
-        code = _vertical_epsg(self.geoid)
-        if code is not None:
-            return CRS.from_epsg(code)
+        named = _vertical_crs(self.geoid)
+        if named is not None:
+            return named
         return VerticalCRS(
             f"height above {self.geoid.stem}", datum=f'VDATUM["{self.geoid.stem.replace(chr(34), "_")}"]'
         )
@@ -161,7 +161,7 @@ def check_delivery(epsg: int | None, geoid: Path | None) -> None:
 
 @lru_cache(maxsize=16)
 def projected_crs(epsg: int) -> CRS:
-    """A projected CRS in metres; raises ConfigError for any other code."""
+    """A projected CRS in metres that WKT 1, and so LAZ and GeoPackage, can hold; raises ConfigError for other codes."""
     try:
         crs = CRS.from_epsg(epsg)
     except CRSError:
@@ -171,6 +171,13 @@ def projected_crs(epsg: int) -> CRS:
         raise ConfigError(
             f"delivery.crs: found EPSG:{epsg} ({crs.name}), expected a projected CRS in metres, such as 25832"
         )
+    try:
+        crs.to_wkt("WKT1_GDAL")
+    except CRSError:
+        raise ConfigError(
+            f"delivery.crs: found EPSG:{epsg} ({crs.name}), whose projection WKT 1 has no name for, which LAZ and"
+            " GeoPackage need; choose another CRS of that place"
+        ) from None
     return crs
 
 
@@ -195,17 +202,19 @@ def _undulation(geoid: Path) -> Transformer:
         ) from None
 
 
-def _vertical_epsg(geoid: Path) -> int | None:
-    """Code of the vertical CRS that a GeoTIFF grid names."""
+def _vertical_crs(geoid: Path) -> CRS | None:
+    """The vertical CRS in metres that a GeoTIFF grid names; None where it names none, or something else."""
     import rasterio
     from rasterio.errors import RasterioError
 
     try:
         with rasterio.open(geoid) as grid:
             tags = {**grid.tags(), **grid.tags(1)}
-        return int(tags[VERTICAL_EPSG])
-    except (RasterioError, KeyError, ValueError):
+        crs = CRS.from_epsg(int(tags[VERTICAL_EPSG]))
+    except (RasterioError, CRSError, KeyError, ValueError):
         return None
+    is_in_metres = {axis.unit_name for axis in crs.axis_info} == {"metre"}
+    return crs if crs.is_vertical and not crs.is_compound and is_in_metres else None
 
 
 def _contains(bounds: tuple[float, float, float, float], lat_deg: float, lon_deg: float) -> bool:

@@ -20,6 +20,7 @@ from gnss_sem_map.export.run_files import listed
 from gnss_sem_map.export.track import Track, read_track
 from gnss_sem_map.export.verdict import verdict_of
 from gnss_sem_map.files.ownership import amend
+from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.untrusted import is_file, read_text
 from gnss_sem_map.voxels import tiles
 
@@ -78,7 +79,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
     }  # fmt: skip
     for part in (_drives(run), _classes(about_map, metrics.get("semantics", {}), refined),
                  _movers(refinement, moved, "drives" in run),
-                 _passed(run), _left_out(run.get("skips", {})), _refined(refinement),
+                 _passed(run), _left_out(run.get("skips", {})), _refined(about_map),
                  _sharpness(metrics.get("sharpness", {})), _stages(run)):  # fmt: skip
         content |= part
     amend(folder, "report.html", page("report.html.j2", **content))
@@ -95,12 +96,14 @@ def _overviews(folder: Path) -> dict[str, Overview]:
 
 
 def _tracks(folder: Path, run: Mapping[str, Any]) -> dict[str, Track]:
-    """Of every drive of the map, by name; empty where the folder has none."""
-    if "drives" in run:
-        places = {name: folder / "drives" / name / "trajectory.parquet" for name in run["drives"]}
-        return {name: read_track(path) for name, path in places.items() if is_file(path)}
-    path, scans_s = folder / "trajectory.parquet", run.get("scans_s")
-    return {str(run.get("name", folder.name)): read_track(path, scans_s)} if is_file(path) else {}
+    """Of every drive of the map, by name, the part with scans; empty where the folder has none."""
+    parts = {name: folder / "drives" / name for name in run.get("drives", {})}
+    found = {}
+    for name, part in (parts or {str(run.get("name", folder.name)): folder}).items():
+        if is_file(path := part / "trajectory.parquet"):
+            about = read_run(part) if parts else run
+            found[name] = read_track(path, about.get("scans_s"))
+    return found
 
 
 def _facts(run: Mapping[str, Any]) -> list[str]:
@@ -304,13 +307,14 @@ def _left_out(skips: Mapping[str, Any]) -> dict[str, Any]:
     return {"skips": rows, "more_skips": skips.get("count", len(listed)) - len(rows) if rows else 0}
 
 
-def _refined(refinement: Mapping[str, Any]) -> dict[str, Any]:
+def _refined(about_map: Mapping[str, Any]) -> dict[str, Any]:
     """Steps of the refinement, and how many vehicles it found to stand or move."""
+    refinement = about_map.get("refinement", {})
     motions = [str(thing.get("motion")) for thing in refinement.get("objects", ())]
     figures: dict[str, Any] = {
         f"vehicles, {motion}": motions.count(motion) for motion in sorted(set(motions))
     }
-    if "systematic_errors" in refinement:
+    if "systematic_errors" in refinement and any(about_map.get("labelled", {}).get("raw", {}).values()):
         share = percent(refinement["systematic_errors"])
         figures["systematic label error rate, estimated without truth"] = share
     steps = [

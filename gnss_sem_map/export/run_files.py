@@ -33,6 +33,7 @@ FILES = {
     "looks": "the LiDAR points of the voxel of each of these points, at most 255, uint8",
     "removed": "1 for every LiDAR point on a moving vehicle that was taken out of the map",
     "config.yaml": "all settings of this run",
+    "classes.yaml": "the class set that the settings name",
     "calibration.yaml": "the confusion model of the segmentation network that the settings name",
     "run.json": "what report.html says of the run, machine-readable",
     "metrics.json": "what report.html says of the evaluation, machine-readable",

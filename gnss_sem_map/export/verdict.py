@@ -57,7 +57,8 @@ def _size(run: Mapping[str, Any], overview: Overview | None, tracks: Sequence[Tr
     drives = f" in {counted(len(tracks), 'drive')}" if len(tracks) > 1 else ""
     length = sum(track.length_m for track in tracks)
     way = f"{_length(length)} driven{drives}" if tracks else "The driven length is not known"
-    scans = run.get("counts", {}).get("scans")
+    of_drives = [about.get("scans", 0) for about in run.get("drives", {}).values()]
+    scans = run.get("counts", {}).get("scans", sum(of_drives) or None)
     seen = f" with {counted(scans, 'laser scan')}" if scans is not None else ""
     if overview is None:
         return f"{way}{seen}; the mapped area is not known."

@@ -135,7 +135,8 @@ class _Refinement:
         sums = [{name: about["sha256"] for name, about in of_layer.items()} for of_layer in files]
         voxel_size_m = self.raw.fused.voxel_size_m
         halo = halo_m(self.settings.refinement, voxel_size_m)
-        said = [self.settings.refinement.model_dump_json(), self.settings.classes, halo]
+        label_set = self.raw.fused.label_set.about()  # whatever the name of its file
+        said = [self.settings.refinement.model_dump_json(), label_set, halo]
         model = opened_sensor_model(self.settings)
         of_all = [said, None if model is None else repr(model.to_yaml())]
         tiles_in_halo = math.ceil(halo / (voxel_size_m * (1 << TILE_BITS)))

@@ -50,7 +50,7 @@ from gnss_sem_map.runs.about import (
     with_objects,
 )
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
-from gnss_sem_map.runs.run_settings import CALIBRATION, write_settings
+from gnss_sem_map.runs.run_settings import COPIES, write_settings
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.thread_pools import leaving_all
@@ -58,14 +58,12 @@ from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.attributes import open_attributes
 
 RUN_FILES = re.compile(
-    "|".join(
-        map(re.escape, (*(name for name in FILES if "." in name and name != CALIBRATION), "report.html"))
-    )
+    "|".join(map(re.escape, (*(name for name in FILES if "." in name and name not in COPIES), "report.html")))
     + r"|(map|refined)/(map\.json|-?\d+_-?\d+\.parquet)?"
     r"|(labels|labels_raw|removed)/(\d+\.label)?|(confidence|looks)/(\d+\.bin)?"
 )
-"""Pattern of all paths in run folders of older versions, which have no list of their files: a calibration there is the
-user's."""
+"""Pattern of all paths in run folders of older versions, which have no list of their files: a calibration or a class
+set there is the user's."""
 
 
 def is_run_file(name: str) -> bool:

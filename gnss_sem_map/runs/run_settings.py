@@ -1,4 +1,4 @@
-"""The settings of a run in its folder, with the calibration that they name: a run can be moved, and mapped on."""
+"""The settings of a run in its folder, with the classes and the calibration that they name: a run can be moved."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.files.untrusted import read_bytes
+from gnss_sem_map.labels.label_set import SHIPPED_CLASS_SETS
 
-SETTINGS, CALIBRATION = "config.yaml", "calibration.yaml"
+SETTINGS, CALIBRATION, CLASSES = "config.yaml", "calibration.yaml", "classes.yaml"
+COPIES = (CALIBRATION, CLASSES)
+"""Files that settings name, under their names in a run."""
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
-    """Write config.yaml and, if it names a calibration, a copy beside it; raises ConfigError if that cannot be read."""
-    if settings.calibration is not None:
-        content = read_bytes(settings.calibration, error=ConfigError)
-        with replacing(folder / CALIBRATION) as copy:  # it may be a second name of the file that was read
+    """Write config.yaml, and copies of the class set and the calibration that it names; raises ConfigError, OSError."""
+    names = {"calibration": Path(CALIBRATION), "classes": CLASSES}
+    for setting, file in _named(settings).items():
+        content = read_bytes(file, error=ConfigError)
+        with replacing(folder / names[setting]) as copy:  # it may be a second name of the file that was read
             copy.write(content)
-        settings = settings.model_copy(update={"calibration": Path(CALIBRATION)})
+        settings = settings.model_copy(update={setting: names[setting]})
     (folder / SETTINGS).write_text(settings.to_yaml(), "utf-8")
 
 
@@ -29,11 +33,17 @@ def read_settings(folder: Path) -> Settings:
 
 
 def differing(one: Settings, other: Settings) -> list[str]:
-    """Names of the settings that differ, wherever the calibration is that they name; raises ConfigError."""
+    """Names of the settings that differ, wherever the files are that they name; raises ConfigError."""
     one, other = _with_content(one), _with_content(other)
     return [name for name in Settings.model_fields if getattr(one, name) != getattr(other, name)]
 
 
 def _with_content(settings: Settings) -> Settings:
-    file = settings.calibration
-    return settings.model_copy(update={"calibration": file and read_bytes(file, error=ConfigError)})
+    contents = {name: read_bytes(file, error=ConfigError) for name, file in _named(settings).items()}
+    return settings.model_copy(update=contents)
+
+
+def _named(settings: Settings) -> dict[str, Path]:
+    """The files of a class set and of a calibration that settings name; a shipped class set is none."""
+    files = {} if settings.calibration is None else {"calibration": settings.calibration}
+    return files if settings.classes in SHIPPED_CLASS_SETS else files | {"classes": Path(settings.classes)}

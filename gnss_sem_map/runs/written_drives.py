@@ -34,7 +34,7 @@ from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.bound_drives import BoundDrives
 from gnss_sem_map.runs.merged_run import write_merged
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
-from gnss_sem_map.runs.run_settings import CALIBRATION, SETTINGS
+from gnss_sem_map.runs.run_settings import COPIES, SETTINGS
 from gnss_sem_map.runs.session_changes import changes_in
 from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
@@ -137,7 +137,7 @@ def _link_all(drive: Path, part: Path) -> None:
     for file in (
         *drive.glob("trajectory*"),
         *drive.glob("objects.*"),
-        *drive.glob(CALIBRATION),
+        *(file for name in COPIES for file in drive.glob(name)),
         *(drive / name for name in OF_ONE_DRIVE),
     ):
         link_or_copy(file, part / file.name)

@@ -1,4 +1,4 @@
-"""The calibration that settings name is part of a run: it needs the original no longer, wherever the run goes."""
+"""The files that settings name are part of a run: it needs the originals no longer, wherever the run goes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from street import Street
 
 from gnss_sem_map import Settings, config, run
 from gnss_sem_map.errors import ConfigError
+from gnss_sem_map.labels import label_set
 from gnss_sem_map.runs.run_settings import differing, read_settings, write_settings
 from gnss_sem_map.segmentation import DEMO_CALIBRATION
+
+URBAN = Path(label_set.__file__).with_name("urban.yaml")
 
 
 @pytest.fixture
@@ -19,17 +22,21 @@ def calibration(tmp_path: Path) -> Path:
     return Path(shutil.copyfile(DEMO_CALIBRATION, tmp_path / "confusion.yaml"))
 
 
-def test_a_run_that_was_moved_is_refined_without_the_calibration_it_was_made_with(
+def test_a_run_that_was_moved_is_refined_without_the_files_it_was_made_with(
     small_drive: Street, calibration: Path, tmp_path: Path
 ) -> None:
-    settings = Settings(calibration=calibration)
+    classes = Path(shutil.copyfile(URBAN, tmp_path / "mine.yaml"))
+    settings = Settings(calibration=calibration, classes=str(classes))
     made = run(small_drive.drive, tmp_path / "out", f"labels:{small_drive.labels}", settings)
     tiles = {path.name: path.read_bytes() for path in (made.folder / "refined").glob("*.parquet")}
     assert tiles
     calibration.unlink()
+    classes.unlink()
     moved = type(made)(Path(shutil.move(made.folder, tmp_path / "delivered")))
     assert moved.settings.calibration == tmp_path / "delivered" / "calibration.yaml"
-    again = moved.refine(settings.model_copy(update={"calibration": DEMO_CALIBRATION}), tmp_path / "again")
+    assert moved.settings.classes == str(tmp_path / "delivered" / "classes.yaml")
+    elsewhere = {"calibration": DEMO_CALIBRATION, "classes": str(URBAN)}
+    again = moved.refine(settings.model_copy(update=elsewhere), tmp_path / "again")
     assert {path.name: path.read_bytes() for path in (again.folder / "refined").glob("*.parquet")} == tiles
     assert (again.folder / "config.yaml").read_bytes() == (moved.folder / "config.yaml").read_bytes()
 

@@ -81,6 +81,16 @@ def test_a_file_says_its_compound_crs_and_its_heights_in_words(
     assert (b"EGM96" if code else b"height above heights") in words
 
 
+@pytest.mark.parametrize("code", [999999, 4326, 4979, 6360])  # no CRS, one of degrees, with heights, in feet
+def test_a_grid_that_names_no_vertical_crs_in_metres_gives_its_own_name(
+    code: int, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    georeference = Georeference(karlsruhe, 25832, geoid(tmp_path / "heights.tif", code))
+    horizontal, vertical = georeference.crs.sub_crs_list
+    assert (horizontal.to_epsg(), vertical.name) == (25832, "height above heights")
+    assert georeference.crs.to_wkt("WKT1_GDAL").startswith("COMPD_CS")
+
+
 def test_without_a_geoid_the_words_say_that_heights_are_ellipsoidal(karlsruhe: LocalFrame) -> None:
     georeference = Georeference(karlsruhe)
     assert georeference.words == "EPSG:32632 (WGS 84 / UTM zone 32N), heights above the WGS 84 ellipsoid"
@@ -94,6 +104,7 @@ def test_without_a_geoid_the_words_say_that_heights_are_ellipsoidal(karlsruhe: L
         (2263, "expected a projected CRS in metres"),  # feet
         (7423, "expected a projected CRS in metres"),  # compound
         (99, "no EPSG code"),
+        (6247, r"EPSG:6247 \(MAGNA-SIRGAS / Bogota urban grid\), whose projection WKT 1 has no name for"),
     ],
 )
 def test_what_is_no_projected_crs_in_metres_is_refused(epsg: int, said: str) -> None:

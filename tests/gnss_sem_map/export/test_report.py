@@ -167,6 +167,12 @@ def test_the_date_is_that_of_the_first_scan_where_stamps_are_dates(
     assert (date or "not georeferenced") in text
 
 
+def test_a_map_without_labels_has_no_rate_of_wrong_ones(tmp_path: Path) -> None:
+    about_map = RUN["map"] | {"labelled": {"raw": {"road": 0}, "refined": {"road": 0}}}
+    page = report(tmp_path, RUN | {"map": about_map}, {})
+    assert not [row for row in page.rows if row and row[0].startswith("systematic label error rate")]
+
+
 def test_what_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
     verdict = report(tmp_path, {"name": "x"}, {}).verdict
     for missing in ("driven length", "mapped area", "accuracy of the positions", "accuracy of the classes"):
@@ -174,18 +180,29 @@ def test_what_is_not_known_is_said_to_be_so(tmp_path: Path) -> None:
     assert "no known coordinates" in verdict
 
 
-def test_length_and_uncertainty_are_those_of_the_trajectory_while_it_had_scans(tmp_path: Path) -> None:
+@pytest.mark.parametrize("drives", [(), ("a", "b")])
+def test_length_and_uncertainty_are_those_of_the_trajectory_while_it_had_scans(
+    drives: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Of several drives, the sum of what the table says of each."""
     stamps = np.arange(0.0, 20.0, 0.1)
     T = np.tile(np.eye(4), (len(stamps), 1, 1))
     T[:, 0, 3] = 2.0 * stamps
     covariances = np.tile(np.diag([1e-4] * 3 + [0.04, 0.01, 0.09]), (len(stamps), 1, 1))
-    Trajectory(stamps, T, covariances=covariances).save(tmp_path / "trajectory.parquet")
-    page = report(tmp_path, {"name": "x", "scans_s": [0.0, 10.0]}, {})
-    assert "20 m driven" in page.verdict
+    for folder in [tmp_path / "drives" / name for name in drives] or [tmp_path]:
+        folder.mkdir(parents=True, exist_ok=True)
+        Trajectory(stamps, T, covariances=covariances).save(folder / "trajectory.parquet")
+        (folder / "run.json").write_text('{"scans_s": [0.0, 10.0]}')
+    about: dict[str, Any] = {"counts": {"scans": 100}, "scans_s": [0.0, 10.0]}
+    if drives:
+        about = {"drives": {name: {"scans": 50} for name in drives}}
+    page = report(tmp_path, {"name": "x"} | about, {})
+    assert f"{'40 m driven in 2 drives' if drives else '20 m driven'} with 100 laser scans" in page.verdict
     # the larger axis of the plane, sqrt(chi2 0.95 of 2 degrees of freedom) * 0.2 m; and 1.96 * 0.3 m
     assert "within 0.49 m in the plane and 0.59 m in height at the median place" in page.verdict
     assert "not checked against independent survey points" in page.verdict
-    assert page.headings == ["Trajectory", "Files"]
+    others = ("Drives", "Trajectory", "Files") if drives else ("Trajectory", "What went in", "Files")
+    assert tuple(page.headings) == others
 
 
 def test_the_report_shows_the_map_of_its_folder(street: SemanticMap, tmp_path: Path) -> None:

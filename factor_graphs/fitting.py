@@ -185,7 +185,7 @@ def constrain(
     which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
     """
     settings, motion, key = problem.settings, body_motion(problem, fit), len(problem.intervals.keyframes)
-    quiet = _quiet(problem)
+    by_fixes, quiet = fit, _quiet(problem)
     vehicle, wheels, mounting = _observed(problem, fit, motion, speeds)
     axle = vehicle if vehicle and (settings.vehicle_constraint == "on" or not vehicle.doubt) else None
     rolling = wheels if wheels and (settings.wheel_speed == "on" or not wheels.doubt) else None
@@ -225,6 +225,10 @@ def constrain(
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
+    if (
+        rolling is not None and rolling.doubt and settings.wheel_speed != "on"
+    ):  # they fitted only until they were held
+        return *constrain(problem, by_fixes)[:3], replace(rolling, held=False)
     return fit, factors, axle or vehicle, rolling or wheels
 
 

@@ -166,6 +166,7 @@ def _solution(
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
     of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
+    of_poses += _of_calibration(calibration, problem.settings, R, velocities)
     if problem.heading_in_doubt:
         of_poses += of_any_heading(R, problem.p_imu_antenna)
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
@@ -196,6 +197,22 @@ def _solution(
         wheels=wheels,
         notes=(*problem.notes, *_doubts(problem, fit, keyframes, calibration)),
     )
+
+
+def _of_calibration(
+    calibration: Calibration, settings: SmootherSettings, R_map_imu: Array, velocities: Array
+) -> Array:
+    """Covariance (k, 6, 6) that poses have of what was estimated beside them: clock and lever arm.
+
+    Where the clock is d s off, the trajectory is so much further on its way; where the antenna is dl m off, so is it.
+    """
+    covariances = np.zeros((len(R_map_imu), 6, 6))
+    if calibration.time_offset_stddev_s and (settings.estimate_time_offset or calibration.time_offset_s):
+        in_imu = np.einsum("kij,ki->kj", R_map_imu, velocities) * calibration.time_offset_stddev_s
+        covariances[:, 3:, 3:] += in_imu[:, :, None] * in_imu[:, None]
+    if calibration.p_imu_antenna_stddevs is not None:
+        covariances[:, 3:, 3:] += np.diag(calibration.p_imu_antenna_stddevs**2)
+    return covariances
 
 
 def _lacking(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:

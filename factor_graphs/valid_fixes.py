@@ -21,11 +21,10 @@ def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray
     `stamps` (n,) s, finite; `geodetic` (n, 3) degrees and m; `stddevs` (n, 3) m.
     """
     lat, lon, alt = geodetic.T
-    is_unknown = (lat == 0) & (lon == 0)  # what receivers write without a fix
-    is_place = np.isfinite(geodetic).all(axis=1) & ~is_unknown
-    is_place &= (np.abs(lat) <= 90) & (np.abs(lon) <= 360)
-    is_high = is_place & ~(np.abs(alt) <= LARGEST_ALT_M)
-    is_place &= ~is_high
+    # 0, 0 is what receivers write without a fix
+    on_earth = (np.abs(lat) <= 90) & (np.abs(lon) <= 360) & ~((lat == 0) & (lon == 0))
+    is_flat, is_high = on_earth & np.isnan(alt), on_earth & (np.abs(alt) > LARGEST_ALT_M)
+    is_place = on_earth & ~is_flat & ~is_high
     has_accuracy = ((stddevs >= LEAST_STDDEV_M) & (stddevs <= LARGEST_STDDEV_M)).all(axis=1)
     usable = is_place & has_accuracy
     near = np.zeros(len(stamps), np.bool_)
@@ -33,7 +32,8 @@ def valid_fixes(stamps: Array, geodetic: Array, stddevs: Array) -> tuple[NDArray
         near[usable] = _near(stamps[usable], geodetic[usable])
     kinds = [
         (is_high, "no height on Earth; is the altitude in mm?"),
-        (~is_place & ~is_high, "no place on Earth, or 0, 0"),
+        (is_flat, "a place without height: fixes in two dimensions are not used"),
+        (~on_earth, "no place on Earth, or 0, 0"),
         (is_place & ~has_accuracy, "a standard deviation that is not above 0, or far too large"),
         (usable & ~near, "too far from the fixes around for any vehicle"),
     ]

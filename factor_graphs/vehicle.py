@@ -131,9 +131,13 @@ class Vehicle:
 
     def __str__(self) -> str:
         (yaw, pitch), (lateral, vertical) = self.yaw_pitch_deg, self.typical_slip
+        unsure = ["", "", ""]
+        if self.mounting_stddevs is not None:
+            of_yaw, of_pitch = np.degrees(self.mounting_stddevs[:2] / (1 + self.mounting[:2] ** 2))
+            unsure = [f" ± {of_yaw:.2f}", f" ± {of_pitch:.2f}", f" ± {self.mounting_stddevs[2]:.1f}"]
         return (
-            f"slip {lateral:.2f} m/s sideways, {vertical:.2f} m/s vertically; IMU mounted {yaw:+.2f}° in yaw,"
-            f" {pitch:+.2f}° in pitch, {self.mounting[2]:+.1f} m ahead of the axle"
+            f"slip {lateral:.2f} m/s sideways, {vertical:.2f} m/s vertically; IMU mounted {yaw:+.2f}{unsure[0]}° in"
+            f" yaw, {pitch:+.2f}{unsure[1]}° in pitch, {self.mounting[2]:+.1f}{unsure[2]} m ahead of the axle"
         )
 
 

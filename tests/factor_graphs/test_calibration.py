@@ -55,3 +55,19 @@ def test_lever_arm_and_offset_are_found_together_when_asked(simulate):
         found.p_imu_antenna_stddevs[2] > 0.3
     )  # a vehicle that hardly tilts does not show the height of its antenna
     assert found.time_offset_s == pytest.approx(0.05, abs=4 * found.time_offset_stddev_s)
+
+
+def test_covariances_hold_what_is_not_known_of_clock_and_lever_arm(simulate):
+    """They are those of the same data with both given, and what an error of either does to the place."""
+    drive = simulate(65, seconds=130.0, noise=ImuNoise())
+    both = SmootherSettings(estimate_lever_arm=True, estimate_time_offset=True)
+    found = smooth(drive.imu, drive.fixes, FRAME, both, LEVER)
+    clock, fixes = found.calibration, drive.fixes
+    given = GnssFixes(fixes.stamps + clock.time_offset_s, fixes.positions, fixes.stddevs)
+    none = SmootherSettings(estimate_time_offset=False)
+    known = smooth(drive.imu, given, FRAME, none, clock.p_imu_antenna).keyframes
+    R, moving = known.T_map_imu[:, :3, :3], known.velocities
+    of_clock = clock.time_offset_stddev_s**2 * moving[:, :, None] * moving[:, None]
+    of_lever = R @ np.diag(clock.p_imu_antenna_stddevs**2) @ np.swapaxes(R, 1, 2)
+    expected = known.position_covariances + of_clock + of_lever
+    np.testing.assert_allclose(found.keyframes.position_covariances, expected, atol=1e-6)

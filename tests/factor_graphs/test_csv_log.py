@@ -87,6 +87,7 @@ def test_the_order_of_columns_spaces_and_other_columns_do_not_matter(log):
         ("imu.csv", 3, 0, "1.7e9", r"imu\.csv: IMU: 40 rows; 1 with a stamp far off all others, dropped"),
         ("gnss.csv", 0, 1, "", r"gnss\.csv: 1 rows dropped: no place on Earth, or 0, 0"),
         ("gnss.csv", 0, 1, "91", r"gnss\.csv: 1 rows dropped: no place on Earth"),
+        ("gnss.csv", 5, 3, "", r"gnss\.csv: 1 rows dropped: a place without height"),
         ("gnss.csv", 5, 4, "0", r"gnss\.csv: 1 rows dropped: a standard deviation that is not above 0"),
         ("gnss.csv", 5, 1, "59", r"gnss\.csv: 1 rows dropped: too far from the fixes around"),
         ("gnss.csv", 5, 0, "nan", r"gnss\.csv: 1 rows dropped: no stamp"),

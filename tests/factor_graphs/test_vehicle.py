@@ -1,5 +1,7 @@
 """Mounting, slip, and whether it is a vehicle at all: found in exact motion, and in solutions of noisy drives."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
@@ -234,3 +236,18 @@ def test_relative_poses_take_the_place_of_the_constraint(simulate):
     assert held is None
     assert alone.held
     assert asked.held
+
+
+def test_on_a_roundabout_the_verdict_says_how_little_it_tells_of_the_mounting(simulate):
+    """At one speed and one turn rate, yaw and distance to the axle cannot be told apart."""
+
+    def around(seconds: float, rng: np.random.Generator) -> Motion:
+        angle = np.arange(0.0, 8.0 * seconds / 15.0 + 1.0, 0.1)
+        ring = np.column_stack([15 * np.cos(angle), 15 * np.sin(angle), 0 * angle])
+        return follow(ring, [0.0, 2.0, 5.0, seconds], [0.0, 0.0, 8.0, 8.0])
+
+    drive = simulate(62, seconds=100.0, noise=ImuNoise(), moves=around)
+    vehicle = smooth(drive.imu, drive.fixes, FRAME, None, LEVER).vehicle
+    yaw, its_stddev = re.search(r"mounted (\S+) ± (\S+)° in yaw", vehicle.verdict).groups()
+    assert float(its_stddev) > 1.0
+    assert abs(float(yaw)) < 3 * float(its_stddev)

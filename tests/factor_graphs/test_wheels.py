@@ -282,3 +282,16 @@ def test_the_wheels_of_another_vehicle_are_not_believed(simulate):
     wheels = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, wheels=wheels_of(other, 70, 150.0)).wheels
     assert not wheels.held
     assert "differ from the speed" in wheels.verdict
+
+
+def test_wheels_that_fit_only_until_they_are_held_are_left_out(simulate):
+    """A message that freezes for the last third of the drive; then all is as without wheels."""
+    outages = [(60.0, 90.0), (150.0, 190.0)]
+    drive = simulate(1, seconds=240.0, noise=ImuNoise(), outages=outages)
+    wheels = wheels_of(drive, 1, 240.0, scale=1.0, offset_mps=0.0, latency_s=0.0)
+    frozen = wheels.speeds[np.searchsorted(wheels.stamps, 155.0)]
+    wheels = WheelSpeeds(wheels.stamps, np.where(wheels.stamps > 155.0, frozen, wheels.speeds))
+    with_wheels = smooth(drive.imu, drive.fixes, FRAME, None, LEVER, wheels=wheels)
+    without = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+    assert with_wheels.wheels.verdict.startswith("wheel speed off: they differ from the speed")
+    np.testing.assert_array_equal(with_wheels.trajectory.T_map_imu, without.trajectory.T_map_imu)

@@ -35,6 +35,7 @@ from gnss_sem_map.files.ownership import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
 from gnss_sem_map.mapping import fingerprints
+from gnss_sem_map.mapping.chunks import writing_to
 from gnss_sem_map.mapping.execution import Executor, Task, run_tasks
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -205,7 +206,8 @@ def _bound(
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:
             files[name] = work / BOUND / name / CORRECTION
-            write_whole(files[name], _as_bytes(correction))
+            with writing_to(files[name].parent):
+                write_whole(files[name], _as_bytes(correction))
     return BoundDrives(files, together.passes, together.warnings)
 
 

@@ -30,6 +30,7 @@ from gnss_sem_map.files.output_folder import Claim
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.mapping.chunks import writing_to
 from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
@@ -259,14 +260,15 @@ def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) ->
 
 
 def _begin(claim: Claim, settings: Settings, how: HowMapped) -> Path:
-    """Prepare the work folder; returns the file of the settings, for tasks."""
-    if not how.resume:
-        work_folder.remove_drives(claim.work)
-    work_folder.make(claim.work)
-    (claim.work / DRIVES).mkdir(exist_ok=True)
-    work_folder.remove_damaged_drives(claim.work)
+    """Prepare the work folder; returns the file of the settings, for tasks. Raises DataError."""
     file = claim.work / DRIVES / SETTINGS
-    file.write_text(settings.to_yaml(), "utf-8")
+    with writing_to(claim.work):
+        if not how.resume:
+            work_folder.remove_drives(claim.work)
+        work_folder.make(claim.work)
+        file.parent.mkdir(exist_ok=True)
+        work_folder.remove_damaged_drives(claim.work)
+        file.write_text(settings.to_yaml(), "utf-8")
     return file
 
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from gnss_sem_map.compiling import njit
 
 Array = NDArray[np.float64]
 

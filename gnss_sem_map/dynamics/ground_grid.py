@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int32, njit
+from numba import int32
 from numpy.typing import NDArray
+
+from gnss_sem_map.compiling import njit
 
 GROUND_CELL_M = 1.0
 

@@ -33,7 +33,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import npz_of
 from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
-from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY
+from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY, writing_to
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
@@ -178,7 +178,8 @@ def _bound(
     for name, correction in zip(names, together.corrections, strict=True):
         if correction is not None:
             files[name] = work / BOUND / name / CORRECTION
-            write_whole(files[name], npz_of(correction))
+            with writing_to(files[name].parent):
+                write_whole(files[name], npz_of(correction))
     return BoundDrives(files, together.passes, together.warnings)
 
 

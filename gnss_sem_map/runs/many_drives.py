@@ -253,13 +253,14 @@ def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) ->
 
 
 def _begin(run: SeveralDrives, resume: bool) -> None:
-    """Prepare the work folder, with the settings for tasks."""
-    if not resume:
-        work_folder.remove_drives(run.work)
-    work_folder.make(run.work)
-    (run.work / DRIVES).mkdir(exist_ok=True)
-    work_folder.remove_damaged_drives(run.work)
-    run.settings_file.write_text(run.settings.to_yaml(), "utf-8")
+    """Prepare the work folder, with the settings for tasks; raises DataError."""
+    with work_folder.writing_to(run.work):
+        if not resume:
+            work_folder.remove_drives(run.work)
+        work_folder.make(run.work)
+        (run.work / DRIVES).mkdir(exist_ok=True)
+        work_folder.remove_damaged_drives(run.work)
+        run.settings_file.write_text(run.settings.to_yaml(), "utf-8")
 
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:

@@ -18,7 +18,7 @@ COPIES = (CALIBRATION, CLASSES)
 
 def write_settings(folder: Path, settings: Settings) -> None:
     """Write config.yaml, and copies of the class set and the calibration that it names; raises ConfigError, OSError."""
-    names = {"calibration": Path(CALIBRATION), "classes": CLASSES}
+    names: dict[str, Path | str] = {"calibration": Path(CALIBRATION), "classes": CLASSES}
     for setting, file in _named(settings).items():
         content = read_bytes(file, error=ConfigError)
         with replacing(folder / names[setting]) as copy:  # it may be a second name of the file that was read

@@ -11,7 +11,8 @@ from typing import Any, Final, Protocol, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from gnss_sem_map.compiling import njit
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

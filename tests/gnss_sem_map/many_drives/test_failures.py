@@ -129,6 +129,18 @@ def test_an_error_of_the_disk_in_one_drive_leaves_the_others(
     assert made.failed == {"b": f"/torn/disk: {os.strerror(errno.EIO)}"}
 
 
+def test_a_disk_that_is_full_at_once_is_an_error_that_says_where(
+    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(settings: Settings) -> NoReturn:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a write that fails names no file
+
+    monkeypatch.setattr(Settings, "to_yaml", full)
+    with pytest.raises(DataError, match=r"\.out\.work: cannot be written \(No space .*free the disk"):
+        mapped("ab", drives, tmp_path / "out", how)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_drive_that_cannot_be_bound_is_named(
     drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

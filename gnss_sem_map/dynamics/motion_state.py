@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -26,6 +27,10 @@ LENGTH_M = 5.0
 """Length of a car."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
+STANDING_MISSES_PER_HIT = 0.15
+"""What stands has at most so many misses per hit."""
+ASKED_PLACES = 8
+"""So many segments at either end of a track tell whether it was free while the object was elsewhere."""
 SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.5, 0.5, 0.2
 """A segment that is larger than SIZE_RATIO times the usual size of its track, and SIZE_MARGIN_M, is not of the person
 alone. A track is of a person if at least FREE_SHARE of its segments are mostly seen through, and most of these are no
@@ -44,6 +49,9 @@ class Motion(StrEnum):
 
 
 GONE = (Motion.MOVING, Motion.STOPPED_AND_LEFT)
+
+CountedIn = Callable[[int, list[int]], tuple[float, float]]
+"""Hits and misses of the points of a segment, by its number, in some scans."""
 
 
 class MotionSettings(BaseModel):
@@ -124,6 +132,7 @@ def classify_motion(
     misses: NDArray[np.float64],
     settings: MotionSettings,
     is_sharp: bool = False,
+    counted_in: CountedIn | None = None,
 ) -> list[TrackedObject]:
     """Track the segments and give every object its motion state.
 
@@ -131,6 +140,7 @@ def classify_motion(
     them. `is_sharp`: the poses blur static objects little. Then what stands has 0.00 to 0.15 misses per hit, labels
     or not, a car that creeps for a third of its length 0.4, and what drives on more than 1 (three simulated drives,
     KITTI 0005); without sharp poses parked cars reach more than 1, and what no image shows must have gone elsewhere.
+    `counted_in` tells, with sharp poses, whether the place of an object was free while the object was elsewhere.
 
     This takes the place of eq. 13, which calls long and dense clusters of the map moving vehicles.
     """
@@ -143,7 +153,7 @@ def classify_motion(
         members = [large[place] for place in one.segments]
         is_shown = any(segments[n].shown for n in members)
         elsewhere = settings.displaced_misses_per_hit if is_shown or is_sharp else misses_per_hit
-        whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere)
+        whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere, counted_in)
         if not (is_shown or is_sharp or whole.displaced):
             continue
         beside = _beside(members, segments, hits, misses)
@@ -185,6 +195,7 @@ def _motion_of_track(
     misses: NDArray[np.float64],
     misses_per_hit: float,
     elsewhere_misses_per_hit: float,
+    counted_in: CountedIn | None,
 ) -> TrackedObject:
     """Motion state of a track: it went elsewhere, or its volume was free at other times."""
     hit, missed = float(hits[members].sum()), float(misses[members].sum())
@@ -192,11 +203,13 @@ def _motion_of_track(
     moved = motion_of([segments[n] for n in members])
     displaced = False
     if moved and moved.is_moving:
-        reach = min(moved.shift_m / 4, FARTHEST_APART_M)
-        hit_elsewhere, missed_elsewhere = _elsewhere(members, segments, hits, misses, reach)
         # the volume that it left or came into is free at other times, as far as it did not cover it itself
-        least = elsewhere_misses_per_hit * min(1.0, moved.shift_m / LENGTH_M)
-        displaced = missed_elsewhere > least * hit_elsewhere and not bool(is_occupied(hit, missed))
+        share = min(1.0, moved.shift_m / LENGTH_M)
+        least = elsewhere_misses_per_hit * share
+        displaced = _free_elsewhere(members, segments, hits, misses, moved.shift_m, least)
+        displaced &= not bool(is_occupied(hit, missed))
+        if not displaced and counted_in is not None:
+            displaced = _free_without(members, segments, moved.shift_m, share, counted_in)
     reason = f"seen through {missed:,.0f} times, hit {hit:,.0f} times"
     if moved and displaced:
         motion = Motion.MOVING
@@ -223,20 +236,48 @@ def _beside(
     return [n for n in members if misses[n] <= hits[n] and extents[n] > SIZE_RATIO * usual + SIZE_MARGIN_M]
 
 
-def _elsewhere(
+def _free_elsewhere(
     members: list[int],
     segments: list[Segment],
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
-    reach_m: float,
-) -> tuple[float, float]:
-    """Hits and misses of a track away from its median position, each place once however long the object stood there."""
+    shift_m: float,
+    least: float,
+) -> bool:
+    """Whether the places of a track away from its median position have more misses per hit than `least`.
+
+    All together, and most of them: where something that moves passes a parked car, both are one segment in some scans.
+    Each place counts once, however long the object stood there.
+    """
+    reach_m = min(shift_m / 4, FARTHEST_APART_M)
     centroids = np.array([segments[n].centroid for n in members])
     away = np.linalg.norm(centroids - np.median(centroids, axis=0), axis=1) > reach_m
-    tree = cKDTree(centroids)
-    once = 1 / tree.query_ball_point(centroids[away], reach_m, return_length=True)
+    once = 1 / cKDTree(centroids).query_ball_point(centroids[away], reach_m, return_length=True)
     of_track = np.array(members)[away]
-    return float(once @ hits[of_track]), float(once @ misses[of_track])
+    free = misses[of_track] - least * hits[of_track]
+    return bool(once @ free > 0 and 2 * once @ (free > 0) > once.sum())
+
+
+def _free_without(
+    members: list[int], segments: list[Segment], shift_m: float, share: float, counted_in: CountedIn
+) -> bool:
+    """Whether the two places of a track that are farthest apart were free while the object was elsewhere.
+
+    One that comes closer for a short way, and waits, hides the place that it left, and is hit for long where it is. It
+    covers all but a `share` of its place also before.
+    """
+    centroids = np.array([segments[n].centroid for n in members])
+    first = np.linalg.norm(centroids - centroids[0], axis=1).argmax()
+    last = np.linalg.norm(centroids - centroids[first], axis=1).argmax()
+    total = np.zeros(2)
+    for end in (first, last):
+        off = np.linalg.norm(centroids - centroids[end], axis=1)
+        away = [segments[members[k]].scan for k in np.flatnonzero(off > shift_m / 2)]
+        near = np.flatnonzero(off < shift_m / 4)
+        counted = [counted_in(members[k], away) for k in near[:: len(near) // ASKED_PLACES + 1]]
+        total += np.median(counted, axis=0)  # in a few something else is in its segment, too
+    hit, missed = total
+    return bool(missed > max(STANDING_MISSES_PER_HIT, share / 2) * hit)
 
 
 def _probability(misses: float, hits: float) -> float:

@@ -30,7 +30,7 @@ from gnss_sem_map.dynamics.lost_parts import joined_to_movers, with_next_parts
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.pose_sharpness import are_sharp
-from gnss_sem_map.dynamics.presence import near_movers, presence
+from gnss_sem_map.dynamics.presence import near_movers, presence, unusually_large
 from gnss_sem_map.dynamics.seen_through import free_groups, with_free_groups
 from gnss_sem_map.dynamics.standing import is_occupied, standing
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
@@ -56,6 +56,10 @@ FOOT_REACH_M = 0.2
 CELL_M_PER_DEG, LARGEST_CELL_M = 1.0, 2.0
 """Cells of the ground grow with the gap between rings: in one of 1 m the lowest return of 16 rings is often of the
 object."""
+
+
+ASKED_SCANS = 20
+"""So many scans, of those in which an object is elsewhere, tell whether its place was free."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,8 @@ def decide(
         [of_scan.sums_of(counted) for of_scan, counted in zip(segments, counts(), strict=True)], axis=1
     )
     listed = _all_segments(observations, segments)
-    objects = classify_motion(listed, hits, misses, settings, is_sharp)
+    counted_in = partial(_counted_in, observations, listed, segments, settings) if is_sharp else None
+    objects = classify_motion(listed, hits, misses, settings, is_sharp, counted_in)
     gone = _gone(objects, len(listed))
     if is_sharp:
         objects = joined_to_movers(objects, segments, places, _of_voxels(gone, segments), hits, misses)
@@ -139,8 +144,12 @@ def decide(
     if is_sharp:
         stamps = np.array([seen.stamp for seen in observations])
         near = _either(near_movers(objects, listed, segments, stamps, settings.grow_m), moved_of)
-        of_mover, without = presence(places, of_places, near)
-        moved = _either(moved, of_mover)
+        of_mover, without, occupied = presence(places, of_places, near)
+        is_large = _of_voxels(unusually_large(objects, listed), segments)
+        moved = [
+            gone & ~(large & stays) | comes
+            for gone, large, stays, comes in zip(moved, is_large, occupied, of_mover, strict=True)
+        ]
         stands = _either((is_occupied(*counted) for counted in counts()), without)
     else:
         stands = [of_scan.number >= 0 for of_scan in segments]
@@ -197,6 +206,27 @@ def _parted(
         return parted, np.zeros(len(segments.keys), np.bool_)
     groups = free_groups(parted, hits, misses, eps_m)
     return with_free_groups(parted, groups), groups >= 0
+
+
+def _counted_in(
+    observations: Sequence[Observation],
+    listed: Sequence[Segment],
+    segments: Sequence[Segments],
+    settings: MotionSettings,
+    number: int,
+    scans: Sequence[int],
+) -> tuple[float, float]:
+    """Hits and misses of the points of a segment in some of these scans."""
+    scan = listed[number].scan
+    first = sum(len(of_scan.truncated) for of_scan in segments[:scan])
+    mine = np.flatnonzero(segments[scan].number == number - first)
+    points = segments[scan].parts.points[mine]
+    some = [observations[k].seen for k in scans[:: len(scans) // ASKED_SCANS + 1]]
+    if not some:
+        return 0.0, 0.0
+    means = segments[scan].parts.sums[mine] / points[:, None]
+    hits, misses = hits_and_misses(means, KeyframeScans.of(some), settings.farthest_m, SHARP_RATIO) @ points
+    return float(hits), float(misses)
 
 
 def _with_track(one: TrackedObject, listed: Sequence[Segment]) -> TrackedObject:

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics.clusters import Segments
 from gnss_sem_map.dynamics.ground_grid import closer_than
-from gnss_sem_map.dynamics.motion_state import GONE, TrackedObject
+from gnss_sem_map.dynamics.motion_state import GONE, SIZE_MARGIN_M, SIZE_RATIO, TrackedObject
 from gnss_sem_map.dynamics.object_track import velocities
 from gnss_sem_map.dynamics.seen_through import PERSON_M
+from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.dynamics.tracking import Segment
 
 Array = NDArray[np.float64]
@@ -34,14 +35,17 @@ LEAST_SCANS = 3
 WITH_MOVER_SHARE = 0.9
 """A place is of a mover if one is near in so large a share of the scans that find something there, and no fewer scans
 looked there while none was near."""
+LEAST_HITS = 5
+"""What so many scans hit without a mover stands: one that comes to a stop is within the margin of a hit before."""
 LEAST_FOUND = 3
 """A place that so many scans find, and more without a mover than with one, stands."""
 
 
 def presence(
     places: Sequence[NDArray[np.int32]], counts: NDArray[np.int32], near: Sequence[NDArray[np.bool_]]
-) -> tuple[Masks, Masks]:
-    """For each scan, the voxels (v,) that are there only with a mover, and those that are there mostly without one.
+) -> tuple[Masks, Masks, Masks]:
+    """For each scan, the voxels (v,) that are there only with a mover, that are there mostly without one, and that
+    scans hit also without one and hardly ever see through.
 
     `places` (v,) number the voxels of each scan, the same in all scans; `counts` (2, p) are the hits and misses of
     all places; `near` (v,) tells which voxels have a mover near them.
@@ -54,11 +58,24 @@ def presence(
         near_one = place[is_near]
         first[near_one] = np.minimum(first[near_one], scan)
         last[near_one] = scan
-    looks_without = counts.sum(axis=0) - (last - first + 1)
+    with_one = last - first + 1
+    looks_without = counts.sum(axis=0) - with_one
     comes_and_goes = (with_mover >= WITH_MOVER_SHARE * found) & (looks_without >= found)
     stands = (found >= LEAST_FOUND) & (2 * with_mover < found)
     of_mover = [comes_and_goes[place] & is_near for place, is_near in zip(places, near, strict=True)]
-    return of_mover, [stands[place] for place in places]
+    hits_without = counts[0] - with_one
+    occupied = is_occupied(*counts) & (hits_without >= LEAST_HITS)
+    return of_mover, [stands[place] for place in places], [occupied[place] for place in places]
+
+
+def unusually_large(objects: Sequence[TrackedObject], listed: Sequence[Segment]) -> NDArray[np.bool_]:
+    """Which of all segments (s,) are so much larger than most of their track that they hold something else, too."""
+    is_large = np.zeros(len(listed), np.bool_)
+    for one in objects:
+        if one.motion in GONE and len(one.segments) >= LEAST_SCANS:
+            size = np.array([np.linalg.norm(np.ptp(listed[n].outline(), axis=0)) for n in one.segments])
+            is_large[list(one.segments)] = size > SIZE_RATIO * np.median(size) + SIZE_MARGIN_M
+    return is_large
 
 
 def near_movers(

@@ -99,9 +99,10 @@ def _test_visibility(drawn, around, column, low, high):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
-    """Mask (count,) of the segments of a scan that something nearer hides in part, on the left or on the right.
+    """Mask (count,) of the segments of a scan that are seen in part, as something hides the left or the right of them.
 
-    The sides of a segment are its outermost columns; nearer returns in the three columns beyond hide it.
+    The sides of a segment are its outermost columns; nearer returns in the three columns beyond hide it. Where these
+    hold no return at all, the view of the LiDAR ends.
     """
     members, flat = np.flatnonzero(segments >= 0), p_map.reshape(-1)
     segments, n = segments[members], len(members)
@@ -124,6 +125,7 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
             columns[i] += COLUMNS
         low[s], high[s] = min(low[s], columns[i]), max(high[s], columns[i])
     counts, hidden = np.zeros((count, 2), np.int64), np.zeros((count, 2), np.int64)
+    is_blank = _without_returns(image)
     for i in range(n):
         s = segments[i]
         if rows[i] == 0:
@@ -132,15 +134,28 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
             if abs(columns[i] - edge) > 1:
                 continue
             counts[s, side] += 1
+            blank = 0
             for beyond in range(1, 4):
-                seen = image[rows[i], (columns[i] + first[s] + step * beyond) % COLUMNS + 1]
-                if seen != EMPTY and seen / UNITS_PER_M < ranges[i] - margin_m:
+                column = (columns[i] + first[s] + step * beyond) % COLUMNS
+                seen = image[rows[i], column + 1]
+                blank += is_blank[column]
+                if blank == 3 or (seen != EMPTY and seen / UNITS_PER_M < ranges[i] - margin_m):
                     hidden[s, side] += 1
                     break
     result = np.zeros(count, np.bool_)
     for s in range(count):
         result[s] = 3 * hidden[s, 0] > counts[s, 0] or 3 * hidden[s, 1] > counts[s, 1]
     return result
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _without_returns(image):
+    """Which columns of an image have no return in any row."""
+    is_blank = np.ones(COLUMNS, np.bool_)
+    for row in range(len(image)):
+        for column in range(COLUMNS):
+            is_blank[column] &= image[row, column + 1] == EMPTY
+    return is_blank
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

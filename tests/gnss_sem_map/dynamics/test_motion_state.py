@@ -54,3 +54,12 @@ def test_what_is_beside_something_that_moved_is_in_time_order():
     objects = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
     assert (1, 3, 6, 8) in [one.segments for one in objects]
     assert all(one.segments == tuple(sorted(one.segments)) for one in objects)
+
+
+def test_a_parked_car_behind_which_another_passes_stays():
+    """In four scans both are one segment; the part of it that is seen grows as it is passed."""
+    segments = [segment(scan, 0.08 * scan, 4.3) for scan in range(24)]
+    hits = np.full(24, 2000.0)
+    misses = np.where(np.isin(np.arange(24), (17, 19, 21, 23)), 1500.0, 10.0)
+    objects = classify_motion(segments, hits, misses, MotionSettings(), is_sharp=True)
+    assert not any(one.motion in GONE for one in objects)

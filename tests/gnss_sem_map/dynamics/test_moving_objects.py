@@ -181,6 +181,14 @@ def test_a_car_that_creeps_past_parked_cars_takes_nothing_of_them_along():
     assert others == 0
 
 
+def test_a_car_that_comes_closer_for_a_metre_and_waits_goes():
+    """It hides the place that it left, and nearly all scans hit it where it waits."""
+    share, others, _ = drive([*ROW, going(-9, 0, 3.0, stop=0.4)], scans=70, ego_speed=0.0, view_deg=0.0)
+    assert share[-1] > 0.9
+    np.testing.assert_array_equal(share[:-1], 0)
+    assert others < 2e-4
+
+
 def test_a_car_that_no_scan_is_near_is_told_by_those_farther_away():
     """It comes from 62 m to 47 m, where no scan is within `farthest_m`; the lowest ring is too far from the next."""
     share, others, _ = drive([going(62, -3.5, -5.0), parked(60, 4.5)], scans=30, ego_speed=0.0)

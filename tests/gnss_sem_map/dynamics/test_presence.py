@@ -5,7 +5,14 @@ import pytest
 
 from gnss_sem_map.dynamics.clusters import PointSets, Segments
 from gnss_sem_map.dynamics.motion_state import Motion, TrackedObject
-from gnss_sem_map.dynamics.presence import PERSON_REACH_M, PERSON_S, PREDICTED_S, near_movers, presence
+from gnss_sem_map.dynamics.presence import (
+    PERSON_REACH_M,
+    PERSON_S,
+    PREDICTED_S,
+    near_movers,
+    presence,
+    unusually_large,
+)
 from gnss_sem_map.dynamics.tracking import Segment
 
 REACH_M, STEP_S = 0.35, 0.1
@@ -15,7 +22,7 @@ def seen_in(scans, with_mover, looks):
     """Whether one place is of a mover, and whether it stands: found in some of 40 scans, a mover near in others."""
     places = [np.zeros(int(scan in scans), np.int32) for scan in range(40)]
     near = [np.full(int(scan in scans), scan in with_mover) for scan in range(40)]
-    of_mover, stands = presence(places, np.array([[looks], [0]], np.int32), near)
+    of_mover, stands, _ = presence(places, np.array([[looks], [0]], np.int32), near)
     return any(part.any() for part in of_mover), any(part.any() for part in stands)
 
 
@@ -33,6 +40,27 @@ def test_a_place_that_nobody_looked_at_without_the_mover_is_left_alone():
 
 def test_a_place_without_a_mover_is_of_none():
     assert seen_in(range(5, 7), with_mover=(), looks=38) == (False, False)
+
+
+@pytest.mark.parametrize(("hits", "misses", "expected"), [(35, 0, True), (22, 0, False), (35, 5, False)])
+def test_what_scans_hit_before_a_mover_came_beside_it_stands(hits, misses, expected):
+    """The last 20 scans show it beside the mover; one that comes to a stop is within the margin of a hit before."""
+    places = [np.zeros(int(scan >= 20), np.int32) for scan in range(40)]
+    near = [np.ones(len(place), np.bool_) for place in places]
+    *_, occupied = presence(places, np.array([[hits], [misses]], np.int32), near)
+    assert [part.tolist() for part in occupied] == [[]] * 20 + [[expected]] * 20
+
+
+def test_a_segment_that_is_much_larger_than_most_of_its_track_holds_something_else():
+    def segment(scan, length):
+        outline = np.array([(0.0, 0.0), (length, 0.0)])
+        return Segment(scan, 0.1 * scan, outline.mean(axis=0), 20, False, False, outline.copy, np.zeros(2))
+
+    lengths = [1.9] * 6 + [5.7, 2.2, 5.7]
+    listed = [segment(scan, length) for scan, length in enumerate(lengths)]
+    for motion, expected in ((Motion.MOVING, [6, 8]), (Motion.PARKED, [])):
+        one = TrackedObject(motion, 1.0, True, "", tuple(range(9)), 180, 0.0, 0.8, np.zeros((9, 2)))
+        assert np.flatnonzero(unusually_large([one], listed)).tolist() == expected
 
 
 def points_at(p):

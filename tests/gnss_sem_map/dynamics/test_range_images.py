@@ -132,12 +132,17 @@ def test_the_nearest_return_of_a_pixel_counts():
     assert image[image != range_images.EMPTY].tolist() == [1000]
 
 
-def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands():
+def test_a_segment_is_hidden_on_a_side_where_something_nearer_stands_or_the_view_ends():
     image = wall_image()
     middle = 1 + range_images.COLUMNS // 2
-    for columns, expected in ((slice(0, 0), False), (slice(middle + 12, middle + 30), True)):
+    left = slice(middle + 12, middle + 30)
+    for columns, seen, expected in (
+        (slice(0, 0), 800, False),
+        (left, 800, True),
+        (left, range_images.EMPTY, True),
+    ):
         nearer = image.copy()
-        nearer[:, columns] = 800
+        nearer[:, columns] = seen  # or the view of the LiDAR ends
         azimuths = np.radians(np.arange(-4, 4.5, 0.4))
         points = WALL_M * np.stack([np.cos(azimuths), np.sin(azimuths), -0.02 + 0 * azimuths], axis=1)
         segments = np.zeros(len(points), np.int32)

@@ -20,4 +20,4 @@ def _name_of_its_own(files: IndexDataCacheFile, number: int) -> str:
     return str(files._index_name).removesuffix("nbi") + f"{uuid4().hex[:16]}.nbc"
 
 
-IndexDataCacheFile._data_name = _name_of_its_own
+IndexDataCacheFile._data_name = _name_of_its_own  # type: ignore[method-assign]

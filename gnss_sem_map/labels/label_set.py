@@ -166,11 +166,10 @@ class Taxonomy:
 
 def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> LabelSet:
     """Read a class set: the name of a shipped one, the user's YAML file, or what `about` gave. Raises ConfigError."""
-    content = (
-        name_or_file
-        if isinstance(name_or_file, Mapping)
-        else _read(name_or_file, "class set", SHIPPED_CLASS_SETS)
-    )
+    if isinstance(name_or_file, Mapping):
+        content = name_or_file
+    else:
+        content = _read(name_or_file, "class set", SHIPPED_CLASS_SETS)
     try:
         classes = content["classes"]
         return LabelSet(

@@ -11,19 +11,18 @@ from gnss_sem_map.files.atomic import replacing
 from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.labels.label_set import SHIPPED_CLASS_SETS
 
-SETTINGS, CALIBRATION, CLASSES = "config.yaml", "calibration.yaml", "classes.yaml"
-COPIES = (CALIBRATION, CLASSES)
-"""Files that settings name, under their names in a run."""
+SETTINGS = "config.yaml"
+COPIES = ("calibration.yaml", "classes.yaml")
+"""Files that settings name, each by the name of its setting."""
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
     """Write config.yaml, and copies of the class set and the calibration that it names; raises ConfigError, OSError."""
-    names: dict[str, Path | str] = {"calibration": Path(CALIBRATION), "classes": CLASSES}
     for setting, file in _named(settings).items():
-        content = read_bytes(file, error=ConfigError)
-        with replacing(folder / names[setting]) as copy:  # it may be a second name of the file that was read
+        content, name = read_bytes(file, error=ConfigError), f"{setting}.yaml"
+        with replacing(folder / name) as copy:  # it may be a second name of the file that was read
             copy.write(content)
-        settings = settings.model_copy(update={setting: names[setting]})
+        settings = settings.model_copy(update={setting: type(getattr(settings, setting))(name)})
     (folder / SETTINGS).write_text(settings.to_yaml(), "utf-8")
 
 

@@ -18,6 +18,7 @@ from factor_graphs.constraints import (
     zero_velocity_factors,
 )
 from factor_graphs.covariances import keyframe_covariances
+from factor_graphs.graph import from_values
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
@@ -41,6 +42,9 @@ NOTABLE_FIX_NOISE = 1.2
 NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
+# A course that may be so far off the heading, rad, shows no slip: a boat that drifts looks like a car. Only a motion
+# with less horizontal acceleration, m/s², nearly always, leaves the heading so unknown.
+MOST_OF_HEADING, GENTLE = 0.05, 0.5
 # The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip of wheels by
 # this share. Until then the cost need not be better than so much of itself: the next solution begins there.
 CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP, ROUGH = 4, 0.3, 0.2, 1e-3
@@ -246,11 +250,28 @@ def _observed(
     if not with_axle and not with_wheels:
         return None, None, np.zeros(4)
     shown = observe(problem, fit, motion)
+    if not shown.doubt and (heading := _heading_if_gentle(problem, fit)) > MOST_OF_HEADING:
+        doubt = (
+            f"its heading is known to {np.degrees(heading):.0f}° only: it hardly turns or changes its speed"
+        )
+        shown = replace(shown, doubt=doubt)
     mounting = np.zeros(4) if shown.doubt and wanted != "on" else shown.mounting
     vehicle = shown if with_axle else None
     if speeds is None or not with_wheels:
         return vehicle, None, mounting
     return vehicle, observe_wheels(speeds, problem, fit, motion, mounting), mounting
+
+
+def _heading_if_gentle(problem: Problem, fit: Fit) -> float:
+    """Usual standard deviation of the heading, rad; 0 where it is certainly small, for turns and braking show it."""
+    k = len(problem.intervals.keyframes)
+    T, velocities, _ = from_values(fit.values, k)
+    changes = np.diff(velocities[:, :2], axis=0) / np.diff(problem.intervals.keyframes)[:, None]
+    if np.quantile(np.linalg.norm(changes, axis=1), 0.9) > GENTLE:
+        return 0.0
+    covariances, _ = keyframe_covariances(fit.graph, fit.values, k)
+    up = T[:, 2, :3]
+    return float(np.sqrt(np.median(np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up))))
 
 
 def _quiet(problem: Problem) -> NDArray[np.bool_]:

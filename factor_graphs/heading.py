@@ -18,8 +18,9 @@ from factor_graphs.problem import Fit, Problem, first_values, motion_graph, opti
 
 Array = NDArray[np.float64]
 
-# Slower than this, m/s, nearly always, the course does not tell the heading; a prior below this, rad, does.
-SLOW_MPS, UNKNOWN = 3.0, 1.0
+# Slower than this, m/s, over so many s, nearly always, the course does not tell the heading; a prior below this, rad,
+# does.
+SLOW_MPS, COURSE_S, UNKNOWN = 3.0, 20.0, 1.0
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 # Another heading, so far away, rad, fits as well when its cost is that of a good one of 999 in a thousand.
 APART, AS_GOOD = 0.5, quantile(0.999, 1)
@@ -29,20 +30,29 @@ ANY = np.pi / np.sqrt(3)
 
 def with_heading(problem: Problem) -> Problem:
     """The problem with the first guess of which the solution is best, and with the doubt whether another is as good."""
-    speeds = np.linalg.norm(problem.guess[1], axis=1)
-    if problem.is_bound or problem.attitude.stddevs[2] < UNKNOWN or np.quantile(speeds, 0.9) > SLOW_MPS:
+    if problem.is_bound or problem.attitude.stddevs[2] < UNKNOWN or not _is_slow(problem):
         return problem
     tried = [_solved(_turned(problem, turn)) for turn in TURNS_DEG]
     found = [one for one in tried if one is not None]
     if not found:
         return problem
+    middle = len(problem.intervals.keyframes) // 2
     costs = np.array([2 * fit.graph.error(fit.values) for _, fit in found])
-    R_map_imu = np.stack([motion_from(fit.values)[0][len(speeds) // 2, :3, :3] for _, fit in found])
+    R_map_imu = np.stack([motion_from(fit.values)[0][middle, :3, :3] for _, fit in found])
     best, best_fit = found[int(costs.argmin())]
     off = Rotation.from_matrix(R_map_imu @ R_map_imu[int(costs.argmin())].T).as_rotvec()[:, 2]
     as_good = costs - costs.min() < AS_GOOD
     in_doubt = bool(np.any(as_good & (np.abs(off) > APART)))
     return replace(best, guess=motion_from(best_fit.values), heading_in_doubt=in_doubt)
+
+
+def _is_slow(problem: Problem) -> bool:
+    """Whether it gets nowhere fast: a speed from fix to fix is mostly their noise."""
+    stamps, level = problem.intervals.keyframes, problem.guess[0][:, :2, 3]
+    first = np.flatnonzero(stamps <= max(stamps[-1] - COURSE_S, stamps[0]))
+    last = np.minimum(np.searchsorted(stamps, stamps[first] + COURSE_S), len(stamps) - 1)
+    speeds = np.linalg.norm(level[last] - level[first], axis=1) / (stamps[last] - stamps[first])
+    return bool(np.quantile(speeds, 0.9) < SLOW_MPS)
 
 
 def of_any_heading(R_map_imu: Array, p_imu_antenna: Array) -> Array:

@@ -15,7 +15,7 @@ from factor_graphs.rigid_motion import FreeMotion, Mounted, RigidMotion, drone, 
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import Motion, follow, random_drive
 from factor_graphs.slip import LEAST_SLIP, Slip, explain
-from factor_graphs.smoothing import smooth
+from factor_graphs.smoothing import heading_stddevs, smooth
 from factor_graphs.vehicle import BodyMotion
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
@@ -251,3 +251,22 @@ def test_on_a_roundabout_the_verdict_says_how_little_it_tells_of_the_mounting(si
     yaw, its_stddev = re.search(r"mounted (\S+) ± (\S+)° in yaw", vehicle.verdict).groups()
     assert float(its_stddev) > 1.0
     assert abs(float(yaw)) < 3 * float(its_stddev)
+
+
+def test_a_boat_that_drifts_sideways_all_the_time_is_no_vehicle(simulate):
+    """11° off its course in gentle turns: the first solution knows its heading no better, so it shows no slip."""
+
+    def ferry(seconds: float, rng: np.random.Generator) -> FreeMotion:
+        t = np.linspace(-30.0, seconds + 30.0, 60)
+        course = 2.0 + 0.01 * t + 0.1 * np.sin(t / 20)
+        way = 5.0 * (t[1] - t[0]) * np.cumsum(np.column_stack([np.cos(course), np.sin(course)]), axis=0)
+        position = np.column_stack([way, 0.3 * np.sin(t)])
+        euler = np.column_stack([course + 0.2, 0.02 * np.sin(t / 2), 0.05 * np.sin(t / 1.5)])
+        return FreeMotion(make_interp_spline(t, position, k=5), make_interp_spline(t, euler, k=5))
+
+    drive = simulate(6, seconds=300.0, noise=ImuNoise(), moves=ferry)
+    found = smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
+    assert not found.vehicle.held
+    assert "heading is known to" in found.vehicle.verdict
+    off = np.degrees(errors(found.keyframes, drive.motion.trajectory(found.keyframes.stamps)).rotation[:, 2])
+    assert np.all(np.abs(off) < 3 * np.degrees(heading_stddevs(found.keyframes)))

@@ -35,7 +35,7 @@ LEAST_SCANS = 3
 WITH_MOVER_SHARE = 0.9
 """A place is of a mover if one is near in so large a share of the scans that find something there, and no fewer scans
 looked there while none was near."""
-LEAST_HITS = 5
+LEAST_HITS = 10
 """What so many scans hit without a mover stands: one that comes to a stop is within the margin of a hit before."""
 LEAST_FOUND = 3
 """A place that so many scans find, and more without a mover than with one, stands."""

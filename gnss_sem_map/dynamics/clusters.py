@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.hash_unique import distinct
 from gnss_sem_map.voxels.voxel_map import keys_of, unpack

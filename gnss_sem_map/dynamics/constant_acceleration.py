@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.special import softmax
-
-from gnss_sem_map.compiling import njit
 
 Array = NDArray[np.float64]
 

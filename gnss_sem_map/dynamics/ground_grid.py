@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int32
+from numba import int32, njit
 from numpy.typing import NDArray
-
-from gnss_sem_map.compiling import njit
 
 GROUND_CELL_M = 1.0
 

@@ -12,9 +12,9 @@ from functools import partial
 from itertools import chain, pairwise
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.dynamics import range_images
 from gnss_sem_map.dynamics.clusters import Segments, find_segments, split_segments
 from gnss_sem_map.dynamics.covered_parts import HIDING_M, with_cover

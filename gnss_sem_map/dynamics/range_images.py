@@ -10,10 +10,9 @@ instructions.
 from __future__ import annotations
 
 import numpy as np
-from numba import int32, uint16
+from numba import int32, njit, uint16
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.dynamics.image_rows import CELL_DEG, CELLS, LOWEST_DEG, Rows
 from gnss_sem_map.scans.angles import atan2_deg
 

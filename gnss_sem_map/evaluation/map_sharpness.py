@@ -13,12 +13,12 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map

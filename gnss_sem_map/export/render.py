@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-
-from gnss_sem_map.compiling import njit
 
 NEAREST_M = 0.5
 """What is nearer to the eye is not drawn."""

@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numba import int64
+from numba import int64, njit
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy.special import gammaln
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.machine import threads
 from gnss_sem_map.refinement.figures import FIXED_POINT, PSEUDO_COUNTS, Sums
 from gnss_sem_map.refinement.state import MapState, StepSettings, classes_of

@@ -7,10 +7,10 @@ be tracked, in no image, or too close to a wall. Static voxels are hit again fro
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.dynamics.range_images import FARTHEST_M
 from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings

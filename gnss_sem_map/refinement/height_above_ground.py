@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.voxels.voxel_map import limits_of
 
 CELL_M = 1.0

@@ -11,10 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.special import entr, expit, logit
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.refinement.kerb_points import FACE_BEGINS
 from gnss_sem_map.refinement.road_sidewalk import (

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 
 HALF_STENCIL = np.array(

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import uint64
+from numba import njit, uint64
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.refinement.neighbours import pairs_of_neighbours
 from gnss_sem_map.refinement.state import MapState, Scores, StepSettings
 from gnss_sem_map.voxels.voxel_map import softmax

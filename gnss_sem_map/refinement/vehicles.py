@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.dynamics.motion_state import Motion
 from gnss_sem_map.refinement.figures import Sums
 from gnss_sem_map.refinement.state import (

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.polynomial import Chebyshev, Polynomial
 from numpy.typing import NDArray
-
-from gnss_sem_map.compiling import njit
 
 EIGHTH = float(np.tan(np.pi / 8))
 ARCTANGENT_DEG = tuple(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import int64
+from numba import int64, njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.scans.kernels import coordinates, mark_usable
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, grown, slot_of

@@ -7,9 +7,8 @@ the compiler can use SIMD instructions. The tests hold a numpy version of each l
 from __future__ import annotations
 
 import numpy as np
-from numba import int64
+from numba import int64, njit
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.sensor_log.cameras import ANGLE, PINHOLE
 from gnss_sem_map.voxels.kernels import height_in_voxel, pack_key
 

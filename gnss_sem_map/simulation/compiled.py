@@ -11,8 +11,7 @@ from typing import Any, Final, Protocol, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-
-from gnss_sem_map.compiling import njit
+from numba import njit
 
 Floats = npt.NDArray[np.float64]
 Singles = npt.NDArray[np.float32]

@@ -9,10 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import int64
+from numba import int64, njit
 from numpy.typing import NDArray
-
-from gnss_sem_map.compiling import njit
 
 WORDS = 7
 """Of a row: the last moment; points (4 bytes), exponent of the stride (1 byte) and sample."""

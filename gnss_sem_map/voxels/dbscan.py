@@ -10,10 +10,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numba import int64, uint64
+from numba import int64, njit, uint64
 from numpy.typing import NDArray
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.voxels.kernels import AXIS_OFFSET
 from gnss_sem_map.voxels.voxel_map import pack

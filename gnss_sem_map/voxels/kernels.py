@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import int64, types, uint64
+from numba import int64, njit, types, uint64
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from gnss_sem_map.compiling import njit
 from gnss_sem_map.voxels.attribute_table import note
 
 AXIS_BITS = 21

@@ -20,7 +20,7 @@ from factor_graphs.constraints import (
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, first_values, motion_graph, optimise
+from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, fit_as_expected, motion_graph, optimise
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
@@ -50,40 +50,22 @@ MOST_OF_HEADING, GENTLE = 0.05, 0.5
 CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP, ROUGH = 4, 0.3, 0.2, 1e-3
 
 
-def fit_noise(
-    problem: Problem,
-    start: Fit | None = None,
-    constraints: list[gtsam.NonlinearFactor] | None = None,
-    tolerance: float = RELATIVE_TOLERANCE,
-) -> Fit:
-    """Inflate the IMU noise, from the sensor's own or from `start`, until chi2 per degree of freedom fits.
-
-    The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only. `tolerance` as
-    in `optimise`.
-    """
-    if start is None:
-        fit, enough = _as_said(problem, constraints or [], tolerance), INFLATED_CHI2
-    else:
-        noise, enough = (start.inflation, start.of_walk), FITTING_CHI2[1]
-        fit = optimise(
-            problem, start.motion, start.values, noise, _loss(problem), constraints or [], tolerance
-        )
-    return fit if _fits(problem, fit) else _inflated(problem, fit, constraints or [], tolerance, enough)
-
-
-def fit_noise_of_all(problem: Problem) -> tuple[Problem, Fit]:
+def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
     """Fit, with more noise where the residuals show it: of the fixes, then the problem is another; else of the IMU.
 
-    Fixes that are worse than they say would be followed by an IMU that is inflated without end. Only variance
-    components tell one from the other. Not where relative poses bind the keyframes: they may not fit either.
+    The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only. Fixes that are
+    worse than they say would be followed by an IMU that is inflated without end. Only variance components tell one from
+    the other. Not where relative poses bind the keyframes: they may not fit either.
     """
-    fit = _as_said(problem)
+    fit = fit_as_expected(problem)
     if _fits(problem, fit):
         return problem, fit
     if not problem.is_bound:
         noisier, better = problem, fit
         for _ in range(NOISE_ROUNDS):
-            of_fixes, noise = _noise_shown(noisier, better)
+            covariances, steps = _covariances(problem, better)
+            of_fixes = fix_noise_shown(noisier, better, covariances)
+            noise = imu_noise_shown(noisier, better, covariances, steps)
             if of_fixes == noisier.of_fixes and noise == (better.inflation, better.of_walk):
                 break
             noisier, motion = noisier.with_fix_noise(of_fixes), motion_graph(problem, *noise)
@@ -93,18 +75,16 @@ def fit_noise_of_all(problem: Problem) -> tuple[Problem, Fit]:
     return problem, _inflated(problem, fit, [], RELATIVE_TOLERANCE, INFLATED_CHI2)
 
 
-def _loss(problem: Problem) -> str:
-    return "huber" if problem.settings.robust else "quadratic"
-
-
-def _as_said(
-    problem: Problem,
-    constraints: list[gtsam.NonlinearFactor] | None = None,
-    tolerance: float = RELATIVE_TOLERANCE,
+def fit_noise_from(
+    start: Fit, problem: Problem, constraints: list[gtsam.NonlinearFactor], tolerance: float
 ) -> Fit:
-    """The solution with the noise that is expected."""
-    motion, values = motion_graph(problem, 1.0, 1.0), first_values(problem)
-    return optimise(problem, motion, values, (1.0, 1.0), _loss(problem), constraints or [], tolerance)
+    """Fit with constraints from a solution without, and inflate the IMU noise further until chi2 fits.
+
+    `tolerance` as in `optimise`.
+    """
+    noise = start.inflation, start.of_walk
+    fit = optimise(problem, start.motion, start.values, noise, problem.first_loss, constraints, tolerance)
+    return fit if _fits(problem, fit) else _inflated(problem, fit, constraints, tolerance, FITTING_CHI2[1])
 
 
 def _fits(problem: Problem, fit: Fit) -> bool:
@@ -140,19 +120,19 @@ def fit_noise_by_components(problem: Problem, fit: Fit) -> Fit:
     A vehicle constraint would hide noise: where an axle slides less than it is believed to, residuals are small.
     """
     for _ in range(NOISE_ROUNDS):
-        _, noise = _noise_shown(problem, fit)
+        noise = imu_noise_shown(problem, fit, *_covariances(problem, fit))
         if noise == (fit.inflation, fit.of_walk):
             break
         fit = optimise(problem, motion_graph(problem, *noise), fit.values, noise, fit.loss)
     return fit
 
 
-def _noise_shown(problem: Problem, fit: Fit) -> tuple[float, tuple[float, float]]:
-    """How many times more noise than they say the fixes show, and white noise and walk of the IMU."""
+def _covariances(problem: Problem, fit: Fit) -> tuple[Array, BiasSteps]:
+    """Covariances (k, 15, 15) of the keyframes, and variances of the steps of their biases."""
     k = len(problem.intervals.keyframes)
     steps = BiasSteps(k)
     covariances, _ = keyframe_covariances(fit.graph, fit.values, k, steps)
-    return fix_noise_shown(problem, fit, covariances), imu_noise_shown(problem, fit, covariances, steps)
+    return covariances, steps
 
 
 def calibrate(
@@ -209,7 +189,7 @@ def constrain(
         factors = _constraints(problem, start, motion, stands, axle, rolling, mounting)
         if not factors:
             break
-        fit = fit_noise(problem, start, factors, tolerance)
+        fit = fit_noise_from(start, problem, factors, tolerance)
         if axle is not None and known is not None and slip != known and _is_bent(fit, start):
             fit, slip, axle = start, known, replace(axle, slip=known)
             continue
@@ -229,9 +209,8 @@ def constrain(
             calibration, noise = fit.values.atVector(W(key)), rolling.noise.typical
             rolling = replace(observe_wheels(speeds, problem, fit, motion, mounting, calibration), held=True)
             settled &= np.allclose(noise, rolling.noise.typical, rtol=SETTLED_SLIP)
-    if (
-        rolling is not None and rolling.doubt and settings.wheel_speed != "on"
-    ):  # they fitted only until they were held
+    # wheels that fitted only until they were held
+    if rolling is not None and rolling.doubt and settings.wheel_speed != "on":
         return *constrain(problem, by_fixes)[:3], replace(rolling, held=False)
     return fit, factors, axle or vehicle, rolling or wheels
 

@@ -88,6 +88,11 @@ class Problem:
     of_fixes: float = 1.0
     heading_in_doubt: bool = False
 
+    @property
+    def first_loss(self) -> str:
+        """Loss of the fixes, until outliers are rejected."""
+        return "huber" if self.settings.robust else "quadratic"
+
     def with_fix_noise(self, of_fixes: float) -> "Problem":
         """The same with fixes of so many times the standard deviations that they say."""
         f = self.fixes
@@ -209,6 +214,12 @@ def usable_fixes(
             f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
         )
     return used, notes
+
+
+def fit_as_expected(problem: Problem) -> Fit:
+    """The solution from the first guess, with the noise that is expected; raises EstimationError."""
+    motion = motion_graph(problem, 1.0, 1.0)
+    return optimise(problem, motion, first_values(problem), (1.0, 1.0), problem.first_loss)
 
 
 def motion_graph(problem: Problem, inflation: float, of_walk: float) -> gtsam.NonlinearFactorGraph:

@@ -16,8 +16,8 @@ from factor_graphs.fitting import (
     FITTING_CHI2,
     calibrate,
     constrain,
+    fit_noise,
     fit_noise_by_components,
-    fit_noise_of_all,
     reject,
 )
 from factor_graphs.geodesy import LocalFrame
@@ -126,7 +126,7 @@ def smooth(
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
         lever = calibration.p_imu_antenna
         problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
-        return fit_noise_of_all(with_heading(problem))
+        return fit_noise(with_heading(problem))
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0

@@ -21,7 +21,7 @@ def relative_difference(ours: np.ndarray, theirs: np.ndarray) -> float:
 def test_they_are_those_of_gtsams_marginals(simulate):
     drive = simulate(1, seconds=40.0, noise=ImuNoise())
     problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
-    fit, k = fit_noise(problem), len(problem.intervals.keyframes)
+    (_, fit), k = fit_noise(problem), len(problem.intervals.keyframes)
     marginals = gtsam.Marginals(fit.graph, fit.values)
     theirs = [marginals.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix() for i in range(k)]
     ours, _ = keyframe_covariances(fit.graph, fit.values, k)
@@ -31,7 +31,7 @@ def test_they_are_those_of_gtsams_marginals(simulate):
 def test_they_hold_where_factors_reach_over_several_keyframes(simulate):
     drive = simulate(2, seconds=20.0, noise=ImuNoise())
     problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
-    fit, k = fit_noise(problem), len(problem.intervals.keyframes)
+    (_, fit), k = fit_noise(problem), len(problem.intervals.keyframes)
     graph = gtsam.NonlinearFactorGraph(fit.graph)
     model = gtsam.noiseModel.Isotropic.Sigma(6, 0.05)
     for i in range(0, k - 5, 3):
@@ -46,7 +46,7 @@ def test_they_hold_where_factors_reach_over_several_keyframes(simulate):
 def test_they_hold_where_all_keyframes_share_an_unknown(simulate):
     drive = simulate(3, seconds=120.0, noise=ImuNoise())
     problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
-    fit, _, vehicle, _ = constrain(problem, fit_noise(problem))
+    fit, _, vehicle, _ = constrain(*fit_noise(problem))
     assert vehicle.held
     k = len(problem.intervals.keyframes)
     marginals = gtsam.Marginals(fit.graph, fit.values)

@@ -26,7 +26,7 @@ def test_the_variance_of_sums_is_that_of_the_whole_covariance(simulate):
     drive = simulate(3, seconds=60.0, noise=ImuNoise())
     settings = SmootherSettings(vehicle_constraint="on")
     problem = pose_problem(drive.imu, drive.fixes, FRAME, settings, LEVER, None)
-    fit, _, vehicle, _ = constrain(problem, fit_noise(problem))
+    fit, _, vehicle, _ = constrain(*fit_noise(problem))
     assert vehicle.held
     k, rng = len(problem.intervals.keyframes), np.random.default_rng(0)
     windows = np.repeat([-1, 0, 1, -1, 2], [5, 20, 10, 4, k - 39])

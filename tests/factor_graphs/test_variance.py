@@ -25,7 +25,7 @@ def test_redundancy_of_the_imu_is_that_of_dense_algebra(simulate):
     """Its rows, less the trace of their part of the hat matrix."""
     drive = simulate(41, seconds=20.0, noise=ImuNoise())
     problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
-    fit = fit_noise(problem)
+    _, fit = fit_noise(problem)
     k = len(problem.intervals.keyframes)
     covariances, _ = keyframe_covariances(fit.graph, fit.values, k)
     ordering = gtsam.Ordering()
@@ -71,7 +71,7 @@ def test_biases_that_walk_faster_than_said_are_told_from_white_noise(simulate):
 
 def test_the_variance_of_bias_steps_is_that_of_dense_algebra(simulate):
     drive = simulate(41, seconds=20.0, noise=ImuNoise())
-    fit = fit_noise(pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None))
+    _, fit = fit_noise(pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None))
     k = sum(key >> 56 == ord("x") for key in fit.values.keys())  # noqa: SIM118
     steps = BiasSteps(k)
     keyframe_covariances(fit.graph, fit.values, k, steps)
@@ -124,7 +124,7 @@ def test_without_information_nothing_is_said(simulate):
     drive = simulate(41, seconds=20.0, noise=ImuNoise().scaled(3.0))
     vague = type(drive.fixes)(drive.fixes.stamps, drive.fixes.positions, np.full((len(drive.fixes), 3), 1e3))
     problem = pose_problem(drive.imu, vague, FRAME, SmootherSettings(), LEVER, None)
-    fit = fit_noise(problem)
+    _, fit = fit_noise(problem)
     steps = BiasSteps(len(problem.intervals.keyframes))
     covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes), steps)
     assert imu_noise_shown(problem, fit, covariances, steps) == (1.0, 1.0)

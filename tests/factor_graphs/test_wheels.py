@@ -122,7 +122,7 @@ def test_a_keyframe_without_samples_on_both_sides_or_beyond_the_log_has_no_readi
 def test_covariances_are_those_of_gtsams_marginals(simulate, settings):
     drive = simulate(3, seconds=120.0, noise=ImuNoise(), moves=mounted)
     problem = pose_problem(drive.imu, drive.fixes, FRAME, settings, LEVER, None)
-    fit, _, _, wheels = constrain(problem, fit_noise(problem), wheels_of(drive, 3, 120.0))
+    fit, _, _, wheels = constrain(*fit_noise(problem), wheels_of(drive, 3, 120.0))
     assert wheels.held
     k = len(problem.intervals.keyframes)
     shared = [key for key in (M(k), W(k)) if fit.values.exists(key)]

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.motion_state import TrackedObject
-from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, decide, moved_points
+from gnss_sem_map.dynamics.moving_objects import decide, moved_points
+from gnss_sem_map.dynamics.observation import NearPoints, Observation
 from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSelector
 from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.labels import sensor_model

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics.clusters import PointSets, Segments
 from gnss_sem_map.dynamics.image_rows import Rows
-from gnss_sem_map.dynamics.moving_objects import Observation
+from gnss_sem_map.dynamics.observation import Observation
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import RangeImage
 from gnss_sem_map.errors import DataError

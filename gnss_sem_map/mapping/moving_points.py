@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
-from gnss_sem_map.dynamics.moving_objects import NearPoints, Observation, observe
+from gnss_sem_map.dynamics.observation import NearPoints, Observation, observe
 from gnss_sem_map.dynamics.sweep_delays import SweepDelays
 from gnss_sem_map.dynamics.visibility import THREADS, RangeImage
 from gnss_sem_map.errors import DataError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.dynamics.moving_objects import NearPoints
+from gnss_sem_map.dynamics.observation import NearPoints
 from gnss_sem_map.mapping.labelled_scans import LabelledScan
 
 WAITING = ".waiting"

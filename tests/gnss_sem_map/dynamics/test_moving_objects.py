@@ -5,7 +5,8 @@ import pytest
 
 from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.dynamics.motion_state import MotionSettings
-from gnss_sem_map.dynamics.moving_objects import decide, moved_points, observe
+from gnss_sem_map.dynamics.moving_objects import decide, moved_points
+from gnss_sem_map.dynamics.observation import observe
 from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.refinement.vehicles import Motion

@@ -1,4 +1,4 @@
-"""A drive that fails, or a run that is stopped, costs the other drives nothing; a drive is not counted twice."""
+"""A drive that fails costs the other drives nothing, and the map stays as it was; a drive is not counted twice."""
 
 from __future__ import annotations
 
@@ -6,49 +6,25 @@ import errno
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NoReturn
 
 import pytest
 import street
-import street_drives
-from damage import flipped, halved
 from maps_of_drives import SETTINGS, assert_same, gnss_sem_map, mapped, products, run_of
 from street import Street
 from street_drives import Drives
 
-from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.score_run import score_run
-from gnss_sem_map.files.output_folder import RESUMABLE
-from gnss_sem_map.files.ownership import CONTENT_BYTES, foreign, write_list
-from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
-from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
+from gnss_sem_map.files.ownership import foreign, write_list
+from gnss_sem_map.runs import bound_drives, finished_run
+from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
-
-KILLED_BY_ITSELF = """
-import os, signal, sys
-
-def look(event, details):
-    place = os.fsdecode(details[1]) if event == "os.rename" else ""
-    folder, _, name = place.rpartition("/")
-    if folder.endswith("/drives/.b.work") and name.isdecimal():  # a chunk of its scans is put away
-        os.kill(os.getpid(), signal.SIGKILL)
-
-sys.addaudithook(look)
-from gnss_sem_map.cli import main
-main()
-"""
 
 
 def broken(drives: Drives, folder: Path) -> Path:
@@ -168,178 +144,6 @@ def test_where_no_drive_can_be_mapped_nothing_is_written(
         run_drives([drives.by_name["a"], bad], out, SETTINGS, none)
     assert "\n" not in str(refused.value)
     assert [path.name for path in tmp_path.iterdir()] == ["drives"]
-
-
-def test_a_run_that_is_killed_in_its_second_drive_is_resumed_there(
-    made: dict[str, Path], drives: Drives, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    words = run_of([drives.by_name["a"], drives.by_name["b"]], drives, out, "--workers", "1")
-    died = subprocess.run([sys.executable, "-c", KILLED_BY_ITSELF, *map(str, words)], check=False)
-    assert died.returncode == -signal.SIGKILL
-    assert not out.exists()
-    first = (tmp_path / ".out.work/drives/a/run.json").stat()
-    assert not (tmp_path / ".out.work/drives/b/run.json").exists()
-    done = gnss_sem_map(*words, "--resume")
-    assert done.returncode == 0, done.stderr
-    assert os.path.samestat((out / "drives/a/run.json").stat(), first), "the finished drive is mapped again"
-    assert_same(out, made["ab"])
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def stopped(*_: object, **__: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
-def stop_of(run: Callable[[], object], module: ModuleType, name: str) -> KeyboardInterrupt:
-    """How a run ends that is stopped where it calls this function."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, name, stopped)
-        with pytest.raises(KeyboardInterrupt) as stopping:
-            run()
-    return stopping.value
-
-
-def test_a_run_that_is_stopped_in_its_first_drive_keeps_the_chunks(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
-) -> None:
-    out, chunk = tmp_path / "out", tmp_path / ".out.work/drives/.a.work/0"
-    ended = stop_of(lambda: mapped("ab", drives, out, how), run_folder, "write_drive")
-    assert ended.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
-    there = (chunk / "record.json").stat()
-    stop_of(lambda: mapped("ab", drives, out, replace(how, resume=True)), run_folder, "write_drive")
-    assert os.path.samestat((chunk / "record.json").stat(), there), "the chunk is mapped again"
-    mapped("ab", drives, out, replace(how, resume=True))
-    assert_same(out, made["ab"])
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def calls_of_the_pipeline(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the drives that are mapped from now on."""
-    calls, original = [], pipeline.run
-
-    def watched(log: SensorLog, *rest: Any, **named: Any) -> pipeline.Mapped:
-        calls.append(log.name)
-        return original(log, *rest, **named)
-
-    monkeypatch.setattr(pipeline, "run", watched)
-    return calls
-
-
-def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, calls = shutil.copytree(made["ab"], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
-    removing = stop_of(lambda: remove_drive(out, "b"), many_drives, "write_drives")
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    adding = stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
-    assert not hasattr(removing, "__notes__"), "nothing resumes a removal"
-    assert adding.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
-    calls.clear()
-    assert products(out) == products(made["ab"])
-    add_drive(out, drives.by_name["c"], replace(how, resume=True))
-    assert_same(out, made["abc"])
-    assert calls == []
-
-
-def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
-    drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = calls_of_the_pipeline(monkeypatch)
-    monkeypatch.setattr(many_drives, "write_drives", stopped)
-    coarse = Settings.model_validate({"mapping": {"voxel_size_m": 0.4}})
-    elsewhere = LocalFrame(49.01, 8.42, 100.0)
-    for settings, origin, again, times in (
-        (SETTINGS, None, how, 1),
-        (SETTINGS, None, replace(how, resume=True), 0),
-        (coarse, None, replace(how, resume=True), 1),
-        (coarse, elsewhere, replace(how, resume=True), 1),
-        (coarse, elsewhere, replace(how, segmenter="none", resume=True), 1),
-    ):
-        calls.clear()
-        with pytest.raises(KeyboardInterrupt):
-            run_drives([drives.by_name["a"]], tmp_path / "out", settings, again, origin=origin)
-        assert len(calls) == times
-
-
-def test_what_is_damaged_of_an_interrupted_run_is_made_again(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, work = tmp_path / "out", tmp_path / ".out.work"
-    stop_of(lambda: mapped("ab", drives, out, how), many_drives, "write_drives")
-    halved(work / "bound/a/condensed.npz")
-    flipped(work / "bound/b/trajectory.npz")
-    halved(work / "drives/a/run.json")
-    (work / "drives/b/metrics.json").unlink()
-    calls = calls_of_the_pipeline(monkeypatch)
-    mapped("ab", drives, out, replace(how, resume=True))
-    assert calls == ["a", "b"]
-    assert_same(out, made["ab"])
-
-
-def test_a_changed_byte_of_a_large_file_of_a_finished_drive_is_found(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where files are compared by their size alone, it ends up in the map, or stops every run that is resumed."""
-    out, file = tmp_path / "out", tmp_path / ".out.work/drives/a/trajectory.png"
-    stop_of(lambda: mapped("ab", drives, out, how), many_drives, "write_drives")
-    assert file.stat().st_size > CONTENT_BYTES
-    flipped(file)
-    calls = calls_of_the_pipeline(monkeypatch)
-    mapped("ab", drives, out, replace(how, resume=True))
-    assert calls == ["a"]
-    assert_same(out, made["ab"])
-
-
-def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
-) -> None:
-    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
-    stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
-    kept = shutil.copytree(work, tmp_path / "kept")
-    again = replace(how, resume=True)
-    add_drive(out, drives.by_name["c"], again)
-    kept.rename(work)  # as if it had been killed before it removed it
-    add_drive(out, drives.by_name["c"], again)
-    assert_same(out, made["abc"])
-    assert not work.exists()
-
-
-def test_a_drive_that_was_added_while_another_command_began_stays(
-    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, claimed_run = shutil.copytree(made["a"], tmp_path / "out"), run_folder.claimed_run
-
-    def after_another(*words: Any, **more: Any) -> Any:
-        monkeypatch.setattr(run_folder, "claimed_run", claimed_run)
-        add_drive(out, drives.by_name["b"], how)
-        return claimed_run(*words, **more)
-
-    monkeypatch.setattr(run_folder, "claimed_run", after_another)
-    add_drive(out, drives.by_name["c"], how)
-    assert_same(out, made["abc"])
-
-
-def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed(
-    how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    written, calls = street_drives.write(tmp_path / "drives", ("a", "b")), calls_of_the_pipeline(monkeypatch)
-    labels, drive = Path(written.labels.partition(":")[2].format(drive="a")), written.by_name["b"]
-    places, again = list(written.by_name.values()), replace(how, segmenter=written.labels, resume=True)
-    monkeypatch.setattr(many_drives, "write_drives", stopped)
-
-    def mapped_again(changed: Path, content: bytes) -> list[str]:
-        changed.write_bytes(content)
-        calls.clear()
-        with pytest.raises(KeyboardInterrupt):
-            run_drives(places, tmp_path / "out", SETTINGS, again)
-        return list(calls)
-
-    image, row = labels / "0000000002.npz", drive / "oxts/data/0000000003.txt"
-    latitude, rest = row.read_text().split(" ", 1)
-    assert mapped_again(image, image.read_bytes()) == ["a", "b"]
-    assert mapped_again(row, f"{float(latitude) + 1e-7:.12f} {rest}".encode()) == ["b"]
-    assert mapped_again(image, image.read_bytes()) == ["a"]
 
 
 def test_labels_in_a_result_that_would_be_replaced_are_not_removed(

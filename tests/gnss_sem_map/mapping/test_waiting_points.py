@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnss_sem_map.dynamics.moving_objects import NearPoints
+from gnss_sem_map.dynamics.observation import NearPoints
 from gnss_sem_map.mapping.waiting_points import COLUMNS, WaitingPoints
 
 

@@ -18,12 +18,14 @@ giving it back blocks all threads."""
 WHOLE = (
     "importlib._bootstrap",
     "_frozen_importlib",
+    "llvmlite",
     "tempfile",
     "gnss_sem_map.files.output_folder",
     "gnss_sem_map.files.work_folder",
     "gnss_sem_map.files.atomic",
 )
-"""Modules whose functions are finished with all that they call: an import, and what makes, replaces or removes results.
+"""Modules whose functions are finished with all that they call: an import, compiling or loading a function, and what
+makes, replaces or removes results.
 A block in which such a folder is claimed is not below them."""
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
@@ -92,8 +94,9 @@ def _stop_later(number: int, seen: FrameType | None = None) -> None:
 def _must_go_on(frame: FrameType | None) -> bool:
     """Whether a function that takes locks is on top, or one that must be finished is below.
 
-    An import that is left may crash in compiled code, and some modules drop every exception of what they import. A
-    folder that is claimed or given back is otherwise left with its lock, or half removed.
+    An import that is left may crash in compiled code, and some modules drop every exception of what they import. LLVM
+    calls Python to load a function, drops what is raised there, and the function is missing when it is called. A folder
+    that is claimed or given back is otherwise left with its lock, or half removed.
     """
     if frame is not None and _module_of(frame).startswith(LOCKING):
         return True

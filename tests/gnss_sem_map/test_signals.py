@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -76,6 +77,42 @@ def test_an_import_is_finished_first(tmp_path: Path) -> None:
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.split() == [str(int(signal.SIGTERM)), "100000"]
+
+
+LOAD = """
+import os, signal, time
+import numpy as np
+from llvmlite.binding.executionengine import ExecutionEngine
+from gnss_sem_map.cli import signals
+from gnss_sem_map.voxels.hash_unique import distinct
+
+def find_and_interrupt(engine, module, find=ExecutionEngine._find_module_ptr):
+    os.kill(os.getpid(), signal.SIGTERM)
+    return find(engine, module)
+
+ExecutionEngine._find_module_ptr = find_and_interrupt  # LLVM has it called for what is compiled or loaded
+signals.TRY_AGAIN_S = 1.0  # the function is used before
+signals.stop_on_signals()
+try:
+    distinct(np.arange(5))
+    time.sleep(20.0)
+except signals.Stopped as stopped:
+    print(stopped.number)
+"""
+
+
+def test_a_signal_while_a_function_is_compiled_or_loaded_crashes_nothing(tmp_path: Path) -> None:
+    """LLVM goes on without a function whose loading raised an exception, and a call of it would crash."""
+    for _ in ("compiled", "loaded from the cache"):
+        ended = subprocess.run(
+            [sys.executable, "-c", LOAD],
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert (ended.returncode, ended.stdout.split(), ended.stderr) == (0, ["15"], "")
 
 
 CLAIM = """

@@ -113,7 +113,10 @@ def _smooth(stamps, z, r, density, out):
             for j in range(3):  # from the state before to this one, and what the position here leaves of it
                 A[j, i] = F[i, j] - P[i, 0] / r[k] * F[0, j]
         _transform(A, G, S)
-        x[:] = g
+        for i in range(3):
+            x[i] = g[
+                i
+            ]  # as a slice, it is compiled for two seconds: numba writes an error for unequal shapes
         for i in range(3):
             g[i] = F[0, i] * offs[k] / totals[k]
             for j in range(3):

@@ -7,6 +7,8 @@ from numba import int32, njit
 from numpy.typing import NDArray
 
 GROUND_CELL_M = 1.0
+FARTHEST_CELL = 2**31 - 1
+"""Index of no cell, beyond all that are."""
 
 
 def height_over_ground(p_map: NDArray[np.float64], cell_m: float = GROUND_CELL_M) -> NDArray[np.float64]:
@@ -59,14 +61,17 @@ def _cells(p_map, size_m):
     The grid has a margin of one cell, so that every cell with a point has eight neighbours.
     """
     n = len(p_map)
-    east, north = np.empty(n, np.int32), np.empty(n, np.int32)
+    x, y = np.empty(n, np.int32), np.empty(n, np.int32)
+    west = south = FARTHEST_CELL
+    east = north = -FARTHEST_CELL
     for i in range(n):
-        east[i], north[i] = int32(np.floor(p_map[i, 0] / size_m)), int32(np.floor(p_map[i, 1] / size_m))
-    west, south = east.min() - 1, north.min() - 1
-    length, width = east.max() - west + 2, north.max() - south + 2
+        x[i], y[i] = int32(np.floor(p_map[i, 0] / size_m)), int32(np.floor(p_map[i, 1] / size_m))
+        west, south = min(west, x[i]), min(south, y[i])
+        east, north = max(east, x[i]), max(north, y[i])
+    length, width = east - west + 3, north - south + 3
     for i in range(n):
-        east[i] = (east[i] - west) * width + north[i] - south
-    return east, length, width
+        x[i] = (x[i] - west + 1) * width + y[i] - south + 1
+    return x, length, width
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

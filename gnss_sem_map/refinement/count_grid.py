@@ -186,11 +186,15 @@ def _count(keys, labels, votes, cell, layer, reach, counts):
 def _count_slab(keys, labels, votes, cell, layer, reach, ends, counts):
     runs = len(ends) - 1
     y, z = np.empty(runs, np.int64), np.empty(runs, np.int64)
+    low_y = low_z = AXIS_MASK
+    high_y = high_z = 0
     for run in range(runs):
         y[run] = ((keys[ends[run]] >> AXIS_BITS) & AXIS_MASK) // cell
         z[run] = (keys[ends[run]] & AXIS_MASK) // layer
-    low_y, low_z = y.min(), z.min() - reach
-    grid = np.zeros((y.max() - low_y + 1, z.max() + reach - low_z + 1), np.int64)
+        low_y, high_y = min(low_y, y[run]), max(high_y, y[run])
+        low_z, high_z = min(low_z, z[run]), max(high_z, z[run])
+    low_z -= reach
+    grid = np.zeros((high_y - low_y + 1, high_z + reach - low_z + 1), np.int64)
     for run in range(runs):
         pair = int64(0)
         for label in labels[ends[run] : ends[run + 1]]:

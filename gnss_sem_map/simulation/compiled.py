@@ -2,8 +2,8 @@
 
 They are compiled once, kept on disk, and run without the interpreter's lock. They allocate nothing, so reference counts
 are switched off: counting alone would double the time of a ray and make threads wait for each other. No fastmath: the
-same operations in the same order give the same bits everywhere. What takes a whole scene is `merged` into its caller:
-handing over a hundred words costs more than a normal.
+same operations in the same order give the same bits everywhere. What is small, and what takes a whole scene, is
+`inlined` by LLVM: handing over a hundred words costs more than a normal. (Inlined by numba, it is compiled for longer.)
 """
 
 from collections.abc import Callable
@@ -29,8 +29,7 @@ class _Compile(Protocol):
 
 _OPTIONS: Final[dict[str, Any]] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}
 kernel: Final[_Compile] = njit(**_OPTIONS)
-inlined: Final[_Compile] = njit(**_OPTIONS, inline="always")
-merged: Final[_Compile] = njit(**_OPTIONS, forceinline=True)
+inlined: Final[_Compile] = njit(**_OPTIONS, forceinline=True)
 
 
 def kernel_of(signature: str) -> _Compile:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gnss_sem_map.simulation.compiled import Floats, inlined, kernel, merged
+from gnss_sem_map.simulation.compiled import Floats, inlined, kernel
 from gnss_sem_map.simulation.noise import uniform
 from gnss_sem_map.simulation.surfaces import Surface
 
@@ -70,7 +70,7 @@ def _span(streets: Floats, x: float) -> tuple[int, float, float]:
     return n, low, high
 
 
-@merged
+@inlined
 def inside_block(ground: Ground, u: float, v: float) -> tuple[float, int]:
     """Signed distance to the kerb, positive on the block; also the block's number."""
     i, u0, u1 = _span(ground.streets_u, u)
@@ -91,7 +91,7 @@ def ground_height(ground: Ground, x: float, y: float) -> float:
     return street_height(ground, x, y) + (ground.kerb_height if inside > 0.0 else 0.0)
 
 
-@merged
+@inlined
 def _sheet_hit(
     ground: Ground, lift: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> float:
@@ -116,7 +116,7 @@ def _sheet_hit(
     return second if second > 0.0 else FAR
 
 
-@merged
+@inlined
 def hit_ground(
     ground: Ground, best: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
 ) -> tuple[float, bool]:
@@ -181,7 +181,7 @@ def _marked(along: float, across: float, half: float, crossing: Floats) -> bool:
     return abs(lateral - (half - 2.15)) < 0.06 and uniform(7, int(np.floor(along / 0.7)), nearest, 0) < 0.9
 
 
-@merged
+@inlined
 def ground_surface(ground: Ground, x: float, y: float, kerb_face: bool) -> int:
     """Material of the ground at the hit point of a ray."""
     if kerb_face:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gnss_sem_map.simulation.compiled import Triple, merged
+from gnss_sem_map.simulation.compiled import Triple, inlined
 from gnss_sem_map.simulation.ground import ground_surface, height_gradient
 from gnss_sem_map.simulation.raycast import GROUND, KERB, Scene, into_thing
 from gnss_sem_map.simulation.shapes import shape_normal
@@ -20,7 +20,7 @@ for _surface, _kind in {
     _GROUND_KINDS[_surface] = _kind
 
 
-@merged
+@inlined
 def surface_at(
     scene: Scene,
     thing: int,

@@ -33,6 +33,9 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 LARGEST = 1e12
 """Largest stamp in s and length in m."""
 
+FARTHEST_M = 1e4
+"""What is so far from its truth on average is another drive, or has another origin."""
+
 AXES = ("lat_deg", "lon_deg", "alt_m")
 
 ONE_SECOND = 10
@@ -56,6 +59,7 @@ def score_run(
     if is_file(path):
         reference = _in_frame_of(out, read_tum(path), truth / "world.json")
         metrics["trajectory"] = score_trajectory(Trajectory.load(out / "trajectory.parquet"), reference)
+        _refuse_elsewhere(path, metrics["trajectory"]["ate_m"])
     amend(out, "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
     return metrics
 
@@ -146,6 +150,14 @@ def _in_frame_of(out: Path, poses: Trajectory, world: Path) -> Trajectory:
             f"{shown(world)}: expected the origin of the true poses, as {', '.join(AXES)}"
         ) from None
     return poses.moved(frames[0].pose_of(frames[1]))
+
+
+def _refuse_elsewhere(truth: Path, error_m: float) -> None:
+    if error_m > FARTHEST_M:
+        raise DataError(
+            f"{shown(truth)}: found poses {error_m / 1000:.0f} km from those of the run; expected the same drive,"
+            f" in the frame of its map or with the origin in {shown(truth.parent)}/world.json"
+        )
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, float]:

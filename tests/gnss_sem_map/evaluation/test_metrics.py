@@ -194,6 +194,11 @@ def test_the_truth_may_have_another_origin_than_the_map(tmp_path: Path) -> None:
     found = score_run(tmp_path, tmp_path / "truth")["trajectory"]
     assert found["ate_m"] == pytest.approx(0.0, abs=1e-5)
     assert found["tilt_rms_deg"] == pytest.approx(0.0, abs=1e-5)
+    before = (tmp_path / "metrics.json").read_bytes()
+    (tmp_path / "truth" / "world.json").write_text(json.dumps(asdict(LocalFrame(52.0, 8.4, 110.0))))
+    with pytest.raises(DataError, match=r"trajectory_lidar\.tum: found poses 33\d km from .*world\.json"):
+        score_run(tmp_path, tmp_path / "truth")
+    assert (tmp_path / "metrics.json").read_bytes() == before
     (tmp_path / "truth" / "world.json").write_text('{"lat_deg": 49}')
     with pytest.raises(DataError, match=r"world\.json: expected the origin"):
         score_run(tmp_path, tmp_path / "truth")

@@ -231,8 +231,12 @@ def print_preflight(name: str, page: Preflight, skips: Sequence[Skip], out: Path
         console.print(line, highlight=False)
         for more in filter(None, (found.mistake, found.remedy)):
             console.print(f"       {more}", highlight=False, markup=False)
+    alike: dict[tuple[str, str], list[Skip]] = {}
     for skip in skips:
-        console.print(f"left out: {skip.what}, {skip.where}: {skip.reason}", highlight=False, markup=False)
+        alike.setdefault((skip.what, skip.reason), []).append(skip)
+    for (what, reason), group in alike.items():
+        more = f" and {len(group) - 1} more" if len(group) > 1 else ""
+        console.print(f"left out: {what}, {group[0].where}{more}: {reason}", highlight=False, markup=False)
     console.print(f"results in {out}", highlight=False, markup=False)
 
 

@@ -26,9 +26,13 @@ def readers() -> dict[str, Any]:
 
 def detect_format(drive: Path) -> str:
     """Name of the format of a drive, by its files; raises DataError for what is no drive."""
-    of_file = [name for name, reader in readers().items() if drive.suffix in getattr(reader, "FILES", ())]
-    if of_file and not drive.is_dir() and is_file(drive):
-        return of_file[0]
+    endings = {ending: name for name, reader in readers().items() for ending in getattr(reader, "FILES", ())}
+    if not drive.is_dir() and is_file(drive):
+        if drive.suffix in endings:
+            return endings[drive.suffix]
+        raise DataError(
+            f"{shown(drive)}: found a file, expected the folder of a drive, or a file ending in {', '.join(endings)}"
+        )
     if not is_folder(drive):
         raise DataError(f"{shown(drive)}: no such folder; expected a drive")
     fitting = [name for name, reader in readers().items() if reader.is_drive(drive)]

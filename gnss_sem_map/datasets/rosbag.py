@@ -22,7 +22,7 @@ from factor_graphs.measurements import GnssFixes, ImuSamples, clean_gnss, clean_
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
-from gnss_sem_map.datasets.ros.bag import SUFFIXES, Bag, Messages, bag_files
+from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.rig import (
@@ -65,6 +65,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     if rig.imu is None or rig.gnss is None:
         raise roles.nothing_taken(bag, rig)
     imu = bag.messages(rig.imu.topic)
+    lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
     fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
     epoch_ns = int(fix_ns[0])
     gnss, frame, invalid = _usable(fixes, shown(drive))
@@ -94,7 +95,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*skips, *imu_skips, *calibration_skips, *image_skips),
+        skips=(*lost, *skips, *imu_skips, *calibration_skips, *image_skips),
     )
 
 

@@ -40,7 +40,7 @@ class BagWriter:
         self._types, self._connections = self._store.types, dict[str, Any]()
         if is_ros1:
             folder.mkdir(parents=True)
-            self._writer: Any = Writer1(folder / f"{folder.name.partition('.')[0]}.bag")
+            self._writer: Any = Writer1(folder / f"{folder.name}.bag")
         else:
             self._writer = Writer2(folder, version=ROS2_VERSION, storage_plugin=StoragePlugin.MCAP)
 

@@ -60,7 +60,7 @@ def rewrite(drive: Path, out: Path, layout: Layout, progress: Progress | None = 
     target = out / drive.name.removesuffix("_sync")
     refuse_there(target)
     log = kitti_raw.read(drive)
-    partial = drive.parent / f"{target.name}.{layout}"
+    partial = drive.parent / layout / target.name  # a bag names its files by its folder
     if layout == "table":
         _write_table(drive, log, partial, progress)
     else:
@@ -69,6 +69,7 @@ def rewrite(drive: Path, out: Path, layout: Layout, progress: Progress | None = 
         shutil.copytree(drive / TRUTH, partial / TRUTH)
     out.mkdir(parents=True, exist_ok=True)
     shutil.move(partial, target)
+    partial.parent.rmdir()
     return target
 
 

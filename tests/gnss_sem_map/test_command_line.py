@@ -16,10 +16,12 @@ from street import Street
 
 from gnss_sem_map import simulation
 from gnss_sem_map.cli import app
-from gnss_sem_map.cli.console import print_run
+from gnss_sem_map.cli.console import print_preflight, print_run
 from gnss_sem_map.datasets import readers
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.evaluation.preflight.findings import Preflight
 from gnss_sem_map.runs import expected_cost
+from gnss_sem_map.sensor_log import Skip
 
 pytestmark = pytest.mark.integration
 
@@ -249,6 +251,16 @@ def test_a_drive_that_is_there_is_refused_before_anything_is_simulated(
     words = ["simulate", "-o", str(tmp_path), "--seed", "31", "--session", "1", "--layout", layout]
     with pytest.raises(DataError, match="2026_04_19_drive_0031: is already there"):
         typer.testing.CliRunner().invoke(app, words, catch_exceptions=False)
+
+
+def test_what_is_left_out_for_one_reason_is_one_line_of_the_check(capsys: pytest.CaptureFixture[str]) -> None:
+    skips = [Skip("scan", f"frame {number}", "repeated stamp") for number in (7, 8, 9)]
+    skips.insert(1, Skip("image", "frame 7", "repeated stamp"))
+    print_preflight("drive", Preflight((), 0.0), skips, Path("check.html"))
+    assert capsys.readouterr().out.splitlines()[1:-1] == [
+        "left out: scan, frame 7 and 2 more: repeated stamp",
+        "left out: image, frame 7: repeated stamp",
+    ]
 
 
 def test_the_summary_counts_frames_that_are_skipped_not_their_entries(

@@ -26,6 +26,8 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
 WHOLE_FILE = ".zstd"
 """Ending of the files of a bag that was compressed file by file."""
+NOT_CLOSED = ".active"
+"""Ending of the file that a recorder of ROS 1 writes to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,10 @@ class Bag:
         if find_spec("rosbags") is None:
             raise DataError(f"{shown(path)}: ROS bags need rosbags; {how_to_install('ros')}")
         self.is_ros1 = suffixes == [".bag"]
-        codec = "" if self.is_ros1 else _message_codec(path)
+        about = {} if self.is_ros1 else _metadata(path)
+        codec = _message_codec(about)
+        self.lost = _lost(about, names)
+        """Names of the files that the bag's metadata list, and that are not there."""
         self._files: list[BagFile] = [_opened(name, codec) for name in names]
         self.kinds = self._kinds()
 
@@ -121,18 +126,39 @@ def bag_files(path: Path) -> list[Path]:
             f"{shown(path)}: is compressed as whole files ({shown(packed[0])}), which cannot be read in parts; expand"
             f" it once: zstd -d --rm {shown(packed[0])}, and remove compression_mode from {METADATA}"
         )
+    opened = [one.name for one in found if one.suffix == NOT_CLOSED and Path(one.stem).suffix in SUFFIXES]
+    if opened:
+        name, closed = shown(opened[0]), shown(Path(opened[0]).stem)
+        raise DataError(
+            f"{shown(path)}: holds a part that its recorder did not close ({name}); repair it: rosbag reindex {name};"
+            f" mv {name} {closed}"
+        )
     return [one for one in found if one.suffix in SUFFIXES and is_file(one)]
 
 
-def _message_codec(path: Path) -> str:
-    """How single messages are compressed, as the metadata of a ROS 2 bag say; empty: not at all."""
+def _metadata(path: Path) -> dict[str, Any]:
+    """The metadata of a ROS 2 bag; empty where there are none."""
     if not path.is_dir() or not is_file(path / METADATA):
-        return ""
+        return {}
     about: Any = read_yaml(path / METADATA)
     about = about.get("rosbag2_bagfile_information") if isinstance(about, dict) else None
-    if not isinstance(about, dict) or str(about.get("compression_mode") or "").lower() != "message":
+    return about if isinstance(about, dict) else {}
+
+
+def _message_codec(about: dict[str, Any]) -> str:
+    """How single messages are compressed, by a bag's metadata; empty: not at all."""
+    if str(about.get("compression_mode") or "").lower() != "message":
         return ""
     return str(about.get("compression_format") or "")
+
+
+def _lost(about: dict[str, Any], files: list[Path]) -> list[str]:
+    """Names of the parts that a bag's metadata list, but for those that are there, perhaps expanded since."""
+    listed, there = about.get("relative_file_paths"), {file.name for file in files}
+    if not isinstance(listed, list):
+        return []
+    names = [Path(str(name)).name.removesuffix(WHOLE_FILE) for name in listed]
+    return [shown(name) for name in names if name not in there]
 
 
 def _opened(path: Path, codec: str) -> BagFile:

@@ -53,7 +53,8 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
         taken = TAKEN_FOR.get(kind, "")
         messages = bag.messages(name)
         steps = np.diff(messages.received_ns) * 1e-9
-        usual = float(np.median(steps)) if len(steps) else 0.0
+        later = steps[steps > 0]  # of messages that are there twice, one has no step
+        usual = float(np.median(later)) if len(later) else 0.0
         gaps = steps[steps > GAP_STEPS * usual] if len(steps) > 2 else steps[:0]
         is_sensor = taken in roles.KINDS and len(messages) > 0
         frame, notes = _looked_into(bag, messages, taken, transforms) if is_sensor else ("", [])
@@ -90,8 +91,9 @@ def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
         parts.append(f"{key}:" if of[sensor] else f"{key}: {{}}")
         for name, topic in _named(of[sensor]).items():
             about: dict[str, Any] = {"topic": topic.name} | _stamps(topic)
-            if sensor == "camera":
-                about["info"] = roles.info_beside(bag, topic.name)
+            info = roles.info_beside(bag, topic.name) if sensor == "camera" else None
+            if info is not None:
+                about["info"] = info
             parts += _noted(topic, _yaml({name: about}), indent="  ")
     return "\n".join(parts) + "\n"
 
@@ -111,6 +113,8 @@ def _looked_into(
         notes.append("its covariance is unknown: set stddevs_m")
     if taken == "camera" and messages.kind == pictures.RAW and first.encoding not in pictures.CHANNELS:
         notes.append(f"encoding {first.encoding} is not read: rgb8, bgr8 or mono8")
+    if taken == "camera" and roles.info_beside(bag, messages.topic) is None:
+        notes.append("no CameraInfo topic beside it: set info, or K and image_size")
     if taken in ("LiDAR", "camera") and frame not in transforms.frames:
         notes.append(f"its frame {frame!r} is not in {TF_STATIC}: set frame or the pose")
     return frame, notes
@@ -125,7 +129,10 @@ def _stamp_notes(bag: Bag, messages: Messages) -> list[str]:
     if np.ptp(late) > LATE_S:
         return [f"header stamps jump by {np.ptp(late):.1f} s against the arrivals"]
     if abs(float(np.median(late))) > LATE_S:
-        return [f"header stamps are {np.median(late):.1f} s before the arrivals: is it another clock?"]
+        off, side = float(np.median(late)), "before" if np.median(late) > 0 else "after"
+        return [
+            f"header stamps are {abs(off):.1f} s {side} the arrivals: another clock than that of other topics?"
+        ]
     return []
 
 

@@ -53,7 +53,7 @@ class McapFile:
         except (ReaderError, *DAMAGED) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not closed ({one_line(error, 120)}); repair it: mcap recover"
-                f" {shown(path.name)} -o repaired.mcap"
+                f" {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             ) from None
         self._codecs = [chunk.compression for chunk in chunks]
         self.topics = {one.topic: one.msgtype for one in connections}
@@ -65,7 +65,7 @@ class McapFile:
         if indexed < expected:
             raise DataError(
                 f"{shown(path)}: not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
-                f" recover {shown(path.name)} -o repaired.mcap"
+                f" recover {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             )
 
     def index(self, topic: str) -> tuple[Ints, Ints]:

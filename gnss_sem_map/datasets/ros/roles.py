@@ -72,10 +72,10 @@ def info_beside(bag: Bag, topic: str) -> str | None:
 
 def nothing_taken(bag: Bag, rig: Rig) -> DataError:
     """The error that there is no IMU or no receiver."""
-    what = "IMU (sensor_msgs/Imu)" if rig.imu is None else "receiver (sensor_msgs/NavSatFix)"
+    what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
     return DataError(
-        f"{shown(bag.path)}: found no topic of an {what}; it has {found}; set it, or a file of positions (gnss.file),"
+        f"{shown(bag.path)}: found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file),"
         " in rig.yaml"
     )
 
@@ -106,7 +106,13 @@ def _check(bag: Bag, rig: Rig) -> None:
 
 
 def _check_kind(bag: Bag, place: str, topic: str, kinds: Iterable[str]) -> None:
-    kind = bag.messages(topic).kind
+    kind = bag.kinds.get(topic)
+    if kind is None:
+        fitting = sorted(name for name, one in bag.kinds.items() if one in kinds)
+        raise DataError(
+            f"rig.yaml: {place}: {shown(bag.path)} has no topic {topic[:100]!r}, expected one of"
+            f" {' or '.join(kinds)}: {', '.join(fitting)[:500] or 'there is none'}; correct or remove it in rig.yaml"
+        )
     if kind not in kinds:
         raise DataError(
             f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)}; `gnss-sem-map inspect` lists the"

@@ -48,7 +48,7 @@ class Ros1File:
         ) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not indexed ({one_line(error, 120)}); repair it: rosbag reindex"
-                f" {shown(path.name)}"
+                f" {shown(path.name)}, and move the copy that it leaves (.orig.bag) to another folder"
             ) from None
         try:
             self.topics = {one.topic: one.msgtype for one in reader.connections}

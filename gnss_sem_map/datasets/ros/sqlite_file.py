@@ -62,7 +62,7 @@ class SqliteFile:
     def _damaged(self, error: Exception) -> DataError:
         return DataError(
             f"{shown(self.path)}: truncated, damaged or no bag ({error}); repair it: sqlite3 {shown(self.path.name)}"
-            " .recover | sqlite3 repaired.db3"
+            f" .recover | sqlite3 repaired.db3, and move {shown(self.path.name)} to another folder"
         )
 
 

@@ -9,6 +9,12 @@ from typing import Any
 from factor_graphs.smoothing import Solution
 from gnss_sem_map.errors import DataError
 
+ONE_CLOCK = (
+    "give all stamps in seconds of one clock; of a topic of a bag, `stamps: received` in rig.yaml takes the times of"
+    " arrival"
+)
+"""The remedy where one sensor has another clock than the others."""
+
 
 class Level(StrEnum):
     """Severity of a finding: green is good, amber is doubtful, red would make a wrong map."""

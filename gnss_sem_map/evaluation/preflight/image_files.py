@@ -6,7 +6,7 @@ import numpy as np
 
 from gnss_sem_map.errors import DataError, ImageSizeError
 from gnss_sem_map.evaluation.preflight.camera_sample import CameraSample
-from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.findings import ONE_CLOCK, Finding, amber, green, red
 
 SIZE, CLOCK = "image size", "image stamps"
 LOOKED_AT = 3
@@ -69,7 +69,7 @@ def _clock(sample: CameraSample) -> Finding:
         return red(
             CLOCK, found,
             f"image stamps are of another clock, about {exposed[0] - scans[0]:+.1f} s off, or of another drive",
-            "give all stamps on one clock",
+            ONE_CLOCK,
         )  # fmt: skip
     inside = (scans >= exposed[0] - 0.1) & (scans <= exposed[-1] + 0.1)
     if inside.any() and float((nearest[inside] <= 2 * settings.image_within_s).mean()) < 0.5:

@@ -15,7 +15,7 @@ from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.evaluation.preflight import poses
 from gnss_sem_map.evaluation.preflight.clocks import FARTHEST_S, LEAP_S
 from gnss_sem_map.evaluation.preflight.diagnosis import Diagnosis
-from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.findings import ONE_CLOCK, Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.fixes import Fixes
 from gnss_sem_map.evaluation.preflight.lever_arm import check_lever_arm
 from gnss_sem_map.evaluation.preflight.sample import Sample
@@ -126,7 +126,7 @@ def _with_imu(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> Iterat
             "GNSS with IMU",
             f"{error}; stamps of fixes: {times}",
             "fixes and IMU have other clocks, other units of stamps, or are of other drives",
-            "give the stamps of both in seconds of one clock",
+            ONE_CLOCK,
         )
 
 

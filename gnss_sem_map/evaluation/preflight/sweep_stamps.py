@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.findings import ONE_CLOCK, Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.sample import Sample
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ def check(sample: Sample) -> Iterator[Finding]:
             f"scans are of {scans[0].stamp:.1f} to {scans[-1].stamp:.1f} s,"
             f" what tells the motion is of {moving[0]:.1f} to {moving[1]:.1f} s",
             "scan stamps are of another clock, or of another drive",
-            "give all stamps on one clock",
+            ONE_CLOCK,
         )
         return
     stamps = np.array([scan.stamp for scan in scans])

@@ -94,6 +94,7 @@ def test_the_truth_goes_with_the_drive_and_nothing_is_overwritten(
     made = write_in_layout(tmp_path, "mcap", simulate)
     assert made == tmp_path / "2011_09_26_drive_0999"
     assert (made / "truth" / "world.json").read_text() == "{}"
+    assert [path.name for path in made.glob("*.mcap")] == [f"{made.name}.mcap"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [made.name]
     with pytest.raises(DataError, match="is already there"):
         write_in_layout(tmp_path, "mcap", simulate)

@@ -53,6 +53,32 @@ def test_what_would_stop_a_run_is_noted(tmp_path: Path) -> None:
     assert found["/imu_without_clock"].notes == ("5 of 5 header stamps are zero: set stamps: received",)
 
 
+@pytest.mark.parametrize(("off_s", "says"), [(-18, "18.0 s before"), (18, "18.0 s after")])
+def test_the_side_on_which_another_clock_lies_is_told(tmp_path: Path, off_s: int, says: str) -> None:
+    rig = ros.Rig()
+    for k in range(50):
+        rig.imu(START_NS + k * 10_000_000, START_NS + k * 10_000_000 + off_s * 10**9)
+    [note] = topics_of(ros.write(tmp_path / "drive", rig))["/imu"].notes
+    assert f"header stamps are {says} the arrivals" in note
+
+
+def test_messages_that_are_there_twice_have_the_rate_of_one_and_no_gaps(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.messages = [one for one in rig.messages for _ in range(2)]
+    imu = topics_of(ros.write(tmp_path / "drive", rig))["/imu"]
+    assert (imu.messages, imu.rate_hz, imu.gaps) == (402, pytest.approx(100.0), 0)
+
+
+def test_a_camera_without_calibration_is_noted_as_it_stops_a_run(tmp_path: Path) -> None:
+    rig = ros.drive()
+    rig.image(START_NS, np.zeros((4, 6, 3), np.uint8), "rgb8")
+    path = ros.write(tmp_path / "drive", rig)
+    notes = topics_of(path)["/image_rect"].notes
+    assert notes[0] == "no CameraInfo topic beside it: set info, or K and image_size"
+    with pytest.raises(DataError, match=r"/image_rect: no CameraInfo topic beside it; set `info:`, or K"):
+        open_drive(path)
+
+
 def test_the_suggested_rig_reads_the_bag(tmp_path: Path) -> None:
     path = ros.write(tmp_path / "drive", ros.drive())
     before, bag = open_drive(path), Bag(path)

@@ -19,6 +19,7 @@ from ros import START_NS, rig_yaml, sweep, with_camera
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.errors import DataError, PointTimesError
+from gnss_sem_map.sensor_log import Skip
 
 TIMES = np.linspace(-0.05, 0.05, 64)
 
@@ -178,7 +179,15 @@ def test_a_topic_of_another_type_than_said(plain: Path, tmp_path: Path) -> None:
     ):
         open_drive(bag)
     rig_yaml(bag, lidars={"lidar": {"topic": "/nowhere"}})
-    with pytest.raises(DataError, match=r"no topic '/nowhere'; it has /fix, /imu, /points"):
+    with pytest.raises(
+        DataError,
+        match=r"rig.yaml: lidars.lidar: .*drive has no topic '/nowhere', expected one of .*: /points; ",
+    ):
+        open_drive(bag)
+    rig_yaml(bag, cameras={"front": {"topic": "/nowhere"}})
+    with pytest.raises(
+        DataError, match=r"cameras.front: .*'/nowhere', .*: there is none; correct or remove it"
+    ):
         open_drive(bag)
     rig_yaml(bag, lidar={"topic": "/points"})
     with pytest.raises(DataError, match=r"rig.yaml: lidar: Extra inputs"):
@@ -330,3 +339,41 @@ def test_a_bag_without_imu_lists_what_it_has(tmp_path: Path) -> None:
     bag = ros.write(tmp_path / "drive", rig, keep=lambda one: one[0] != "/imu")
     with pytest.raises(DataError, match=r"no topic of an IMU \(sensor_msgs/Imu\); it has /fix"):
         open_drive(bag)
+
+
+def test_a_part_that_the_recorder_did_not_close_is_not_passed_over(plain: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    ros.write(folder / "drive_0.bag", ros.drive(is_ros1=True), "bag")
+    assert open_drive(folder).skips == ()
+    (folder / "drive_1.bag.active").write_bytes(b"")
+    with pytest.raises(
+        DataError, match=r"rosbag reindex drive_1.bag.active; mv drive_1.bag.active drive_1.bag"
+    ):
+        open_drive(folder)
+    with pytest.raises(DataError, match=r"found a file, expected .* a file ending in .bag, .mcap, .db3"):
+        open_drive(folder / "drive_1.bag.active")
+
+
+def test_a_part_that_the_metadata_list_and_that_is_not_there_is_told(plain: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(plain, bag)
+    assert open_drive(bag).skips == ()
+    about = (bag / "metadata.yaml").read_text()
+    assert about.count("- drive.mcap") == 1
+    (bag / "metadata.yaml").write_text(about.replace("- drive.mcap", "- drive.mcap\n  - parts/drive_1.mcap"))
+    assert open_drive(bag).skips == (
+        Skip("part of the bag", "drive_1.mcap", "metadata.yaml lists it, and it is not there"),
+    )
+
+
+def test_a_bag_that_was_repaired_by_its_advice_is_a_drive(plain: Path, tmp_path: Path) -> None:
+    """A repair leaves two files: the advice says what becomes of the damaged one."""
+    bag, whole = tmp_path / "drive", next(plain.glob("*.mcap")).read_bytes()
+    bag.mkdir()
+    (bag / "drive.mcap").write_bytes(whole[:-40])
+    (bag / "repaired.mcap").write_bytes(whole)
+    with pytest.raises(DataError, match=r"-o repaired.mcap, and move drive.mcap to another folder"):
+        open_drive(bag)
+    (bag / "drive.mcap").rename(tmp_path / "drive.mcap")
+    assert len(open_drive(bag).scans) == 10

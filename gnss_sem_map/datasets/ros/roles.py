@@ -97,9 +97,15 @@ def _check(bag: Bag, rig: Rig) -> None:
         *((f"lidars.{name}", "LiDAR", one.topic) for name, one in rig.lidars.items()),
         *((f"cameras.{name}", "camera", one.topic) for name, one in rig.cameras.items()),
     ]
+    places: dict[str, str] = {}
     for place, sensor, topic in named:
         if topic is not None:
             _check_kind(bag, place, topic, KINDS[sensor])
+            if places.setdefault(topic, place) != place:
+                raise DataError(
+                    f"rig.yaml: {place}: {topic} is {places[topic]} already, and would count twice; correct or remove"
+                    " one of them"
+                )
     for name, camera in rig.cameras.items():
         if camera.info is not None:
             _check_kind(bag, f"cameras.{name}.info", camera.info, (INFO,))

@@ -8,13 +8,15 @@ corrects it.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.evaluation.preflight import camera, inertial, lidar_pair, positions, sweeps, wheels
-from gnss_sem_map.evaluation.preflight.findings import Preflight
+from gnss_sem_map.evaluation.preflight.findings import Finding, Preflight
 from gnss_sem_map.evaluation.preflight.sample import Sample
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 from gnss_sem_map.thread_pools import thread_pool, unless_left
 
 
@@ -31,5 +33,17 @@ def check(
     _ = sample.trajectory  # most checks need it: known before they run side by side
     with thread_pool(2) as pool:
         found = list(pool.map(lambda group: unless_left(lambda: tuple(group.check(sample))), groups))
-    findings = tuple(finding for some in found for finding in some)
+    chosen = SensorConventions() if log.conventions is None else settings.sensors.over(log.conventions)
+    findings = tuple(_on_top(finding, chosen) for some in found for finding in some)
     return Preflight(findings, time.perf_counter() - start, sample.whole_solution)
+
+
+def _on_top(finding: Finding, chosen: SensorConventions) -> Finding:
+    """The finding; a remedy for what is set says so: the checks look at what the settings have made of the data."""
+    is_set = chosen.model_dump(exclude_none=True).items()
+    named = [f"{key}: {value}" for key, value in is_set if f"set {key}: " in finding.remedy]
+    if not named:
+        return finding
+    return replace(
+        finding, remedy=f"{finding.remedy}; this is on top of {' and '.join(named)}, which is set now"
+    )

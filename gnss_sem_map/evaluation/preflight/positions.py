@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.measurements import BREAK_S, GnssFixes, ImuSamples
 from factor_graphs.problem import usable_fixes
 from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.evaluation.preflight import poses
@@ -55,6 +55,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     yield _movement(log.gnss, found)
     if log.imu is not None:
         yield from _with_imu(log.gnss, log.imu, sample.settings.trajectory.max_speed_mps)
+        yield from _break(log.gnss, log.imu)
     yield _frozen(log.gnss, found)
     yield _accuracy(log, log.gnss)
     if sample.diagnosis is not None:
@@ -128,6 +129,24 @@ def _with_imu(fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float) -> Iterat
             "fixes and IMU have other clocks, other units of stamps, or are of other drives",
             ONE_CLOCK,
         )
+
+
+def _break(fixes: GnssFixes, imu: ImuSamples) -> Iterator[Finding]:
+    """A finding where nothing was measured for so long that what follows is another drive."""
+    # fixes outside of the IMU's span may be of another clock
+    within = (fixes.stamps > imu.stamps[0]) & (fixes.stamps < imu.stamps[-1])
+    stamps = np.sort(np.concatenate([fixes.stamps[within], imu.stamps]))
+    steps = np.diff(stamps)
+    if not (steps > BREAK_S).any():
+        return
+    k = int(steps.argmax())
+    yield red(
+        "break",
+        f"there is neither a fix nor an IMU sample for {steps[k]:.0f} s, from {stamps[k]:.1f} to {stamps[k + 1]:.1f} s;"
+        f" expected at most {BREAK_S:g} s",
+        "the log holds several drives, and nothing tells the motion between them",
+        "give each of them a folder or file of its own, and map them together: gnss-sem-map run DRIVE DRIVE -o OUT",
+    )
 
 
 def _frozen(fixes: GnssFixes, found: Fixes) -> Finding:

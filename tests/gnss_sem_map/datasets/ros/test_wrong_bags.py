@@ -341,6 +341,16 @@ def test_a_bag_without_imu_lists_what_it_has(tmp_path: Path) -> None:
         open_drive(bag)
 
 
+def test_a_topic_that_is_named_twice_is_refused_as_it_would_count_twice(plain: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "drive"
+    shutil.copytree(plain, bag)
+    rig_yaml(bag, lidars={name: {"topic": "/points"} for name in ("top", "rear")})
+    with pytest.raises(
+        DataError, match=r"rig.yaml: lidars.rear: /points is lidars.top already, and would count"
+    ):
+        open_drive(bag)
+
+
 def test_a_part_that_the_recorder_did_not_close_is_not_passed_over(plain: Path, tmp_path: Path) -> None:
     folder = tmp_path / "drive"
     folder.mkdir()

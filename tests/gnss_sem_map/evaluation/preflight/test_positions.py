@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sensor_drives import FRAME, LEVER, drive, findings, wrong
+from sensor_drives import FRAME, LEVER, SETTINGS, drive, findings, wrong
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.evaluation.preflight import check
 from gnss_sem_map.evaluation.preflight.findings import Level
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
@@ -76,6 +77,18 @@ def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s
     assert wrong(findings(late, SensorConventions(gnss_time_offset_s=offset))) == []
 
 
+def test_a_remedy_says_on_top_of_what_it_comes(right: SensorLog) -> None:
+    """The checks look at what the settings have made: set as it stands, the remedy would undo them."""
+    settings = SETTINGS.changed("sensors.gnss_time_offset_s=1.0", "sensors.imu_axes=frd")
+    said = [finding.remedy for finding in check(right, settings).findings]
+    assert "set imu_axes: frd; this is on top of imu_axes: frd, which is set now" in said
+    [clock] = [remedy for remedy in said if "gnss_time_offset_s" in remedy]
+    found, _, told = clock.partition("; this is on top of ")
+    assert float(found.split("gnss_time_offset_s: ")[1]) == pytest.approx(-1.0, abs=0.2)
+    assert told == "gnss_time_offset_s: 1.0, which is set now"
+    assert not any("on top of" in finding.remedy for finding in check(right, SETTINGS).findings)
+
+
 @pytest.mark.parametrize("stamps", [lambda t: 1000 * t + 200, lambda t: t + 86400])
 def test_fixes_of_another_time_than_the_imu_are_red(
     right: SensorLog, stamps: Callable[[Array], Array]
@@ -86,7 +99,27 @@ def test_fixes_of_another_time_than_the_imu_are_red(
     [said] = [each for each in findings(apart) if each.check == "GNSS with IMU"]
     assert said.level is Level.RED
     assert "0 usable GNSS fixes" in said.evidence
+    assert not [each for each in findings(apart) if each.check == "break"], "another clock is no other drive"
     assert not [each for each in findings(right) if each.check == "GNSS with IMU"]
+
+
+@pytest.mark.parametrize(("pause_s", "says"), [(500.0, 0), (700.0, 1)])
+def test_two_drives_in_one_log_are_told(right: SensorLog, pause_s: float, says: int) -> None:
+    """Bags of two drives in one folder: smoothed as one, they take all memory, or the optimiser fails."""
+    assert right.imu is not None
+    fixes, imu = fixes_of(right), right.imu
+
+    def later(stamps: Array) -> Array:
+        return stamps + pause_s * (stamps >= 60.0)
+
+    paused = replace(
+        right,
+        gnss=GnssFixes(later(fixes.stamps), fixes.positions, fixes.stddevs),
+        imu=ImuSamples(later(imu.stamps), imu.specific_force, imu.angular_rate),
+    )
+    found = [each for each in findings(paused) if each.check == "break"]
+    assert [each.level for each in found] == [Level.RED] * says
+    assert all("several drives" in each.mistake and "run DRIVE DRIVE" in each.remedy for each in found)
 
 
 @pytest.mark.parametrize(("start", "seconds"), [(20.0, 10.0), (30.0, 30.0), (80.0, 60.0), (0.0, 200.0)])

@@ -28,6 +28,10 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=3, help="number of drives (default: 3)")
     parser.add_argument("--seconds", type=float, default=300.0, help="length of each (default: 300)")
     chosen = parser.parse_args()
+    if chosen.drives < 1 or chosen.seconds < OUTAGE_S + 20:
+        parser.error(
+            f"expected --drives of 1 or more, and --seconds of {OUTAGE_S + 20:g} or more, around the outage"
+        )
 
     figures = defaultdict(list)
     for seed in range(chosen.drives):

@@ -25,6 +25,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=120.0, help="length of the drive (default: 120)")
     parser.add_argument("--lag", type=float, default=10.0, help="how far back fixes correct, s (default: 10)")
     chosen = parser.parse_args()
+    if chosen.seconds < BEGIN_S + 5:
+        parser.error(
+            f"--seconds: found {chosen.seconds:g}, expected {BEGIN_S + 5:g} or more: the first are smoothed"
+        )
 
     rng = np.random.default_rng(1)
     motion = random_drive(chosen.seconds, rng)

@@ -16,7 +16,7 @@ from gnss_sem_map.simulation import Simulation, prepare
 
 
 def main() -> None:
-    """Render every so manieth image of 30 s in each street."""
+    """Render every n-th image of 30 s in each street."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("first", type=int, help="first seed")
@@ -25,6 +25,8 @@ def main() -> None:
         "--every", type=int, default=15, help="frames from one image to the next (default: 15)"
     )
     chosen = parser.parse_args()
+    if chosen.last < chosen.first or chosen.every < 1:
+        parser.error("expected a last seed from the first on, and --every of 1 or more")
     for kind in ("images", "labels"):
         (chosen.folder / kind).mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor() as pool:

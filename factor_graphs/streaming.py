@@ -40,7 +40,8 @@ class StreamedState:
 class StreamingSmoother:
     """Fixed-lag smoother that follows a vehicle online, from where a batch solution of its first seconds ends.
 
-    `start` gives the first state, its covariance and the IMU noise; `p_imu_antenna` (3,) m is the lever arm.
+    `start` gives the first state, its covariance and the IMU noise; `p_imu_antenna` (3,) m is the lever arm. Raises
+    MeasurementError when `lag_s` is below 0.
     `state` is the newest one, `restarts` counts how often the solver had to start again, and `unbound` the
     relative poses left out because their earlier moment is no keyframe within the lag.
     """
@@ -52,6 +53,8 @@ class StreamingSmoother:
         p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
         lag_s: float = 10.0,
     ) -> None:
+        if not lag_s >= 0:
+            raise MeasurementError(f"lag_s: found {lag_s}, expected a number of seconds from 0 on")
         self.restarts = self.unbound = 0
         self._frame, self._lag_s = frame, lag_s
         self._lever = np.asarray(p_imu_antenna, dtype=np.float64)

@@ -42,3 +42,22 @@ def test_smoothing_beats_filtering_and_the_graph_beats_both(printed) -> None:
     for falling in (horizontal, lost, heading):
         assert (np.diff(falling) < 0).all()
     assert (inside > 60).all()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "streaming.py --seconds 31",
+        "kalman_baseline.py --seconds 60",
+        "kalman_baseline.py --drives 0",
+        "training_images.py streets 3 2",
+        "training_images.py streets 1 1 --every 0",
+    ],
+)
+def test_an_example_refuses_what_would_give_no_figures(
+    printed, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        printed(*line.split())
+    assert list(tmp_path.iterdir()) == []

@@ -77,3 +77,12 @@ def test_what_does_not_follow_on_the_last_state_is_refused(simulate):
     late = GnssFixes(np.array([1000.0]), np.zeros((1, 3)), np.ones((1, 3)))
     with pytest.raises(MeasurementError, match="the IMU from there to the fix"):
         online.add(cut(drive.imu, online.state.stamp, drive.imu.stamps[-1]), late)
+
+
+@pytest.mark.parametrize("lag_s", [-1.0, np.nan])
+def test_a_lag_that_is_no_time_is_refused_not_met_by_gtsam(simulate, lag_s: float):
+    drive = simulate(93, seconds=40.0, noise=ImuNoise())
+    early = drive.fixes[drive.fixes.stamps < BEGIN_S]
+    start = smooth(cut(drive.imu, 0.0, BEGIN_S), early, FRAME, None, LEVER)
+    with pytest.raises(MeasurementError, match=r"lag_s: found .*, expected a number of seconds from 0 on"):
+        StreamingSmoother(start, FRAME, LEVER, lag_s=lag_s)

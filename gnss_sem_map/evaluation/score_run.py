@@ -43,7 +43,10 @@ ONE_SECOND = 10
 
 
 def score_run(
-    out: Path, truth: Path, label_set: LabelSet | None = None, restrict_to: Path | None = None
+    out: Path | str,
+    truth: Path | str,
+    label_set: LabelSet | None = None,
+    restrict_to: Path | None = None,
 ) -> dict[str, Any]:
     """Scores of a run folder, in the layout of `metrics.json`; also written to it.
 
@@ -52,6 +55,7 @@ def score_run(
     `--origin` and maps of several drives have another). `label_set` is that of the run's settings unless given.
     `restrict_to`: only points labelled there. Raises DataError.
     """
+    out, truth = Path(out), Path(truth)
     _check_scorable(out)
     label_set = label_set or open_label_set(config.load(out / "config.yaml").classes)
     metrics = read_json(out / "metrics.json") | _score_points(out, truth, label_set, restrict_to)

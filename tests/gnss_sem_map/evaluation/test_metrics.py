@@ -174,7 +174,7 @@ def write_scored_run(folder: Path) -> None:
 
 def test_restricted_to_some_points_every_figure_is_of_these_alone(tmp_path: Path) -> None:
     write_scored_run(tmp_path)
-    everything = score_run(tmp_path, tmp_path / "truth")
+    everything = score_run(str(tmp_path), str(tmp_path / "truth"))
     assert (everything["semantics"]["refined"]["mean_iou"], everything["dynamic"]["DA"]) == (1 / 2, 1 / 2)
     found = score_run(tmp_path, tmp_path / "truth", restrict_to=tmp_path / "some")
     assert (found["semantics"]["refined"]["mean_iou"], found["dynamic"]["DA"]) == (1.0, 1.0)

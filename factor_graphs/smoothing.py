@@ -24,12 +24,12 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.heading import of_any_heading, with_heading
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
-from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
+from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
-from factor_graphs.variance import BiasSteps, imu_noise_shown
+from factor_graphs.variance import BiasSteps, correlation_time_shown, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
@@ -39,6 +39,8 @@ Array = NDArray[np.float64]
 NOTABLE_REJECTION = 0.01
 # The usual specific force of any vehicle is gravity to some per cent; so many times more or less is another unit.
 ANOTHER_UNIT = 2.0
+# A correlation time of the fixes so many times that of the settings is worth a word.
+NOTABLE_CORRELATION = 2.0
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
@@ -174,6 +176,7 @@ def _solution(
     trajectory = densify(problem.intervals, keyframes, biases, problem.intervals.noise(noise), problem.frame)
     weights, rejected = np.zeros(len(fixes)), ~problem.used
     weights[problem.used], rejected[problem.used] = fit.weights, fit.squares > REJECTION
+    residuals = _residuals(keyframes, fixes, calibration)
     relative_weights, relative_rejected = np.zeros(len(problem.relative_used)), ~problem.relative_used
     relative_weights[problem.relative_used] = fit.relative_weights
     relative_rejected[problem.relative_used] = fit.relative_squares > RELATIVE_REJECTION
@@ -183,7 +186,7 @@ def _solution(
         biases=biases,
         state_covariances=covariances,
         fix_weights=weights,
-        fix_residuals=_residuals(keyframes, fixes, calibration),
+        fix_residuals=residuals,
         rejected=rejected,
         relative_weights=relative_weights,
         relative_rejected=relative_rejected,
@@ -195,7 +198,11 @@ def _solution(
         iterations=fit.iterations,
         vehicle=vehicle,
         wheels=wheels,
-        notes=(*problem.notes, *_doubts(problem, fit, keyframes, calibration)),
+        notes=(
+            *problem.notes,
+            *_doubts(problem, fit, keyframes, calibration),
+            *_correlation(problem, fit, fixes[problem.used], residuals[problem.used]),
+        ),
     )
 
 
@@ -270,6 +277,20 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
         yield (
             f"heading is unobservable (stddev {np.degrees(heading.min()):.0f}° at best): it takes some seconds of"
             " driving, with turns or changes of speed"
+        )
+
+
+def _correlation(problem: Problem, fit: Fit, fixes: GnssFixes, residuals: Array) -> Iterator[str]:
+    """In words, whether the used fixes are less independent than they are taken for; an inertial unit's always are."""
+    if are_drifting(fixes):
+        return
+    good, believed = fit.squares < GATE, problem.settings.fix_correlation_time_s
+    stddevs = problem.of_fixes * np.maximum(fixes.stddevs, problem.settings.min_fix_stddev_m)
+    shown = correlation_time_shown(fixes.stamps[good], (residuals / stddevs)[good])
+    if shown > NOTABLE_CORRELATION * believed:
+        yield (
+            f"the fixes wander: those within {shown:.0f} s are wrong together, and the stated accuracy is too good; set"
+            f" fix_correlation_time_s to {shown:.0f} (now {believed:g})"
         )
 
 

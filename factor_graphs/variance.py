@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 # Within 99 % of what chance makes of it, noise is as expected. Found, it is good enough when it would change by less
 # than a share: a drive shows white noise to some 10 %, walk less well.
 CHANCE, ENOUGH, ENOUGH_OF_WALK = 0.99, 1.05, 1.1
+# Errors of fixes are correlated where those of neighbours are, by so much: with so many fixes it is beyond chance. For
+# so long, s, an IMU knows the way better than fixes.
+CORRELATED, FEWEST_CORRELATED, KNOWN_WAY_S = 0.3, 60, 5.0
 # A power of the ratio of variances that is changed by, one half if what unknowns take did not follow it; and the most.
 POWER, MOST = 0.75, 4.0
 
@@ -73,6 +76,34 @@ def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
     expected = GOOD_MEAN / 3 * (3 * good.sum() - taken)
     return _corrected(problem.of_fixes, float(fit.squares[good].sum()), float(expected), ENOUGH)
+
+
+def correlation_time_shown(stamps: Array, whitened: Array) -> float:
+    """Within which time fixes weigh as one, s, by their whitened residuals (m, 3); 0 where they look independent.
+
+    The IMU knows the way over some seconds: a smoother that follows errors of fixes hardly changes their steps there.
+    Half the mean square of these is 1 less the correlation. If that is c exp(-t / τ), with white noise of 1 - c beside
+    it, a mean over T has the variance of one fix times 2 c τ / T. Fixes that are better than they say have small steps,
+    too, but are not like their neighbours. What lasts longer than the drive is a shift, which nothing shows.
+    """
+    if len(stamps) < FEWEST_CORRELATED:
+        return 0.0
+    dt = float(np.median(np.diff(stamps)))
+    far = max(2, round(KNOWN_WAY_S / dt))
+    (uncorrelated, of_near), (later, _) = (_steps(stamps, whitened, n, dt) for n in (1, far))
+    if not 0 < uncorrelated < min(later, 1.0, (1 - CORRELATED) * of_near) or later >= 1:
+        return 0.0
+    time = (far - 1) * dt / float(np.log((1 - uncorrelated) / (1 - later)))
+    return 2 * (1 - uncorrelated) * time if time < stamps[-1] - stamps[0] else 0.0
+
+
+def _steps(stamps: Array, whitened: Array, n: int, dt: float) -> tuple[float, float]:
+    """Half the mean square of steps from fixes to the n-th after them, without gaps, and the mean square of both."""
+    whole = stamps[n:] - stamps[:-n] < (n + 0.5) * dt
+    if not whole.any():
+        return 0.0, 0.0
+    first, second = whitened[:-n][whole], whitened[n:][whole]
+    return float(np.mean((second - first) ** 2)) / 2, float(np.mean(first**2 + second**2)) / 2
 
 
 def _corrected(now: float, squares: float, redundancy: float, enough: float) -> float:

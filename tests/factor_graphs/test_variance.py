@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factor_graphs.accuracy import pose_nees
+from factor_graphs.accuracy import coverage, pose_nees
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.elimination import state_keys
 from factor_graphs.fitting import fit_noise
@@ -16,7 +16,7 @@ from factor_graphs.problem import pose_problem
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import simulate_gnss
 from factor_graphs.smoothing import smooth
-from factor_graphs.variance import BiasSteps, _redundancy, imu_noise_shown
+from factor_graphs.variance import BiasSteps, _redundancy, correlation_time_shown, imu_noise_shown
 
 FRAME, LEVER = LocalFrame(49.0, 8.4, 115.0), np.array([0.5, 0.3, 1.0])
 
@@ -128,3 +128,58 @@ def test_without_information_nothing_is_said(simulate):
     steps = BiasSteps(len(problem.intervals.keyframes))
     covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes), steps)
     assert imu_noise_shown(problem, fit, covariances, steps) == (1.0, 1.0)
+
+
+def gauss_markov(rng, m, share, time):
+    """Errors (m, 3) of variance 1 at 1 Hz: this share of it fades over a time, s; the rest is white."""
+    keep, walked = np.exp(-1 / time), rng.standard_normal((m, 3))
+    for i in range(1, m):
+        walked[i] = keep * walked[i - 1] + np.sqrt(1 - keep**2) * walked[i]
+    return np.sqrt(share) * walked + np.sqrt(1 - share) * rng.standard_normal((m, 3))
+
+
+@pytest.mark.parametrize(("share", "time"), [(1.0, 10.0), (1.0, 60.0), (0.7, 10.0), (0.8, 30.0)])
+def test_fixes_weigh_as_one_within_twice_the_integral_of_their_correlation(share, time):
+    errors = gauss_markov(np.random.default_rng(1), 20_000, share, time)
+    stamps = np.arange(len(errors)) + np.where(np.arange(len(errors)) > 9000, 500.0, 0.0)
+    errors[9001:] += 1.0  # a step over a gap is none from neighbour to neighbour
+    errors -= errors.mean(axis=0)
+    assert correlation_time_shown(stamps, errors) == pytest.approx(2 * share * time, rel=0.25)
+
+
+@pytest.mark.parametrize("better", [0.1, 1.0, 3.0])
+def test_white_fixes_are_independent_however_good_they_are(better):
+    for seed in range(20):
+        errors = np.random.default_rng(seed).standard_normal((60, 3)) / better
+        assert correlation_time_shown(np.arange(60.0), errors) == 0.0
+
+
+def test_what_lasts_longer_than_the_drive_is_no_correlation_that_it_shows():
+    ramp = np.linspace(-0.1, 0.1, 100)[:, None] * np.ones(3)
+    assert correlation_time_shown(np.arange(100.0), ramp) == 0.0
+    assert correlation_time_shown(np.arange(100.0), 0 * ramp) == 0.0
+    assert correlation_time_shown(np.arange(3.0), ramp[:3]) == 0.0
+
+
+def test_fixes_that_wander_are_told_and_what_is_told_makes_covariances_honest(simulate):
+    """Each claims white noise of its standard deviation; of many drives 90 % are in the ellipsoid for 90 %."""
+    squares, believed = [], []
+    for seed in range(4):
+        drive = simulate(700 + seed, seconds=400.0, noise=ImuNoise())
+        stamps, stddevs = drive.fixes.stamps, np.array([1.0, 1.0, 2.0])
+        positions = simulate_gnss(
+            drive.motion, stamps, [1e-6] * 3, LEVER, np.random.default_rng(seed),
+            correlated_stddevs=stddevs, correlation_time_s=20.0,
+        ).positions  # fmt: skip
+        fixes = GnssFixes(stamps, positions, np.tile(stddevs, (len(stamps), 1)))
+        alone = smooth(drive.imu, fixes, FRAME, None, LEVER)
+        (note,) = (note for note in alone.notes if "wander" in note)
+        told = float(note.split("fix_correlation_time_s to ")[1].split()[0])
+        assert 30 < told < 60
+        set_so = smooth(drive.imu, fixes, FRAME, SmootherSettings(fix_correlation_time_s=told), LEVER)
+        assert not any("wander" in note for note in set_so.notes)
+        for s, found in ((alone, believed), (set_so, squares)):
+            found.append(pose_nees(s.keyframes, drive.motion.trajectory(s.keyframes.stamps)).position)
+        assert not any("wander" in note for note in smooth(drive.imu, drive.fixes, FRAME, None, LEVER).notes)
+    assert coverage(np.concatenate(believed), 3).scale_gap > 8
+    assert 0.6 < coverage(np.concatenate(squares), 3).scale_gap < 1.5

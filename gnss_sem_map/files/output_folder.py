@@ -2,7 +2,8 @@
 
 What lies at OUT is replaced only when all of it is ours (`ownership`), and never when it is, holds or lies in an
 input. The new result is written in `.OUT.work/part`; the old one moves to `.OUT.work/old`, the new one to OUT, and only
-then is the old one removed. Killed in between, the next command moves the old one back.
+then is the old one removed. Killed in between, the next command moves the old one back. So who reads a result without
+its lock can tell whether it was replaced meanwhile: then another folder lies there (`read_whole`).
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ import fcntl
 import os
 import socket
 import stat
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -293,6 +294,43 @@ def locked(out: Path) -> Iterator[None]:
         finally:
             with suppress(OSError):
                 path.unlink()
+
+
+@contextmanager
+def read_whole(*results: Path) -> Iterator[None]:
+    """Read results that other commands may replace; raises DataError when one of them was.
+
+    That is also why reading fails then, whatever the error says.
+    """
+    with ExitStack() as held:
+        opened = {result: held.enter_context(_opened(result)) for result in results}
+        try:
+            yield
+        except Exception:
+            _refuse_replaced(opened)
+            raise
+        _refuse_replaced(opened)
+
+
+@contextmanager
+def _opened(folder: Path) -> Iterator[int]:
+    """A folder, held open: no other one gets its inode number."""
+    try:
+        number = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: no run folder here ({error.strerror}); expected the -o of an earlier `gnss-sem-map run`"
+        ) from None
+    try:
+        yield number
+    finally:
+        os.close(number)
+
+
+def _refuse_replaced(opened: Mapping[Path, int]) -> None:
+    for folder, number in opened.items():
+        if not (folder.exists() and os.path.samestat(os.fstat(number), folder.stat())):
+            raise DataError(f"{folder}: was replaced by another command while it was read; run this again")
 
 
 def _lock(path: Path, out: Path) -> TextIO:

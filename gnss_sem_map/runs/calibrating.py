@@ -10,6 +10,7 @@ import numpy as np
 from gnss_sem_map.datasets.label_files import label_files, truth_folder
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation.fit_sensor_model import fit_temperature, measure
+from gnss_sem_map.files.output_folder import read_whole
 from gnss_sem_map.files.run_json import inputs_of
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.labels.sensor_model import CalibrationDrive, LabelCalibration
@@ -35,7 +36,8 @@ def calibrate(
     calibration_drives: list[CalibrationDrive] = []
     counted, label_set = [], None
     for out, truth in runs:
-        opened, voxels = drive_and_map(out, drive, segmenter)
+        with read_whole(out):
+            opened, voxels = drive_and_map(out, drive, segmenter)
         if label_set is not None and opened.label_set.names != label_set.names:
             raise DataError(
                 f"{out}: has classes {list(opened.label_set.names)}, the run before {list(label_set.names)};"

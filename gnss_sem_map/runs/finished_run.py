@@ -24,7 +24,14 @@ from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.export.georeference import check_delivery
 from gnss_sem_map.files.atomic import link_or_copy
-from gnss_sem_map.files.output_folder import locked, new_folder, parents_made, real_path, refuse_inputs
+from gnss_sem_map.files.output_folder import (
+    locked,
+    new_folder,
+    parents_made,
+    read_whole,
+    real_path,
+    refuse_inputs,
+)
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
@@ -166,38 +173,38 @@ class Run:
         The coordinates of the files may be others as well. Scans are read only if the run has point labels. Raises
         ConfigError if other settings differ too.
         """
-        _check_same_map(self.settings, settings)
-        georeference = run_folder.georeference_of(settings, self.frame)
-        stats = RunStats()
-        has_labels = not self.is_merged and is_folder(self.folder / "labels")
-        log = self.drive() if has_labels else None
-        with self._rewritten(out, [] if log is None else [inputs_of(self.folder)["drive"]]) as folder:
+        reads = [inputs_of(self.folder).get("drive")] if self._has_labels else []
+        with self._rewritten(out, reads) as (folder, run):
+            _check_same_map(run.settings, settings)
+            georeference = run_folder.georeference_of(settings, run.frame)
+            log = run.drive() if run._has_labels else None
             old_labels = shutil.ignore_patterns(*LABELS)
             for name in (MAP, ATTRIBUTES, evidence.FOLDER, DRIVES, TRACKS):
-                if is_folder(self.folder / name):
+                if is_folder(run.folder / name):
                     shutil.copytree(
-                        self.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
+                        run.folder / name, folder / name, copy_function=link_or_copy, ignore=old_labels
                     )
             for known in folder.glob(f"{DRIVES}/*/{SETTINGS}"):
                 known.unlink()  # a second name of that of the run as it was
                 write_settings(known.parent, settings)
+            stats = RunStats()
             refined = pipeline.refine(folder, settings, stats, work=folder.parent)
-            if self.is_merged:
-                before = run_folder.georeference_of(self.settings, self.frame)
+            if run.is_merged:
+                before = run_folder.georeference_of(run.settings, run.frame)
                 if before is not None and georeference is not None:
-                    copy_changes(self.folder, folder, before, georeference, self.label_set)
-                for file in self.folder.glob("objects.*"):
+                    copy_changes(run.folder, folder, before, georeference, run.label_set)
+                for file in run.folder.glob("objects.*"):
                     link_or_copy(file, folder / file.name)
-                if labelled := sorted(self.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
+                if labelled := sorted(run.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
                     write_point_labels(
                         folder, (_labelled(known, folder) for known in labelled), refined.kerbs, settings
                     )
-                about = self.about | {"map": about_map(folder, refined.report)}
+                about = run.about | {"map": about_map(folder, refined.report)}
                 write_merged(folder, settings, about)
             else:
-                known = self.folder / RAW_LABELS
+                known = run.folder / RAW_LABELS
                 run_folder.write_again(
-                    folder, self.folder, self.trajectory, refined, stats, settings, log, {}, known
+                    folder, run.folder, run.trajectory, refined, stats, settings, log, {}, known
                 )
         return Run(self.folder if out is None else Path(out))
 
@@ -215,15 +222,14 @@ class Run:
         """
         spec = absolute(segmenter.replace("{drive}", str(self.about.get("drive"))))
         reads = run_folder.places_read([Source(inputs_of(self.folder).get("drive", ""), spec)])
-        # what is read of the run is read when no other command can change it any more
-        with self._rewritten(out, reads) as folder:
-            self._refuse_merged(
+        with self._rewritten(out, reads) as (folder, run):
+            run._refuse_merged(
                 "relabelling", "map the drives again with `gnss-sem-map run` and the other --segmenter"
             )
-            log = replace(self.drive(), frame=self.frame)  # --origin, or another drive, may have given it
-            settings, before, stats = self.settings, self.about, RunStats()
-            network = open_segmenter(spec, self.label_set, device, log.calibration.image_sizes)
-            drive = Drive(log, self.trajectory, network, settings)
+            log = replace(run.drive(), frame=run.frame)  # --origin, or another drive, may have given it
+            settings, before, stats = run.settings, run.about, RunStats()
+            network = open_segmenter(spec, run.label_set, device, log.calibration.image_sizes)
+            drive = Drive(log, run.trajectory, network, settings)
             with TemporaryDirectory(prefix=".work.", dir=folder) as work:
                 mapped = pipeline.map_drive(
                     drive, folder, Path(work) / "work", stats, progress, labels_from=spec
@@ -237,9 +243,9 @@ class Run:
                 "skips": about_skips([*skips, *stats.skips]),
                 "warnings": [said for said in before["warnings"] if GEOMETRY_ONLY not in said],
             }
-            with_labels = log if is_folder(self.folder / "labels") else None
+            with_labels = log if is_folder(run.folder / "labels") else None
             run_folder.write_again(
-                folder, self.folder, self.trajectory, refined, stats, settings, with_labels, changed
+                folder, run.folder, run.trajectory, refined, stats, settings, with_labels, changed
             )
         return Run(self.folder if out is None else Path(out))
 
@@ -259,20 +265,10 @@ class Run:
         chosen = list(formats)
         if unknown := [name for name in chosen if name not in known]:
             raise ConfigError(f"export: found {unknown[0]!r}, expected some of {sorted(known)}")
-        about = self.about
-        if to is None and delivery not in (None, self.settings.delivery):
-            raise ConfigError(
-                "export: other coordinates than those of the run need a folder of their own: -o DIR"
-            )
-        delivery = delivery or self.settings.delivery
-        check_delivery(delivery.crs, delivery.geoid)
-        exported = run_folder.exported_of(
-            self.folder, tracks_of(self.folder), str(about["name"]), delivery, about.get("changes", ()),
-            self.label_set,
-        )  # fmt: skip
         if to is None:
             written = []
             with locked(real_path(self.folder)):
+                exported = Run(self.folder)._exported(delivery, is_inside=True)
                 for done, name in enumerate(chosen, 1):
                     written.append(self._amended(known[name], exported))
                     progress("export", done, len(chosen))
@@ -281,11 +277,25 @@ class Run:
         files = [Path(to) / known[name].file for name in chosen]
         if there := [file for file in files if file.exists()]:
             raise DataError(f"{shown(there[0])}: exists; move it away or choose another folder")
-        with parents_made(Path(to) / "file"):
+        with parents_made(Path(to) / "file"), read_whole(self.folder):
+            exported = Run(self.folder)._exported(delivery)
             for done, (name, file) in enumerate(zip(chosen, files, strict=True), 1):
                 known[name].write(exported, file)
                 progress("export", done, len(files))
         return files
+
+    def _exported(self, delivery: DeliverySettings | None, is_inside: bool = False) -> Exported:
+        """What is exported, in these coordinates; of files inside the run they are those of the run."""
+        if is_inside and delivery not in (None, self.settings.delivery):
+            raise ConfigError(
+                "export: other coordinates than those of the run need a folder of their own: -o DIR"
+            )
+        about, delivery = self.about, delivery or self.settings.delivery
+        check_delivery(delivery.crs, delivery.geoid)
+        return run_folder.exported_of(
+            self.folder, tracks_of(self.folder), str(about["name"]), delivery, about.get("changes", ()),
+            self.label_set,
+        )  # fmt: skip
 
     def _amended(self, format_: Format, exported: Exported) -> Path:
         with TemporaryDirectory(prefix="gnss-sem-map-") as folder:
@@ -301,6 +311,11 @@ class Run:
         log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
+    @property
+    def _has_labels(self) -> bool:
+        """Whether it is a run of one drive with point labels."""
+        return not self.is_merged and is_folder(self.folder / "labels")
+
     def _refuse_merged(self, what: str, of_drives: str) -> None:
         """`of_drives` is what to do instead where the map keeps its drives in folders of their own."""
         instead = of_drives if is_folder(self.folder / DRIVES) else "use one of those"
@@ -311,15 +326,18 @@ class Run:
             )
 
     @contextmanager
-    def _rewritten(self, out: Path | str | None, reads: Iterable[Path | str | None]) -> Iterator[Path]:
-        """A new folder for this run with another map; it takes the place of the run, or of `out`.
+    def _rewritten(
+        self, out: Path | str | None, reads: Iterable[Path | str | None]
+    ) -> Iterator[tuple[Path, Run]]:
+        """A new folder for this run with another map, and the run as it is now: what is known of it may be old.
 
-        An `out` that is or holds what the run `reads`, or lies in it, is refused.
+        The folder takes the place of the run, or of `out`. An `out` that is or holds what the run `reads`, or lies in
+        it, is refused, and a run that another command replaces meanwhile.
         """
         place = self.folder if out is None else Path(out)
         inputs = [self.folder, *reads] if place.resolve() != self.folder.resolve() else []
-        with run_folder.claimed_run(place, inputs), new_folder(place) as folder:
-            yield folder
+        with run_folder.claimed_run(place, inputs), new_folder(place) as folder, read_whole(self.folder):
+            yield folder, Run(self.folder)
 
 
 def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:

@@ -34,7 +34,7 @@ from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.bound_drives import bind_drives, read_correction
+from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.point_label_files import RAW_LABELS
@@ -43,6 +43,7 @@ from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.runs.written_drives import write_drives
+from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.voxels.map_json import read_frame
 
 Array = NDArray[np.float64]
@@ -110,8 +111,7 @@ def run_drives(
         run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
         _begin(run, how.resume)
         base = None if align_to is None else read_base(align_to, frame)
-        bound = bind_drives(sources, _tracks(sources, frame, settings), run, base)
-        failed = map_all(sources, bound, how.force, run)
+        bound, failed = _bound_and_mapped(sources, how.force, run, base)
         names = [drive.name for drive in drives if drive.name not in failed]
         done = {name: claim.work / DRIVES / name for name in names}
         if not done:
@@ -119,6 +119,24 @@ def run_drives(
         labelled = [source for source in sources if source.name in done and write_labels]
         about = write_drives(out, done, failed, bound, run, labelled, align_to)
     return ManyDrives(out, about)
+
+
+def _bound_and_mapped(
+    sources: Sequence[Source], force: bool, run: SeveralDrives, base: BaseCloud | None
+) -> tuple[BoundDrives, dict[str, str]]:
+    """Bind the drives and map them; name -> reason of those that fail.
+
+    One that fails may be wrong, and is not in the map: then those that it moved are bound without it, and mapped again.
+    """
+    tracks = _tracks(sources, run.frame, run.settings)
+    failed: dict[str, str] = {}
+    while True:
+        stay = [source for source in sources if source.name not in failed]
+        bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base)
+        failing = map_all(stay, bound, force, run)
+        failed |= failing
+        if failing.keys().isdisjoint(bound.corrections):
+            return bound, failed
 
 
 def frame_of_all(

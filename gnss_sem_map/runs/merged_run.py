@@ -8,7 +8,7 @@ from typing import Any
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.output_folder import new_folder
+from gnss_sem_map.files.output_folder import new_folder, read_whole
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.merging import Alignment, merge_runs
@@ -34,8 +34,8 @@ def merge_run_folders(first: Path, second: Path, out: Path, match: bool = True) 
         raise DataError(
             f"{second}: is the first run as well, and all its evidence would count twice; give another run"
         )
-    check_none_twice(first, second)
-    with claimed_run(out, [first, second]), new_folder(out) as folder:
+    with claimed_run(out, [first, second]), new_folder(out) as folder, read_whole(first, second):
+        check_none_twice(first, second)
         return _merge(first, second, folder, match)
 
 

@@ -127,6 +127,18 @@ def test_a_drive_is_not_added_where_one_that_it_moves_is_gone(days: list[Path], 
     assert products(out) == before
 
 
+def test_a_drive_that_is_left_out_moves_no_other(days: list[Path], tmp_path: Path) -> None:
+    """Its labels are missing, which is seen when all drives are bound and it is mapped."""
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / days[0].name).symlink_to(days[0] / "truth/train_ids")
+    how = HowMapped(f"labels:{tmp_path}/labels/{{drive}}", force=True)
+    made = run_drives(days, tmp_path / "both", Settings(), how)
+    assert list(made.failed) == [days[1].name]
+    assert made.about["passes"] == []
+    run_drives(days[:1], tmp_path / "one", Settings(), how)
+    assert products(tmp_path / "both") == products(tmp_path / "one")
+
+
 def test_tracks_are_grouped_by_where_they_come_near() -> None:
     x = np.arange(0.0, 500.0, 3.0)
     way = np.column_stack([x, 0 * x, 0 * x])

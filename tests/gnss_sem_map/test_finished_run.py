@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -16,14 +17,16 @@ import pyogrio
 import pytest
 from street import Street
 
-from gnss_sem_map import Run, Settings, run
+from gnss_sem_map import Run, Settings, pipeline, run
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
-from gnss_sem_map.files.output_folder import locked
+from gnss_sem_map.files.output_folder import locked, new_folder
+from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.runs import calibrating, merged_run
 from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import State
@@ -228,6 +231,54 @@ def test_it_is_exported_neither_into_itself_nor_while_another_command_writes_it(
         pytest.raises(DataError, match=r"gnss-sem-map writes it now .*; wait for it"),
     ):
         finished.export(["laz"])
+
+
+def replaced(out: Path, **files: str) -> None:
+    """As another command replaces a run, with the same one but for some `files`."""
+    with new_folder(out) as folder:
+        shutil.copytree(out, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns(MARKER))
+        for name, text in files.items():
+            (folder / f"{name}.yaml").write_text(text)
+
+
+@pytest.mark.parametrize("command", ["refine", "relabel", "merge", "export", "calibrate"])
+def test_a_run_that_another_command_replaces_while_it_is_read_is_no_source(
+    command: str, merged: Run, small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the map of one run and the trajectory of another would be written as one, without a word."""
+    whole, to = merged.folder.parent, tmp_path / "to"
+    out, other = Run.open(shutil.copytree(whole / "a", tmp_path / "out")), whole / "b"
+    times = []
+
+    def another(*_: object) -> None:
+        if not times:
+            times.append(replaced(out.folder))
+
+    def beside(original: Callable[..., object]) -> Callable[..., object]:
+        return lambda *words, **named: (another(), original(*words, **named))[1]
+
+    for module, name in ((pipeline, "refine"), (merged_run, "refine_map"), (calibrating, "open_segmenter")):
+        monkeypatch.setattr(module, name, beside(getattr(module, name)))
+    commands: dict[str, Callable[[], object]] = {
+        "refine": lambda: out.refine(out.settings, to),
+        "relabel": lambda: out.relabel(f"labels:{small_drive.labels}", to),
+        "merge": lambda: merged_run.merge_run_folders(other, out.folder, to, match=False),
+        "export": lambda: out.export(["ply", "laz"], to, progress=another),
+        "calibrate": lambda: calibrating.calibrate([(out.folder, small_drive.labels)]),
+    }
+    with pytest.raises(DataError, match=r"out: was replaced by another command while it was read; run this"):
+        commands[command]()
+    assert [path.name for path in tmp_path.iterdir()] == ["out"] + ["to"] * (command == "export")
+
+
+def test_a_run_is_refined_as_it_is_and_not_as_it_was_when_it_was_opened(
+    finished: Run, tmp_path: Path
+) -> None:
+    out = Run.open(shutil.copytree(finished.folder, tmp_path / "out"))
+    before = out.settings
+    replaced(out.folder, config=before.changed("mapping.voxel_size_m=0.4").to_yaml())
+    with pytest.raises(ConfigError, match="mapping differ from those of the run"):
+        out.refine(before, tmp_path / "to")
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ velocity by centimetres per second, attitude by hundredths of a degree.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
@@ -133,9 +133,9 @@ def oxts_rows(
 def _drift(count: int, rate: float, sigma: float, rng: np.random.Generator, seconds: float = 60.0) -> Floats:
     """An error that fades over `seconds` (Gauss-Markov of first order)."""
     keep = np.exp(-1.0 / (rate * seconds))
-    drive = rng.standard_normal(count) * sigma * np.sqrt(1.0 - keep**2)
-    drive[0] = sigma * rng.standard_normal()
-    return np.asarray(lfilter([1.0], [1.0, -keep], drive))
+    steps = rng.standard_normal(count) * sigma * np.sqrt(1.0 - keep**2)
+    steps[0] = sigma * rng.standard_normal()
+    return np.array(list(accumulate(steps.tolist(), lambda error, step: keep * error + step)))
 
 
 def _renewed(laps: Floats, draw: Callable[[], Floats]) -> Floats:

@@ -25,8 +25,7 @@ WHOLE = (
     "gnss_sem_map.files.atomic",
 )
 """Modules whose functions are finished with all that they call: an import, compiling or loading a function, and what
-makes, replaces or removes results.
-A block in which such a folder is claimed is not below them."""
+makes, replaces or removes results. A block in which such a folder is claimed is not below them."""
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
 

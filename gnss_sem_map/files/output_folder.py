@@ -306,10 +306,8 @@ def read_whole(*results: Path) -> Iterator[None]:
         opened = {result: held.enter_context(_opened(result)) for result in results}
         try:
             yield
-        except Exception:
+        finally:
             _refuse_replaced(opened)
-            raise
-        _refuse_replaced(opened)
 
 
 @contextmanager

@@ -14,6 +14,8 @@ COPY gnss_sem_map gnss_sem_map
 COPY factor_graphs factor_graphs
 RUN SETUPTOOLS_SCM_PRETEND_VERSION_FOR_GNSS_SEM_MAP="${VERSION}" \
     pip install --no-cache-dir -c constraints.txt ".${EXTRAS}"
+# Kernels are compiled for the CPU of this machine; without, or on another CPU, every container does so itself, for half a minute
+RUN python -m gnss_sem_map.cli.compile_ahead
 WORKDIR /data
 ENTRYPOINT ["gnss-sem-map"]
 CMD ["demo"]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gnss_sem_map import config
+from gnss_sem_map.cli.compile_ahead import compiling_ahead
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.evaluation.score_run import score_run
 from gnss_sem_map.export.report import write_report
@@ -55,7 +56,7 @@ def demonstrate(
     when the network needs a package that is not installed.
     """
     world = real_path(out).with_name(f"{real_path(out).name}_drive")
-    with claimed_run(out), claimed(world):
+    with claimed_run(out), claimed(world), compiling_ahead():
         return _demonstrate(out, world, seconds, seed, source, progress)
 
 

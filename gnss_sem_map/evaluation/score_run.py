@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
+from gnss_sem_map.machine import threads
+from gnss_sem_map.scans.prefetch import prefetch
 
 LARGEST = 1e12
 """Largest stamp in s and length in m."""
@@ -95,50 +98,79 @@ def _check_scorable(out: Path) -> None:
 
 def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
     tables = metrics.Tables.of(label_set)
-    count = len(label_set.names)
-    refined = np.zeros((count, count + 1), np.int64)
-    raw, moved = refined.copy(), np.zeros((3, 2), np.int64)
-    sure = np.zeros((len(metrics.LOOKS), metrics.CALIBRATION_BINS, 3))
-    for name, true in _truths(out / "labels", truth_folder(truth)):
-        where = f"{out / 'labels' / name}.label"
-        predicted = read_labels(out / "labels" / f"{name}.label")
-        before = read_labels(out / "labels_raw" / f"{name}.label")
-        if restrict_to is not None:
-            chosen = read_labels(restrict_to / f"{name}.label")
-            if len(chosen) != len(true):
-                raise DataError(
-                    f"{shown(restrict_to / name)}.label: found {len(chosen)} labels for {len(true)} points"
-                )
-            true = np.where(chosen & 0xFFFF != 0, true, 0).astype(np.uint32)
-        moved += metrics.dynamic_counts(read_labels(out / "removed" / f"{name}.label"), true, tables, where)
-        refined += metrics.confusion(predicted, true, tables, where)
-        raw += metrics.confusion(before, true, tables, where)
-        confidence = read_confidence(out / "confidence" / f"{name}.bin")
-        if len(confidence) != len(predicted):
-            raise DataError(f"{where}: found {len(confidence)} probabilities for {len(predicted)} labels")
-        looks = read_looks(out / "looks" / f"{name}.bin")
-        if len(looks) != len(predicted):
-            raise DataError(f"{where}: found {len(looks)} counts of looks for {len(predicted)} labels")
-        sure += metrics.calibration_counts(confidence, predicted, true, tables, looks)
+
+    def count(scan: tuple[str, Path]) -> _Counts:
+        name, known = scan
+        return _count_scan(out, name, _true_ids(known, name, restrict_to), tables)
+
+    counted = prefetch(count, _scans(out / "labels", truth_folder(truth)), threads())
+    total = reduce(_Counts.plus, (counts for _, counts in counted))
     return {
         "semantics": {
-            "raw": metrics.semantics(raw, label_set),
-            "refined": metrics.semantics(refined, label_set),
+            "raw": metrics.semantics(total.raw, label_set),
+            "refined": metrics.semantics(total.refined, label_set),
         },
-        "dynamic": metrics.dynamic(moved),
-        "calibration": metrics.calibration(sure),
+        "dynamic": metrics.dynamic(total.moved),
+        "calibration": metrics.calibration(total.sure),
     }
 
 
-def _truths(predictions: Path, truth: Path) -> list[tuple[str, NDArray[np.uint32]]]:
-    """Name and true ids of every scan with labels; each must have truth, and there must be at least one."""
+class _Counts(NamedTuple):
+    """Of one scan, or of several; see `metrics`."""
+
+    raw: NDArray[np.int64]
+    refined: NDArray[np.int64]
+    moved: NDArray[np.int64]
+    sure: NDArray[np.float64]
+
+    def plus(self, other: _Counts) -> _Counts:
+        return _Counts(
+            self.raw + other.raw,
+            self.refined + other.refined,
+            self.moved + other.moved,
+            self.sure + other.sure,
+        )
+
+
+def _count_scan(out: Path, name: str, true: NDArray[np.uint32], tables: metrics.Tables) -> _Counts:
+    where = f"{out / 'labels' / name}.label"
+    predicted = read_labels(out / "labels" / f"{name}.label")
+    before = read_labels(out / "labels_raw" / f"{name}.label")
+    moved = metrics.dynamic_counts(read_labels(out / "removed" / f"{name}.label"), true, tables, where)
+    refined = metrics.confusion(predicted, true, tables, where)
+    raw = metrics.confusion(before, true, tables, where)
+    confidence = read_confidence(out / "confidence" / f"{name}.bin")
+    if len(confidence) != len(predicted):
+        raise DataError(f"{where}: found {len(confidence)} probabilities for {len(predicted)} labels")
+    looks = read_looks(out / "looks" / f"{name}.bin")
+    if len(looks) != len(predicted):
+        raise DataError(f"{where}: found {len(looks)} counts of looks for {len(predicted)} labels")
+    sure = metrics.calibration_counts(confidence, predicted, true, tables, looks)
+    return _Counts(raw, refined, moved, sure)
+
+
+def _true_ids(known: Path, name: str, restrict_to: Path | None) -> NDArray[np.uint32]:
+    """The true ids of a scan, 0 for points that are not labelled in `restrict_to`."""
+    true = read_labels(known)
+    if restrict_to is None:
+        return true
+    chosen = read_labels(restrict_to / f"{name}.label")
+    if len(chosen) != len(true):
+        raise DataError(
+            f"{shown(restrict_to / name)}.label: found {len(chosen)} labels for {len(true)} points"
+        )
+    return np.where(chosen & 0xFFFF != 0, true, 0).astype(np.uint32)
+
+
+def _scans(predictions: Path, truth: Path) -> list[tuple[str, Path]]:
+    """Every scan with labels, and the file of its true ids; each must have one, and there must be at least one."""
     wanted, known = label_files(predictions), label_files(truth)
     missing = sorted(set(wanted) - set(known))
     if missing:
         raise DataError(
             f"{truth}: no truth for {len(missing)} of {len(wanted)} scans, first {missing[0]}; is it another drive?"
         )
-    return [(name, read_labels(known[name])) for name in wanted]
+    return [(name, known[name]) for name in wanted]
 
 
 def _in_frame_of(out: Path, poses: Trajectory, world: Path) -> Trajectory:

@@ -33,7 +33,9 @@ def refine(
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
-    again = finished.refine(delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid), out)
+    settings = delivered_in(finished.settings.changed(*(set_ or ())), crs, geoid)
+    with progress_bars() as progress:
+        again = finished.refine(settings, out, progress=progress)
     about = again.about
     _warn_of_coordinates(again, again.settings)
     if "drives" in about:
@@ -41,7 +43,7 @@ def refine(
     elif again.is_merged and not as_json:
         print_merged(about, again.folder)
     else:
-        print_run(about, again.folder, as_json, ("refinement", "export"))
+        print_run(about, again.folder, as_json, ("refinement", "labels", "export"))
 
 
 def relabel(
@@ -58,7 +60,7 @@ def relabel(
 
     with progress_bars() as progress:
         again = Run.open(run).relabel(segmenter, out, device=device, progress=progress)
-    print_run(again.about, again.folder, as_json, ("mapping", "refinement", "export"))
+    print_run(again.about, again.folder, as_json, ("mapping", "refinement", "labels", "export"))
 
 
 def export(

@@ -51,14 +51,18 @@ def _write_to(logger: logging.Logger, handler: logging.Handler) -> None:
 
 
 class StageLog:
-    """A `Progress` that logs when a stage begins and when it is done."""
+    """A `Progress` that logs when a stage begins and when it is done, of several drives for each."""
 
     def __init__(self) -> None:
         self._begun: dict[str, float] = {}
+        self._done: set[str] = set()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         if stage not in self._begun:
+            if done >= total and stage in self._done:
+                return  # the end of a stage may be told twice
             self._begun[stage] = time.monotonic()
             STAGES.info("%s: begins, %d steps", stage, total)
         if done >= total:
-            STAGES.info("%s: done after %.1f s", stage, time.monotonic() - self._begun[stage])
+            STAGES.info("%s: done after %.1f s", stage, time.monotonic() - self._begun.pop(stage))
+            self._done.add(stage)

@@ -33,7 +33,7 @@ DRIVEN_IN_A_SWEEP_M = 60.0
 
 @dataclass(frozen=True, eq=False)
 class PointLabels:
-    """Labels of every original point of one scan, by one map."""
+    """Labels of every original point of one scan, by one map; or of every voxel, and of none at the end."""
 
     labels: NDArray[np.int8]
     """(n,) class index, -1 unknown."""
@@ -43,6 +43,22 @@ class PointLabels:
     """(n,) mask of the points of moving objects."""
     looks: NDArray[np.uint8]
     """(n,) LiDAR points of the voxel, 255 for more; 0 if unknown."""
+
+    @classmethod
+    def of_voxels(cls, semantic_map: SemanticMap) -> PointLabels:
+        """What a map says of each of its v voxels, and in the place v, which is also -1, of none."""
+        return cls(
+            np.append(semantic_map.labels, np.int8(UNLABELLED)),
+            np.append(semantic_map.confidence, np.float32(0)),
+            np.append(semantic_map.states == State.REMOVED, False),
+            np.append(np.minimum(semantic_map.voxels.hits, 255).astype(np.uint8), np.uint8(0)),
+        )
+
+    def at(self, places: NDArray[np.int64]) -> PointLabels:
+        """Those at the places (n,)."""
+        return PointLabels(
+            self.labels[places], self.confidence[places], self.removed[places], self.looks[places]
+        )
 
 
 def label_points(
@@ -99,6 +115,7 @@ def _label_some(
     kerbs: Kerbs | None,
 ) -> Iterator[tuple[Scan, list[PointLabels]]]:
     one_grid = all(np.array_equal(other.voxels.keys, maps[0].voxels.keys) for other in maps[1:])
+    of_voxels = [PointLabels.of_voxels(each) for each in maps]
 
     def label(scan: Scan) -> list[PointLabels] | None:
         try:
@@ -109,9 +126,9 @@ def _label_some(
         if not valid.any():
             return None  # likewise
         keys = keys_of(p_map, drive.settings.mapping.voxel_size_m)
-        places = [m.voxels.indices_of(keys) for m in (maps[:1] if one_grid else maps)]
+        places = [_places(each, keys, valid) for each in (maps[:1] if one_grid else maps)]
         places *= len(maps) // len(places)
-        found = [_look_up(m, there, valid) for m, there in zip(maps, places, strict=True)]
+        found = [known.at(there) for known, there in zip(of_voxels, places, strict=True)]
         if kerbs is not None:
             inside, chosen, probability = kerbs.decide(keys, p_map)
             points_of_kerbs = np.flatnonzero(valid)[inside]
@@ -132,21 +149,13 @@ def _label_some(
             yield scan, done
 
 
-def _look_up(semantic_map: SemanticMap, places: NDArray[np.int64], valid: NDArray[np.bool_]) -> PointLabels:
-    known = valid.copy()
-    known[valid] = places >= 0
-    places = places[places >= 0]
-    found = PointLabels(
-        labels=np.full(len(valid), UNLABELLED, np.int8),
-        confidence=np.zeros(len(valid), np.float32),
-        removed=np.zeros(len(valid), np.bool_),
-        looks=np.zeros(len(valid), np.uint8),
-    )
-    found.labels[known] = semantic_map.labels[places]
-    found.confidence[known] = semantic_map.confidence[places]
-    found.removed[known] = semantic_map.states[places] == State.REMOVED
-    found.looks[known] = np.minimum(semantic_map.voxels.hits[places], 255)
-    return found
+def _places(
+    semantic_map: SemanticMap, keys: NDArray[np.int64], valid: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """The voxel of every point (n,), -1 for none; `keys` are those of the valid points."""
+    places = np.full(len(valid), -1)
+    places[valid] = semantic_map.voxels.indices_of(keys)
+    return places
 
 
 def _remove(found: PointLabels, points: NDArray[np.int64], semantic_map: SemanticMap) -> None:

@@ -167,7 +167,9 @@ class Run:
         """
         return tiles.read(self.folder / ("refined" if refined else "map"), self.label_set, box)
 
-    def refine(self, settings: Settings, out: Path | str | None = None) -> Run:
+    def refine(
+        self, settings: Settings, out: Path | str | None = None, *, progress: Progress = silent
+    ) -> Run:
         """Refine the map again with other settings, in place or into `out`; nothing is matched or segmented again.
 
         The coordinates of the files may be others as well. Scans are read only if the run has point labels. Raises
@@ -188,7 +190,7 @@ class Run:
                 known.unlink()  # a second name of that of the run as it was
                 write_settings(known.parent, settings)
             stats = RunStats()
-            refined = pipeline.refine(folder, settings, stats, work=folder.parent)
+            refined = pipeline.refine(folder, settings, stats, progress, work=folder.parent)
             if run.is_merged:
                 before = run_folder.georeference_of(run.settings, run.frame)
                 if before is not None and georeference is not None:
@@ -196,15 +198,14 @@ class Run:
                 for file in run.folder.glob("objects.*"):
                     link_or_copy(file, folder / file.name)
                 if labelled := sorted(run.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
-                    write_point_labels(
-                        folder, (_labelled(known, folder) for known in labelled), refined.kerbs, settings
-                    )
+                    drives = (_labelled(known, folder) for known in labelled)
+                    write_point_labels(folder, drives, refined.kerbs, settings, progress)
                 about = run.about | {"map": about_map(folder, refined.report)}
-                write_merged(folder, settings, about)
+                write_merged(folder, settings, about, progress)
             else:
                 known = run.folder / RAW_LABELS
                 run_folder.write_again(
-                    folder, run.folder, run.trajectory, refined, stats, settings, log, {}, known
+                    folder, run.folder, run.trajectory, refined, stats, settings, log, {}, known, progress
                 )
         return Run(self.folder if out is None else Path(out))
 
@@ -245,8 +246,9 @@ class Run:
             }
             with_labels = log if is_folder(run.folder / "labels") else None
             run_folder.write_again(
-                folder, run.folder, run.trajectory, refined, stats, settings, with_labels, changed
-            )
+                folder, run.folder, run.trajectory, refined, stats, settings, with_labels, changed,
+                progress=progress,
+            )  # fmt: skip
         return Run(self.folder if out is None else Path(out))
 
     def export(

@@ -5,19 +5,24 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.machine import threads
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.point_labels import label_points
+from gnss_sem_map.mapping.point_labels import PointLabels, label_points
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.refining import REFINED
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.run_stats import Progress, silent
+from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.sensor_log import Scan, SensorLog
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.tiles import TiledMap
 
@@ -40,7 +45,11 @@ class LabelledDrive:
 
 
 def write_point_labels(
-    run: Path, drives: Iterable[LabelledDrive], kerbs: Kerbs | None, settings: Settings
+    run: Path,
+    drives: Iterable[LabelledDrive],
+    kerbs: Kerbs | None,
+    settings: Settings,
+    progress: Progress = silent,
 ) -> None:
     """Write for every original point of some drives of a run what its maps say of it.
 
@@ -50,7 +59,7 @@ def write_point_labels(
     """
     refined = tiles.open_map(run / REFINED, open_label_set(settings.classes))
     for drive in drives:
-        _label(drive, run, refined, kerbs, settings)
+        _label(drive, run, refined, kerbs, settings, progress)
 
 
 def _label(
@@ -59,6 +68,7 @@ def _label(
     refined: TiledMap,
     kerbs: Kerbs | None,
     settings: Settings,
+    progress: Progress,
 ) -> None:
     folder, label_set = drive.folder, refined.label_set
     for name in LABELS:
@@ -73,11 +83,22 @@ def _label(
     beside = evidence.read(folder, label_set)
     for one in drive.log.by_lidar:
         moving = beside.moving_points_of(one.lidar)
-        for scan, (*raw, after) in label_points(one, drive.trajectory, maps, settings, moving, kerbs):
-            place = Path(one.lidar) / scan.name
-            if raw:
-                ids[raw[0].labels].tofile(folder / RAW_LABELS / f"{place}.label")
-            ids[after.labels].tofile(folder / "labels" / f"{place}.label")
-            after.confidence.astype("<f2").tofile(folder / "confidence" / f"{place}.bin")
-            after.looks.tofile(folder / "looks" / f"{place}.bin")
-            after.removed.astype("<u4").tofile(folder / "removed" / f"{place}.label")
+        labelled = label_points(one, drive.trajectory, maps, settings, moving, kerbs)
+        writing = prefetch(partial(_write, folder, Path(one.lidar), ids), labelled, threads())
+        for done, _ in enumerate(writing, 1):
+            progress("labels", done, len(one.scans))
+        progress("labels", len(one.scans), len(one.scans))  # those that are skipped have none
+
+
+def _write(
+    folder: Path, lidar: Path, ids: NDArray[np.uint32], labelled: tuple[Scan, list[PointLabels]]
+) -> None:
+    """Write the labels of one scan, with these ids of the classes and, at the end, of none."""
+    scan, (*raw, after) = labelled
+    label_file, other_file = lidar / f"{scan.name}.label", lidar / f"{scan.name}.bin"
+    if raw:
+        ids[raw[0].labels].tofile(folder / RAW_LABELS / label_file)
+    ids[after.labels].tofile(folder / "labels" / label_file)
+    after.confidence.astype("<f2").tofile(folder / "confidence" / other_file)
+    after.looks.tofile(folder / "looks" / other_file)
+    after.removed.astype("<u4").tofile(folder / "removed" / label_file)

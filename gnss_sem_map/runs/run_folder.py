@@ -100,12 +100,13 @@ def write_run(
 ) -> None:
     """Write everything that a run of one drive made beside its maps, which are in the folder already."""
     refined = replace(refined, report=with_objects(refined.report, mapped))
+    if write_labels:
+        with mapped.stats.stage("labels"):
+            labelled = LabelledDrive(folder, mapped.log, mapped.trajectory)
+            write_point_labels(folder, [labelled], refined.kerbs, settings, progress)
     with mapped.stats.stage("export"):
         write_plot(folder, mapped.log, mapped.solution)
         write_objects(folder, source.name, mapped, settings)
-        if write_labels:
-            labelled = LabelledDrive(folder, mapped.log, mapped.trajectory)
-            write_point_labels(folder, [labelled], refined.kerbs, settings)
         scans = mapped.log.scans
         track = mapped.trajectory.during(scans[0].stamp, scans[-1].stamp)
         write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
@@ -143,6 +144,7 @@ def write_again(
     log: SensorLog | None,
     changed: dict[str, Any],
     known_raw: Path | None = None,
+    progress: Progress = silent,
 ) -> None:
     """Write a finished run once more, with another map of the same drive, which is in the folder already.
 
@@ -155,11 +157,14 @@ def write_again(
     for file in (*source.glob("trajectory*"), *source.glob("objects.*")):
         if not (folder / file.name).exists():  # what moved may be known anew
             shutil.copyfile(file, folder / file.name)
-    with stats.stage("export"):
-        if log is not None:
+    if log is not None:
+        with stats.stage("labels"):
             labelled = LabelledDrive(folder, log, trajectory, known_raw)
-            write_point_labels(folder, [labelled], refined.kerbs, settings)
-        write_map_files(folder, [trajectory.during(first, last)], str(about["name"]), settings.delivery)
+            write_point_labels(folder, [labelled], refined.kerbs, settings, progress)
+    with stats.stage("export"):
+        write_map_files(
+            folder, [trajectory.during(first, last)], str(about["name"]), settings.delivery, progress=progress
+        )
     tracked = about["map"]["refinement"]
     about |= changed
     about |= {

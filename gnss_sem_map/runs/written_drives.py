@@ -73,7 +73,8 @@ def write_drives(
         )
         if labelled:
             of_drives = (_labelled(source, folder / DRIVES / source.name, settings) for source in labelled)
-            write_point_labels(folder, of_drives, refined.kerbs, settings)
+            with stats.stage("labels"):
+                write_point_labels(folder, of_drives, refined.kerbs, settings, run.progress)
         with stats.stage("changes"):
             changes = changes_in(folder, parts, bound.passes, label_set)
         if changes is not None:

@@ -23,6 +23,17 @@ if TYPE_CHECKING:
 
 LIST = Path(__file__).with_name("kernels.txt")
 """Of every kernel a line: module, name, and the types of its arguments as numba's signatures have them."""
+LATE = (
+    "gnss_sem_map.runs.finished_run",
+    "jinja2",
+    "laspy",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.patheffects",
+    "pandas",
+    "rasterio.features",
+    "shapely",
+)
+"""What a run imports when it needs it, and Python compiles at the first import."""
 
 
 def listed_kernels() -> Iterator[tuple[Dispatcher, tuple[Type, ...]]]:
@@ -38,6 +49,12 @@ def compile_kernels() -> None:
     """Compile the kernels of `LIST`; those that are on disk are loaded, which takes a second for all."""
     for kernel, types in listed_kernels():
         kernel.compile(types)
+
+
+def compile_modules() -> None:
+    """Import what is imported late."""
+    for module in LATE:
+        import_module(module)
 
 
 @contextmanager
@@ -64,3 +81,4 @@ def compiling_ahead() -> Iterator[None]:
 
 if __name__ == "__main__":
     compile_kernels()
+    compile_modules()

@@ -1,7 +1,7 @@
 """Compile the kernels of a run before they are called: `python -m gnss_sem_map.cli.compile_ahead`.
 
 A kernel is compiled when it is first called with arguments of new types, and kept on disk. For a run, that takes half a
-minute of one core, once per machine. `benchmarks/kernels.py` has written `kernels.txt`, which lists them.
+minute of one core, once per installation. `kernels.txt` lists them; `benchmarks/kernels.py` writes it.
 """
 
 from __future__ import annotations

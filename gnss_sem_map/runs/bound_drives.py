@@ -39,7 +39,7 @@ from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.drive_job import read_job, write_job
+from gnss_sem_map.runs.drive_job import read_job, read_trajectory, write_job
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
@@ -60,6 +60,16 @@ CONDENSED, CORRECTION, LOCATED = "condensed.npz", "correction.npz", "located.jso
 
 
 @dataclass(frozen=True, eq=False)
+class KnownTrack:
+    """Where a drive is known to have been before it is bound."""
+
+    positions: Array
+    """(n, 3) m."""
+    has_gaps: bool = False
+    """Whether it may have been elsewhere, too: it had no fix for so long."""
+
+
+@dataclass(frozen=True, eq=False)
 class BoundDrives:
     """Name -> file of the correction of each drive that is bound to others, and what binds them.
 
@@ -74,22 +84,18 @@ class BoundDrives:
 
 def bind_drives(
     sources: Sequence[Source],
-    tracks: Mapping[str, Array],
+    tracks: Mapping[str, KnownTrack],
     run: SeveralDrives,
     base: BaseCloud | None = None,
 ) -> BoundDrives:
     """Locate the drives that may have passed the same places, and bind those that did, and what is near a `base`.
 
-    `tracks` are of drives by name, (n, 3) m; a drive without one, or that cannot be located, is left as it is.
+    `tracks` are of drives by name; a drive without one, or that cannot be located, is left as it is.
     """
     settings = run.settings
-    places = {**tracks, **({} if base is None else {BASE: base.points})}
-    groups = [group for group in groups_of(places) if len(group) > 1]
-    by_name = {source.name: source for source in sources}
-    wanted = [by_name[name] for group in groups for name in group if name != BASE]
-    if not (wanted and settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
+    if not (settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
         return BoundDrives({})
-    reasons = run.call(locate_one, "locating", ((source, (str(run.work),)) for source in wanted))
+    groups, reasons = _located_groups(sources, tracks, run, base)
     corrections: dict[str, Path] = {}
     passes: list[TwoPasses] = []
     warnings: list[str] = []
@@ -101,6 +107,34 @@ def bind_drives(
         warnings += found.warnings
     failed = {name: reason for name, reason in reasons.items() if reason}
     return BoundDrives(corrections, tuple(passes), tuple(warnings), failed)
+
+
+def _located_groups(
+    sources: Sequence[Source],
+    tracks: Mapping[str, KnownTrack],
+    run: SeveralDrives,
+    base: BaseCloud | None,
+) -> tuple[list[list[str]], dict[str, str]]:
+    """The groups of drives that come near each other, all located, and name -> why one could not be, or nothing.
+
+    Once a drive is located, its track has no gaps: it may come near others that its fixes did not.
+    """
+    places = {name: track.positions for name, track in tracks.items()}
+    places |= {} if base is None else {BASE: base.points}
+    reasons: dict[str, str] = {}
+    while True:
+        groups = [group for group in groups_of(places) if len(group) > 1]
+        sought = {name for group in groups for name in group}
+        if len(places) > 1:
+            sought |= {name for name, track in tracks.items() if track.has_gaps}
+        wanted = [source for source in sources if source.name in sought - reasons.keys()]
+        if not wanted:
+            return groups, reasons
+        reasons |= run.call(locate_one, "locating", ((source, (str(run.work),)) for source in wanted))
+        for source in wanted:
+            file = run.work / BOUND / source.name / TRAJECTORY
+            if not reasons[source.name] and file.is_file():  # of others nothing but their fixes is known
+                places[source.name] = read_trajectory(file).positions
 
 
 def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:

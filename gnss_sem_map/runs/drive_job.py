@@ -48,8 +48,13 @@ def read_job(folder: Path) -> tuple[dict[str, Any], Source, Settings, SensorLog,
     about: dict[str, Any] = json.loads((folder / JOB).read_text("utf-8"))
     settings, source = Settings.model_validate(about["settings"]), Source(**about["source"])
     log = source.open_log(with_imu=False).in_our_conventions(settings.sensors)
-    with np.load(folder / TRAJECTORY) as arrays:
-        return about, source, settings, log, Trajectory(**arrays)
+    return about, source, settings, log, read_trajectory(folder / TRAJECTORY)
+
+
+def read_trajectory(file: Path) -> Trajectory:
+    """The trajectory of a job."""
+    with np.load(file) as arrays:
+        return Trajectory(**arrays)
 
 
 def other_drive(source: Source) -> DataError:

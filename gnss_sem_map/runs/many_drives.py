@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factor_graphs.errors import FactorGraphError
 from factor_graphs.geodesy import LocalFrame
@@ -34,7 +33,7 @@ from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
-from gnss_sem_map.runs.bound_drives import BoundDrives, bind_drives, read_correction
+from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import map_all
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.point_label_files import RAW_LABELS
@@ -44,9 +43,11 @@ from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
 from gnss_sem_map.runs.written_drives import write_drives
 from gnss_sem_map.scans.base_cloud import BaseCloud
+from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.map_json import read_frame
 
-Array = NDArray[np.float64]
+LONGEST_GAP_S = 3.0
+"""In a longer gap of its fixes a drive may pass a place that is `bound_drives.NEAR_M` from all of them."""
 
 
 @dataclass(frozen=True)
@@ -249,13 +250,13 @@ def _correction_of(folder: Path) -> str:
     return str(read_run(folder).get("correction", ""))
 
 
-def _driven(folder: Path) -> Array:
-    """The track of a drive that was mapped, (n, 3) m."""
-    return tracks_of(folder)[0].positions
+def _driven(folder: Path) -> KnownTrack:
+    """The track of a drive that was mapped."""
+    return KnownTrack(tracks_of(folder)[0].positions)
 
 
-def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, Array]:
-    """The GNSS track of each drive that has one in this frame, (n, 3) m; of the others, their task says why."""
+def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, KnownTrack]:
+    """The GNSS track of each drive that has one in this frame; of the others, their task says why."""
     found = {}
     for source in sources:
         try:
@@ -266,8 +267,17 @@ def _tracks(sources: Sequence[Source], frame: LocalFrame, settings: Settings) ->
         if log.gnss is None or log.frame is None or not len(log.gnss):
             continue
         T = frame.pose_of(log.frame)
-        found[source.name] = log.gnss.positions @ T[:3, :3].T + T[:3, 3]
+        found[source.name] = KnownTrack(log.gnss.positions @ T[:3, :3].T + T[:3, 3], _has_gaps(log))
     return found
+
+
+def _has_gaps(log: SensorLog) -> bool:
+    """Whether a drive had no fix for so long, while it had scans, that it may have been somewhere else."""
+    if log.gnss is None or not log.scans:
+        return False
+    first, last, fixes = log.scans[0].stamp, log.scans[-1].stamp, log.gnss.stamps
+    known = np.concatenate([[first], fixes[(fixes > first) & (fixes < last)], [last]])
+    return bool(np.diff(known).max() > LONGEST_GAP_S)
 
 
 def _begin(run: SeveralDrives, resume: bool) -> None:

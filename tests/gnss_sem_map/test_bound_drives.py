@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -24,11 +26,13 @@ from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import passes
 from gnss_sem_map.mapping.trajectory import locate
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs import finished_run
-from gnss_sem_map.runs.bound_drives import groups_of
+from gnss_sem_map.runs import bound_drives, finished_run, many_drives
+from gnss_sem_map.runs.bound_drives import KnownTrack, groups_of
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
+from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.deskew import points_in_map
+from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import Camera, Lidar, simulate
 
 pytestmark = pytest.mark.integration
@@ -151,6 +155,39 @@ def test_tracks_are_grouped_by_where_they_come_near() -> None:
     }
     assert groups_of(tracks) == [["a", "b", "c"], ["d"], ["e"]]
     assert groups_of({}) == []
+
+
+@pytest.mark.parametrize("has_gaps", [True, False])
+def test_drives_that_meet_where_neither_has_a_fix_are_bound(
+    has_gaps: bool, days: list[Path], both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fixes_of(sources: Sequence[Source], frame: LocalFrame, settings: Settings) -> dict[str, KnownTrack]:
+        found = tracks_of_drives(sources, frame, settings)
+        parts = dict(zip((drive.name for drive in days), (slice(0, 5), slice(-5, None)), strict=True))
+        return {name: KnownTrack(found[name].positions[parts[name]], has_gaps) for name in found}
+
+    tracks_of_drives = many_drives._tracks
+    monkeypatch.setattr(many_drives, "_tracks", fixes_of)
+    monkeypatch.setattr(bound_drives, "NEAR_M", 15.0)
+    run_drives(days, tmp_path / "both", Settings(), HOW)
+    assert bool(read_run(tmp_path / "both")["passes"]) == has_gaps
+    if has_gaps:
+        assert products(tmp_path / "both") == products(both)
+
+
+def test_a_drive_has_gaps_where_it_may_have_been_elsewhere(days: list[Path]) -> None:
+    log = open_drive(days[0], with_imu=False)
+    assert log.gnss is not None
+
+    def with_fixes(kept: np.ndarray) -> SensorLog:
+        assert log.gnss is not None
+        return replace(log, gnss=log.gnss[kept])
+
+    since = log.gnss.stamps - log.scans[0].stamp
+    assert not many_drives._has_gaps(log)
+    assert not many_drives._has_gaps(with_fixes((since < 2.0) | (since > 4.5)))
+    for gap in ((since < 2.0) | (since > 6.0), since > 4.0, since < 4.0):
+        assert many_drives._has_gaps(with_fixes(gap))
 
 
 def write_base(drive: Path, path: Path) -> None:

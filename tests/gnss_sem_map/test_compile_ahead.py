@@ -6,6 +6,7 @@ import inspect
 import multiprocessing
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -55,11 +56,12 @@ def test_a_demo_compiles_no_kernel_of_a_run(tmp_path: Path, monkeypatch: pytest.
 
 def compilers() -> list[psutil.Process]:
     """The processes that compile ahead for this one."""
-    return [
-        child
-        for child in psutil.Process().children()
-        if child.status() != psutil.STATUS_ZOMBIE and compile_ahead.__name__ in child.cmdline()
-    ]
+    found = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):  # it may end meanwhile
+            if compile_ahead.__name__ in child.cmdline():
+                found.append(child)
+    return found
 
 
 @pytest.mark.integration

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import inspect
 import multiprocessing
-import os
+import signal
 import sys
-from contextlib import suppress
 from pathlib import Path
 
-import psutil
 import pytest
 from numba.core.dispatcher import Dispatcher
-from processes import wait_until
 
 from gnss_sem_map.cli import compile_ahead
 from gnss_sem_map.cli.compile_ahead import compile_kernels, compiling_ahead, listed_kernels
@@ -54,37 +51,29 @@ def test_a_demo_compiles_no_kernel_of_a_run(tmp_path: Path, monkeypatch: pytest.
         assert fresh.apply(missed_by_a_demo, (tmp_path / "demo",)) == set(), "python benchmarks/kernels.py"
 
 
-def compilers() -> list[psutil.Process]:
-    """The processes that compile ahead for this one."""
-    found = []
-    for child in psutil.Process().children():
-        with suppress(psutil.NoSuchProcess):  # it may end meanwhile
-            if compile_ahead.__name__ in child.cmdline():
-                found.append(child)
-    return found
-
-
 @pytest.mark.integration
 def test_a_second_process_compiles_until_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compile_ahead, "cores", lambda: 2)
-    with compiling_ahead():
-        assert len(compilers()) == 1
-    assert not compilers()
+    with compiling_ahead() as compiler:
+        assert compiler is not None
+        assert compiler.poll() is None
+    assert compiler.returncode == -signal.SIGTERM
 
 
 def test_there_is_none_on_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compile_ahead, "cores", lambda: 1)
-    with compiling_ahead():
-        assert not compilers()
+    with compiling_ahead() as compiler:
+        assert compiler is None
 
 
 @pytest.mark.integration
 def test_the_log_says_why_nothing_is_compiled_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compile_ahead, "cores", lambda: 2)
-    monkeypatch.setitem(os.environ, "NUMBA_DISABLE_JIT", "1")
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     said: list[str] = []
     monkeypatch.setattr(STAGES, "warning", lambda text, *values: said.append(text % values))
-    with compiling_ahead():
-        assert wait_until(lambda: not compilers())
+    with compiling_ahead() as compiler:
+        assert compiler is not None
+        compiler.wait()
     [line] = said
     assert "not ahead: AttributeError" in line

@@ -24,15 +24,15 @@ class Calls(event.Listener):
         self.lines: list[str] = []
         self._depth = 0
 
-    def on_start(self, event: event.Event) -> None:
+    def on_start(self, started: event.Event) -> None:
         """Called when numba begins to compile a function, by one thread at a time."""
-        function = event.data["dispatcher"].py_func
+        function = started.data["dispatcher"].py_func
         if self._depth == 0 and not function.__module__.startswith(LEFT_OUT):
-            arguments = ", ".join(map(written, event.data["args"]))
+            arguments = ", ".join(map(written, started.data["args"]))
             self.lines.append(f"{function.__module__} {function.__name__} {arguments}\n")
         self._depth += 1
 
-    def on_end(self, event: event.Event) -> None:
+    def on_end(self, ended: event.Event) -> None:
         """Called when it is compiled, with all that it calls."""
         self._depth -= 1
 
@@ -50,13 +50,11 @@ def written(kind: types.Type) -> str:
 def main() -> None:
     """Write the list, in the order of the first calls."""
     with TemporaryDirectory() as folder:
-        numba.config.CACHE_DIR = (
-            f"{folder}/compiled"  # where kernels are kept is chosen when they are imported
-        )
+        # before kernels are imported, and for this process alone: not for the one that compiles ahead
+        numba.config.CACHE_DIR = f"{folder}/compiled"
         from gnss_sem_map.cli.compile_ahead import LIST
         from gnss_sem_map.cli.demo import demonstrate
 
-        LIST.write_text("")  # else a second process compiles them
         calls = Calls()
         with event.install_listener("numba:compile", calls):
             demonstrate(Path(folder) / "demo")

@@ -5,8 +5,9 @@ WORK/bound/NAME/job.json, trajectory.npz    a drive that was located, in the fra
                located.json                from what, and the checksums of these
                correction.npz              how its anchors move once all drives are known
 
-Only drives whose tracks come near each other are looked at, and each group that is bound is solved alone: so the result
-for a drive depends on those that it is bound to, not on the order, nor on who else is in the map.
+Only drives whose tracks come near each other are looked at; one that had no fix for long is located to know its track.
+Each group that is bound is solved alone: so the result for a drive depends on those that it is bound to, not on the
+order, nor on who else is in the map.
 """
 
 from __future__ import annotations
@@ -132,9 +133,9 @@ def _located_groups(
             return groups, reasons
         reasons |= run.call(locate_one, "locating", ((source, (str(run.work),)) for source in wanted))
         for source in wanted:
-            file = run.work / BOUND / source.name / TRAJECTORY
-            if not reasons[source.name] and file.is_file():  # of others nothing but their fixes is known
-                places[source.name] = read_trajectory(file).positions
+            folder = run.work / BOUND / source.name
+            if not reasons[source.name] and (folder / JOB).is_file():  # others have no LiDAR odometry
+                places[source.name] = read_trajectory(folder / TRAJECTORY).positions
 
 
 def groups_of(tracks: Mapping[str, Array]) -> list[list[str]]:

@@ -58,8 +58,8 @@ def correct(
     )
     groups = by_sections(fit.graph, len(problem.intervals.keyframes), (C(0),))
     (found,) = deque(eliminate(split(linear, groups), groups), maxlen=1)
-    root = np.linalg.inv(found.R)
-    step, sigma = root @ found.d, np.sqrt(np.sum(root**2, axis=1))
+    root = np.linalg.inv(found.R())
+    step, sigma = root @ found.d(), np.sqrt(np.sum(root**2, axis=1))
     better = Calibration(
         now.time_offset_s + float(step[0]) if with_time else now.time_offset_s,
         now.p_imu_antenna + step[1:] if with_lever else now.p_imu_antenna,
@@ -74,12 +74,10 @@ def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
     T, velocities = motion_from(fit.values)
     unit, x, y, z = gtsam.noiseModel.Unit.Create(3), *problem.p_imu_antenna
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    scales = np.sqrt(fit.weights)[:, None] / problem.fixes.stddevs
-    found = problem.antennas_found(T, velocities)
-    for i, fix, scale in zip(problem.at.tolist(), found, scales, strict=True):
-        R, p = T[i, :3, :3], T[i, :3, 3]
-        by_pose, by_calibration = np.hstack([-R @ lever, R]), np.column_stack([velocities[i], R])
-        off = fix - p - R @ problem.p_imu_antenna
-        yield gtsam.JacobianFactor(
-            X(i), by_pose * scale[:, None], C(0), by_calibration * scale[:, None], off * scale, unit
-        )
+    scales = (np.sqrt(fit.weights)[:, None] / problem.fixes.stddevs)[:, :, None]
+    R, p = T[problem.at, :3, :3], T[problem.at, :3, 3]
+    by_pose = np.concatenate([-R @ lever, R], axis=2) * scales
+    by_calibration = np.concatenate([velocities[problem.at, :, None], R], axis=2) * scales
+    off = (problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna) * scales[:, :, 0]
+    for i, *row, right in zip(problem.at.tolist(), by_pose, by_calibration, off, strict=True):
+        yield gtsam.JacobianFactor(X(i), row[0], C(0), row[1], right, unit)

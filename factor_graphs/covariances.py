@@ -21,7 +21,7 @@ from factor_graphs.elimination import (
     PLACES,
     SIZE,
     by_sections,
-    eliminate,
+    conditionals,
     in_time,
     shared_keys,
     split,
@@ -89,7 +89,7 @@ def keyframe_covariances(
     shared = shared_keys(values, k)
     groups = by_sections(graph, k, shared) if also is None else in_time(k, shared)
     linear = (part.linearize(values) for part in split(graph, groups))
-    net = list(eliminate(linear, groups))
+    net = list(conditionals(linear, groups))
     children = Counter(one.parent for one in net)
     covariances, of_shared = np.empty((k, SIZE, SIZE)), np.empty((0, 0))
     # The joint covariance of a group and of those it is given, as long as it has children to come: memory does not

@@ -5,7 +5,7 @@ of the drive. GTSAM's own eliminations hold all rows that they began with, 40 to
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -71,11 +71,10 @@ def by_sections(graph: gtsam.NonlinearFactorGraph, k: int, last: Group = ()) -> 
 
 def split(graph: Graph, groups: Sequence[Group]) -> list[Graph]:
     """The factors of a graph by the group in which they are first needed; last, those that no group needs."""
-    place = {key: n for n, keys in enumerate(groups) for key in keys}
-    parts = [type(graph)() for _ in range(len(groups) + 1)]
+    first_needed, parts = _first_needed(groups), [type(graph)() for _ in range(len(groups) + 1)]
     # named, or the binding tries a factor as all that can be pushed: twice the time
     for factor in (graph.at(n) for n in range(graph.size())):
-        parts[min([place.get(key, len(groups)) for key in list(factor.keys())])].push_back(factor=factor)
+        parts[first_needed(list(factor.keys()))].push_back(factor=factor)
     return parts
 
 
@@ -83,13 +82,13 @@ def eliminate(
     parts: Iterable[gtsam.GaussianFactorGraph],
     groups: Sequence[Group],
     rest: list[gtsam.GaussianFactor] | None = None,
-) -> Iterator[Conditional]:
+) -> Iterator[gtsam.GaussianConditional]:
     """Eliminate the groups in their order; `parts` as `split` makes them.
 
     What the groups leave of variables that are in none of them is appended to `rest`. Raises RuntimeError where GTSAM
     does.
     """
-    place = {key: n for n, keys in enumerate(groups) for key in keys}
+    first_needed = _first_needed(groups)
     left_for: defaultdict[int, list[gtsam.GaussianFactor]] = defaultdict(list)
     for n, (part, keys) in enumerate(zip(parts, groups, strict=False)):
         factors = gtsam.GaussianFactorGraph()
@@ -97,16 +96,30 @@ def eliminate(
         for left in left_for.pop(n, []):
             factors.push_back(left)
         found, left = gtsam.EliminateQR(factors, ordering_of(keys))
-        later, parent = list(found.keys())[len(keys) :], -1
-        if later:
-            parent = min([place.get(key, len(groups)) for key in later])
-            left_for[parent].append(left)
-        # a copy: what R(), S() and d() give does not keep the conditional alive
-        rows = found.augmentedJacobian()
-        size = len(rows)
-        yield Conditional(later, parent, rows[:, :size], rows[:, size:-1], rows[:, -1])
+        if later := list(found.keys())[len(keys) :]:
+            left_for[first_needed(later)].append(left)
+        yield found
     if rest is not None:
         rest += left_for[len(groups)]
+
+
+def conditionals(
+    parts: Iterable[gtsam.GaussianFactorGraph], groups: Sequence[Group]
+) -> Iterator[Conditional]:
+    """As `eliminate`, without what GTSAM's conditionals hold beside their numbers: half of the memory."""
+    first_needed = _first_needed(groups)
+    for keys, found in zip(groups, eliminate(parts, groups), strict=False):
+        later = list(found.keys())[len(keys) :]
+        rows = found.augmentedJacobian()
+        size = len(rows)
+        parent = first_needed(later) if later else -1
+        yield Conditional(later, parent, rows[:, :size], rows[:, size:-1], rows[:, -1])
+
+
+def _first_needed(groups: Sequence[Group]) -> Callable[[Iterable[int]], int]:
+    """Tells which group needs some of these keys first; the number of groups where none does."""
+    place = {key: n for n, keys in enumerate(groups) for key in keys}
+    return lambda keys: min([place.get(key, len(groups)) for key in keys])
 
 
 def state_keys(i: int) -> Group:

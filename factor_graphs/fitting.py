@@ -20,7 +20,15 @@ from factor_graphs.constraints import (
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.problem import RELATIVE_TOLERANCE, Fit, Problem, fit_as_expected, motion_graph, optimise
+from factor_graphs.problem import (
+    RELATIVE_TOLERANCE,
+    ROUGH,
+    Fit,
+    Problem,
+    fit_as_expected,
+    motion_graph,
+    optimise,
+)
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
@@ -46,8 +54,8 @@ LONG_ENOUGH_S = 120.0
 # with less horizontal acceleration, m/s², nearly always, leaves the heading so unknown.
 MOST_OF_HEADING, GENTLE = 0.05, 0.5
 # The constraints are linear enough when the velocity in the imu's axes moves less than this, m/s, slip of wheels by
-# this share. Until then the cost need not be better than so much of itself: the next solution begins there.
-CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP, ROUGH = 4, 0.3, 0.2, 1e-3
+# this share. Until then a rough solution will do.
+CONSTRAINT_ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
 
 
 def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
@@ -55,9 +63,10 @@ def fit_noise(problem: Problem) -> tuple[Problem, Fit]:
 
     The loss is Huber's already, or outliers would be taken for a bad IMU; chi2 counts good fixes only. Fixes that are
     worse than they say would be followed by an IMU that is inflated without end. Only variance components tell one from
-    the other. Not where relative poses bind the keyframes: they may not fit either.
+    the other. Not where relative poses bind the keyframes: they may not fit either. The first fit is a rough one, for
+    all that follow begin there; where relative poses bind, a rough one may be centimetres away.
     """
-    fit = fit_as_expected(problem)
+    fit = fit_as_expected(problem, RELATIVE_TOLERANCE if problem.is_bound else ROUGH)
     if _fits(problem, fit):
         return problem, fit
     if not problem.is_bound:

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
 
 import gtsam
 import numpy as np
@@ -16,7 +15,6 @@ from factor_graphs.alignment import (
     first_guess,
 )
 from factor_graphs.chi_square import probability_below, quantile
-from factor_graphs.elimination import in_time, ordering_of, shared_keys
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import (
@@ -28,7 +26,7 @@ from factor_graphs.graph import (
     to_values,
 )
 from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
-from factor_graphs.levenberg_marquardt import minimise
+from factor_graphs.least_squares import gauss_newton, levenberg_marquardt
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
@@ -45,8 +43,8 @@ RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below
 # A fix so near to a relative pose needs no keyframe of its own, s: it is carried there by velocity. Braking at 3 m/s²
 # moves it by 1 mm; a KITTI unit reports 10 to 23 ms after a scan, so the graph has half of the keyframes.
 CARRIED_S = 0.025
-# The cost stands still when it changes by less than this share.
-RELATIVE_TOLERANCE = 1e-5
+# The cost stands still when it changes by less than this share; by the second where another solution begins there.
+RELATIVE_TOLERANCE, ROUGH = 1e-5, 1e-3
 
 LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
     "quadratic": None,
@@ -216,10 +214,12 @@ def usable_fixes(
     return used, notes
 
 
-def fit_as_expected(problem: Problem) -> Fit:
-    """The solution from the first guess, with the noise that is expected; raises EstimationError."""
+def fit_as_expected(problem: Problem, tolerance: float = RELATIVE_TOLERANCE) -> Fit:
+    """The solution from the first guess, with the noise that is expected; `tolerance` and errors as in `optimise`."""
     motion = motion_graph(problem, 1.0, 1.0)
-    return optimise(problem, motion, first_values(problem), (1.0, 1.0), problem.first_loss)
+    return optimise(
+        problem, motion, first_values(problem), (1.0, 1.0), problem.first_loss, tolerance=tolerance
+    )
 
 
 def motion_graph(problem: Problem, inflation: float, of_walk: float) -> gtsam.NonlinearFactorGraph:
@@ -291,44 +291,6 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
     return float(total / max(GOOD_MEAN * good.sum() + RELATIVE_GOOD_MEAN * relative_good.sum(), GOOD_MEAN))
 
 
-def _undamped(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, k: int, limit: int, tolerance: float
-) -> tuple[gtsam.Values, int] | None:
-    """Gauss-Newton, until a step gains what the linear graph says that it gains; None where a step gains nothing.
-
-    Where the two agree to `tolerance` of the cost, the next step would hardly gain more than that: it need not be made
-    to see it. A step is also cheaper than a damped one. Not for a graph that relative poses bind: it has directions
-    in which a centimetre costs less than the tolerance.
-    """
-    undamped = gtsam.GaussNewtonParams()
-    undamped.setLinearSolverType("MULTIFRONTAL_QR")
-    # to find an ordering, GTSAM takes four times as long per keyframe of two hours as of ten minutes
-    involved = graph.keys()
-    shared = tuple(key for key in shared_keys(start, k) if involved.count(key))
-    undamped.setOrdering(ordering_of(chain.from_iterable(in_time(k, shared))))
-    newton = gtsam.GaussNewtonOptimizer(graph, start, undamped)
-    try:
-        for iteration in range(1, limit + 1):
-            cost, expected = newton.error(), _step(newton)
-            if expected is None:
-                return None
-            if abs(cost - newton.error() - expected) <= tolerance * newton.error():
-                return newton.values(), iteration
-    except RuntimeError:  # a graph that only damping makes regular
-        return None
-    return None
-
-
-def _step(newton: gtsam.GaussNewtonOptimizer) -> float | None:
-    """Make a step; what the linear graph, gone then, says that it gains, or None where it gains nothing."""
-    before, cost = gtsam.Values(newton.values()), newton.error()  # a copy: values() is a view
-    linear = newton.iterate()
-    if not newton.error() <= cost:
-        return None
-    step, none = before.localCoordinates(newton.values()), before.zeroVectors()
-    return float(linear.error(none) - linear.error(step))
-
-
 def _minimise(
     problem: Problem, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float
 ) -> tuple[gtsam.Values, int]:
@@ -340,9 +302,9 @@ def _minimise(
     k, limit = len(problem.intervals.keyframes), problem.settings.max_iterations
     try:
         if problem.is_bound:
-            values, iterations = minimise(graph, start, k, limit, tolerance)
+            values, iterations = levenberg_marquardt(graph, start, k, limit, tolerance)
         else:
-            found = _undamped(graph, start, k, limit, tolerance)
+            found = gauss_newton(graph, start, k, limit, tolerance)
             values, iterations = found or _minimise_whole(graph, start, limit, tolerance)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]

@@ -28,6 +28,8 @@ CHANCE, ENOUGH, ENOUGH_OF_WALK = 0.99, 1.05, 1.1
 # Errors of fixes are correlated where those of neighbours are, by so much: with so many fixes it is beyond chance. For
 # so long, s, an IMU knows the way better than fixes.
 CORRELATED, FEWEST_CORRELATED, KNOWN_WAY_S = 0.3, 60, 5.0
+# Rows of the graph are looked at in blocks of so many, few enough for the cache.
+BLOCK = 1_000
 # A power of the ratio of variances that is changed by, one half if what unknowns take did not follow it; and the most.
 POWER, MOST = 0.75, 4.0
 
@@ -133,19 +135,16 @@ def _redundancy(fit: Fit, covariances: Array) -> float:
     """Rows of the IMU, less what the unknowns take from them: all unknowns, less what they take from other factors."""
     k, others, total = len(covariances), gtsam.NonlinearFactorGraph(), 0.0
     for n in range(k - 1, fit.graph.size()):
-        others.add(fit.graph.at(n))
-    linear = others.linearize(fit.values)
-    for n in range(linear.size()):
-        factor = linear.at(n)
-        assert isinstance(factor, gtsam.JacobianFactor)
-        A, begin = factor.jacobian()[0], 0
-        rows, i = np.zeros((len(A), covariances.shape[1])), -1
-        for letter, index in map(split_key, factor.keys()):
-            place = PLACES[letter]
-            end = begin + len(place)
-            if index < k:
-                rows[:, place], i = A[:, begin:end], index
-            begin = end
-        if i >= 0:
-            total += float(np.sum(rows @ covariances[i] * rows))
+        others.push_back(factor=fit.graph.at(n))
+    # of every column of the Jacobian its keyframe and its place there; the right side is the last column
+    columns = [(i, place) for letter, i in map(split_key, others.keyVector()) for place in PLACES[letter]]
+    keyframe, place = np.array([*columns, (k, 0)]).T
+    row, column, value = others.linearize(fit.values).sparseJacobian_()
+    row, column = row.astype(int) - 1, column.astype(int) - 1
+    of_state = keyframe[column] < k
+    row, column, value = row[of_state], column[of_state], value[of_state]
+    at, A = np.zeros(row.max() + 1, int), np.zeros((row.max() + 1, SIZE))
+    at[row], A[row, place[column]] = keyframe[column], value
+    for rows in np.array_split(np.arange(len(A)), len(A) // BLOCK + 1):
+        total += float(np.einsum("ri,rij,rj->", A[rows], covariances[at[rows]], A[rows]))
     return total - SIZE

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.problem import Problem, pose_problem
+from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.rigid_motion import RigidMotion
+from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import random_drive, simulate_biases, simulate_gnss, simulate_imu
 from factor_graphs.smoothing import Solution, smooth
 
@@ -61,3 +64,23 @@ def mems() -> Drive:
 @pytest.fixture(scope="session")
 def mems_solution(mems: Drive) -> Solution:
     return smooth(mems.imu, mems.fixes, FRAME, None, LEVER)
+
+
+def odometry(motion: RigidMotion, stamps: NDArray[np.float64]) -> RelativePoses:
+    """Relative poses without errors: each keyframe to the next, and every fifth, an anchor, to all up to the next."""
+    earlier = np.concatenate([np.arange(len(stamps) - 1), np.arange(len(stamps) - 1) // 5 * 5])
+    pairs = np.unique(np.column_stack([earlier, np.tile(np.arange(1, len(stamps)), 2)]), axis=0)
+    T = motion.poses(stamps)
+    between = np.linalg.inv(T[pairs[:, 0]]) @ T[pairs[:, 1]]
+    covariance = np.diag(np.repeat([1e-3, 0.01], 3) ** 2)
+    return RelativePoses(stamps[pairs], between, np.tile(covariance, (len(pairs), 1, 1)))
+
+
+@pytest.fixture
+def bound() -> Problem:
+    """A problem whose keyframes are bound by odometry."""
+    one = drive(2, seconds=20.0, noise=ImuNoise())
+    relative = odometry(one.motion, np.arange(1.0, 19.0, 0.2))
+    problem = pose_problem(one.imu, one.fixes, FRAME, SmootherSettings(), LEVER, None, relative)
+    assert problem.is_bound
+    return problem

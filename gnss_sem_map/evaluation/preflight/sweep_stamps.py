@@ -16,6 +16,8 @@ LENGTHS_S = (0.02, 0.5)
 """Scanners turn 2 to 50 times a second."""
 OFF = 0.3
 """Lengths and middles may be off by this part of a sweep: scanners turn evenly, to a few percent."""
+GAP_SWEEPS, GAP_S = 10, 1.0
+"""A step from scan to scan that is longer than both is a gap: a reader may miss a sweep or two."""
 FEW, MANY = 0.02, 0.2
 """More than the first share of odd sweeps is amber, more than the second red: a lost line shifts all that follow."""
 
@@ -55,11 +57,26 @@ def check(sample: Sample) -> Iterator[Finding]:
             "give the stamps in seconds",
         )
         return
+    yield from _gaps(stamps, interval)
     spans = np.array([scan.sweep or (np.nan, np.nan) for scan in scans])
     if np.isnan(spans).any():
         yield green(NAME, f"{len(scans)} scans, {interval:.3f} s apart")
         return
     yield _spans(stamps, spans, interval)
+
+
+def _gaps(stamps: Array, interval: float) -> Iterator[Finding]:
+    steps = np.diff(stamps)
+    gaps = np.flatnonzero(steps > max(GAP_SWEEPS * interval, GAP_S))
+    if len(gaps):
+        longest = int(gaps[steps[gaps].argmax()])
+        yield amber(
+            NAME,
+            f"there is no scan for {steps[longest]:.1f} s after {stamps[longest]:.3f} s; usually one comes every"
+            f" {interval:.3f} s (gaps: {len(gaps)}, {steps[gaps].sum():.1f} s in all)",
+            "the LiDAR was off, or its messages were lost",
+            "the map has holes there: look for files or messages that are missing, or record again",
+        )
 
 
 def _span_of_motion(sample: Sample) -> tuple[float, float] | None:

@@ -174,6 +174,16 @@ def test_a_lost_line_of_sweep_stamps_is_named(town: SensorLog, name: str) -> Non
     assert f"timestamps{part}.txt" in mistakes(replace(town, scans=tuple(scans[:-1])))
 
 
+@pytest.mark.parametrize(("missing", "seconds"), [(2, None), (9, None), (12, 1.3)])
+def test_a_second_without_scans_is_said(town: SensorLog, missing: int, seconds: float | None) -> None:
+    log = replace(town, scans=town.scans[:8] + town.scans[8 + missing :])
+    found = [finding for finding in not_green(log) if "no scan for" in finding.evidence]
+    assert [finding.level for finding in found] == ([] if seconds is None else [Level.AMBER])
+    for finding in found:
+        assert f"no scan for {seconds} s after {town.scans[7].stamp:.3f} s" in finding.evidence
+        assert "gaps: 1," in finding.evidence
+
+
 def test_sweeps_that_the_reader_left_out_are_not_forgotten(town: SensorLog) -> None:
     skips = tuple(Skip("scan", str(k), "the sweep ends before it starts") for k in range(20))
     assert "timestamps_start.txt" in mistakes(replace(town, skips=skips))

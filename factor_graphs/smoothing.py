@@ -15,7 +15,6 @@ from factor_graphs.errors import MeasurementError
 from factor_graphs.fitting import (
     FITTING_CHI2,
     calibrate,
-    constrain,
     fit_noise,
     fit_noise_by_components,
     reject,
@@ -23,6 +22,7 @@ from factor_graphs.fitting import (
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
 from factor_graphs.heading import of_any_heading, with_heading
+from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
 from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses

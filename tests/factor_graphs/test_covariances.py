@@ -3,8 +3,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, M, V, X
 
 from factor_graphs.covariances import keyframe_covariances
-from factor_graphs.fitting import constrain, fit_noise
+from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.problem import pose_problem
 from factor_graphs.settings import SmootherSettings

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import M, X
 
-from factor_graphs.fitting import constrain, fit_noise
+from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
+from factor_graphs.held_constraints import constrain
 from factor_graphs.least_squares import gauss_newton, levenberg_marquardt
 from factor_graphs.problem import first_values, motion_graph, optimise, pose_problem
 from factor_graphs.settings import SmootherSettings

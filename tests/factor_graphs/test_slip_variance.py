@@ -9,8 +9,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.covariances import SIZE, SumVariance, keyframe_covariances
-from factor_graphs.fitting import constrain, fit_noise
+from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.problem import pose_problem
 from factor_graphs.rigid_motion import FreeMotion

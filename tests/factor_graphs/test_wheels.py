@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.accuracy import errors, nees
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import keyframe_covariances
-from factor_graphs.fitting import constrain, fit_noise
+from factor_graphs.fitting import fit_noise
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import ImuNoise, WheelSpeeds
 from factor_graphs.problem import pose_problem
 from factor_graphs.rigid_motion import Mounted

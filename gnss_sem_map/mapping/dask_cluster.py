@@ -7,15 +7,17 @@ Only names and paths are sent: a Dask worker that is sent large data runs out of
 from __future__ import annotations
 
 import json
+import logging
 import secrets
 import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -86,11 +88,12 @@ class Cluster:
 
     @contextmanager
     def _checked(self) -> Iterator[Client]:
-        with _connected(self.address) as client:
+        with _quiet_client(), _connected(self.address) as client:
+            ask = partial(_asked, client, self.address)
             _wait_for_worker(client, self.address)
-            _refuse_other_versions(client)
-            _refuse_without_nanny(client)
-            _refuse_own_folders(client, self.work.resolve())
+            _refuse_other_versions(ask)
+            _refuse_without_nanny(ask)
+            _refuse_own_folders(ask, self.work.resolve())
             yield client
 
     def _submit(self, client: Client, task: Task) -> Future[Any]:
@@ -176,11 +179,30 @@ class _Threads:
 
 
 def _nthreads(client: Client, address: str) -> dict[str, int]:
-    try:
+    with _scheduler_there(address):
         return dict(client.nthreads())
+
+
+@contextmanager
+def _scheduler_there(address: str) -> Iterator[None]:
+    """Raise DataError when the scheduler is lost while it is asked."""
+    try:
+        yield
     # CommClosedError is an OSError; a client that was closed has no scheduler
-    except (OSError, AttributeError):
+    except (OSError, AttributeError, CancelledError):
         raise DataError(f"scheduler {address}: was lost; see that it runs, and --resume") from None
+
+
+@contextmanager
+def _quiet_client() -> Iterator[None]:
+    """Dask's client does not log: it tells of a lost scheduler with a traceback, and we in one line."""
+    log = logging.getLogger("distributed.client")
+    before = log.disabled
+    log.disabled = True
+    try:
+        yield
+    finally:
+        log.disabled = before
 
 
 @contextmanager
@@ -207,28 +229,42 @@ def _connected(address: str) -> Iterator[Client]:
 
 
 def _wait_for_worker(client: Client, address: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
-    except TimeoutError:
-        raise DataError(
-            f"scheduler {address}: has no worker after {FIRST_WORKER_S:g} s; start some: dask worker {address}"
-        ) from None
+    with _scheduler_there(address):
+        try:
+            client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+        except TimeoutError:
+            raise DataError(
+                f"scheduler {address}: has no worker after {FIRST_WORKER_S:g} s; start some: dask worker {address}"
+            ) from None
 
 
-def _refuse_other_versions(client: Client) -> None:
+def _asked(client: Client, address: str, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
+    """What a function returns on every worker; one that dies meanwhile is left out, as Dask starts it again.
+
+    Raises DataError for a worker that cannot call it, and for a scheduler that is lost.
+    """
+    with _scheduler_there(address):
+        said = client.run(function, *arguments, on_error="return")
+    for worker, one in said.items():
+        if isinstance(one, Exception) and not isinstance(one, OSError):
+            raise DataError(
+                f"Dask worker {worker}: has no {PACKAGE} ({one}); install version {_version()} in its Python"
+            )
+    return {worker: one for worker, one in said.items() if not isinstance(one, OSError)}
+
+
+def _refuse_other_versions(ask: Callable[..., dict[str, Any]]) -> None:
     """Every worker must have our package, of our version; asked with a function that every Python has."""
     ours = _version()
-    for worker, found in client.run(metadata.version, PACKAGE, on_error="return").items():
-        if isinstance(found, Exception):
-            raise DataError(f"Dask worker {worker}: has no {PACKAGE}; install version {ours} in its Python")
+    for worker, found in ask(metadata.version, PACKAGE).items():
         if found != ours:
             raise DataError(
                 f"Dask worker {worker}: has {PACKAGE} {found}; expected {ours}, as here; install that"
             )
 
 
-def _refuse_without_nanny(client: Client) -> None:
-    for worker, has_nanny in client.run(_has_nanny).items():
+def _refuse_without_nanny(ask: Callable[..., dict[str, Any]]) -> None:
+    for worker, has_nanny in ask(_has_nanny).items():
         if not has_nanny:
             raise DataError(
                 f"Dask worker {worker}: has no nanny, which restarts it when it hangs or needs too much memory; start"
@@ -236,7 +272,7 @@ def _refuse_without_nanny(client: Client) -> None:
             )
 
 
-def _refuse_own_folders(client: Client, work: Path) -> None:
+def _refuse_own_folders(ask: Callable[..., dict[str, Any]], work: Path) -> None:
     """Every worker must read what is written here, and the other way round."""
     token = secrets.token_hex(8)
     files = [_token_file(work, token, 0)]
@@ -245,7 +281,7 @@ def _refuse_own_folders(client: Client, work: Path) -> None:
             files[0].write_text(token)
         except OSError as error:
             raise DataError(f"{work}: cannot be written ({error.strerror}); choose another folder") from None
-        for worker, number in client.run(_read_and_write, str(work), token).items():
+        for worker, number in ask(_read_and_write, str(work), token).items():
             files.append(_token_file(work, token, number))
             if not number or not files[-1].is_file():
                 raise DataError(

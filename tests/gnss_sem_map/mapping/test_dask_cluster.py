@@ -10,10 +10,12 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import small_tasks
 from processes import wait_until
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
@@ -146,7 +148,7 @@ def test_dask_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, tmp
     ("preload", "message"),
     [
         (OTHER_VERSION, r"Dask worker tcp://\S+: has gnss-sem-map 0\.0\.1; expected \d+\.\d+\S*, as here"),
-        (NO_PACKAGE, r"Dask worker tcp://\S+: has no gnss-sem-map; install version \d"),
+        (NO_PACKAGE, r"Dask worker tcp://\S+: has no gnss-sem-map \(.*\); install version \d"),
         (OWN_FOLDER, r"Dask worker tcp://\S+: does not share the folder /"),
     ],
 )
@@ -203,6 +205,37 @@ def test_a_scheduler_that_dies_on_the_way_is_told(monkeypatch: pytest.MonkeyPatc
                     [task("begins_and_waits", str(begun))] * 3, Cluster(address, tmp_path, allowed=ALLOWED)
                 )
             killer.join()
+
+
+def test_a_scheduler_that_dies_while_workers_are_asked_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "scheduler.json"
+    with started("scheduler", file, "--port", "0", "--dashboard-address", ":0") as dying:
+        assert wait_until(file.exists)
+        with started("worker", file, "--nthreads", "1", "--no-dashboard"):
+            asked = dask_cluster._refuse_without_nanny
+
+            def ask(*words: Any) -> None:
+                dying.kill()
+                os.waitid(os.P_PID, dying.pid, os.WEXITED | os.WNOWAIT)
+                asked(*words)
+
+            monkeypatch.setattr(dask_cluster, "_refuse_without_nanny", ask)
+            address = json.loads(file.read_text())["address"]
+            with pytest.raises(DataError, match=r"scheduler.* lost; see that it runs, and --resume"):
+                results(products(1), Cluster(address, tmp_path, allowed=ALLOWED))
+    assert [record for record in caplog.records if record.name == "distributed.client"] == []
+
+
+def test_a_dask_worker_that_dies_while_it_is_asked_is_left_out(
+    scheduler: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    dead, work = tmp_path / "dead", tmp_path / "work"
+    work.mkdir()
+    monkeypatch.setattr(dask_cluster, "_has_nanny", partial(small_tasks.dies_once, str(dead)))
+    assert len(results(products(4), Cluster(scheduler, work, allowed=ALLOWED))) == 4
+    assert dead.is_dir()
 
 
 @contextmanager

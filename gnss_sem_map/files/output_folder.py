@@ -287,7 +287,9 @@ def locked(out: Path) -> Iterator[None]:
     try:
         file = _lock(path, out)
     except OSError as error:
-        raise DataError(f"{out}: cannot be written ({error.strerror}); choose another -o") from None
+        raise DataError(
+            f"{out}: cannot be written ({error.strerror}); see to its rights, or choose another place"
+        ) from None
     with file:
         try:
             yield

@@ -35,12 +35,13 @@ FORWARD_WINDOW_S = 100.0
 class AttitudePrior:
     """What is known of the attitude at the IMU's first stamp: a rotation and its standard deviations.
 
-    `R_map_imu` (3, 3); `stddevs` (3,) rad about the imu's x, y, z. Raises MeasurementError when it is no
-    rotation or a stddev is not positive.
+    `R_map_imu` (3, 3); `stddevs` (3,) rad about the imu's x, y, z, or `in_map` about east, north, up. Raises
+    MeasurementError when it is no rotation or a stddev is not positive.
     """
 
     R_map_imu: Array
     stddevs: Array
+    in_map: bool = False
 
     def __post_init__(self) -> None:
         R, stddevs = np.asarray(self.R_map_imu, dtype=np.float64), np.asarray(self.stddevs, dtype=np.float64)
@@ -50,6 +51,18 @@ class AttitudePrior:
             raise MeasurementError(f"AttitudePrior.stddevs is {stddevs}; expected three positive values, rad")
         object.__setattr__(self, "R_map_imu", R)
         object.__setattr__(self, "stddevs", stddevs)
+
+    @property
+    def covariance(self) -> Array:
+        """About the imu's x, y, z, (3, 3) rad²."""
+        variances, R = np.diag(self.stddevs**2), self.R_map_imu
+        return np.asarray(R.T @ variances @ R if self.in_map else variances)
+
+    @property
+    def heading_stddev(self) -> float:
+        """About the map's up axis, rad, however the imu is mounted."""
+        up = self.R_map_imu[2]
+        return float(np.sqrt(up @ self.covariance @ up))
 
 
 def first_guess(
@@ -119,7 +132,7 @@ def attitudes(
     weight = np.where((speed > MIN_COURSE_SPEED) & (age < MAX_COURSE_AGE), np.minimum(speed, 10.0), 0.0)
     ahead = np.exp(1j * (np.arctan2(velocities[:, 1], velocities[:, 0]) - turned))
     if attitude is not None:
-        weight[0] = 1 / attitude.stddevs[2]
+        weight[0] = 1 / attitude.heading_stddev
         ahead[0] = np.exp(1j * np.arctan2(attitude.R_map_imu[1, 0], attitude.R_map_imu[0, 0]))
     # the course is along the axis of the vehicle, whether it goes forward or reverses
     axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_WINDOW_S)

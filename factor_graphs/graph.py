@@ -98,11 +98,10 @@ def prior_factors(
     noise: ImuNoise,
 ) -> Iterator[gtsam.NonlinearFactor]:
     """What is known of the first keyframe before any fix: finite in every direction, or GTSAM 4.3 fails."""
-    pose_stddevs = np.concatenate([attitude.stddevs, np.full(3, position_stddev)])
-    rotation = gtsam.Rot3(attitude.R_map_imu)
-    yield gtsam.PriorFactorPose3(
-        X(0), gtsam.Pose3(rotation, pose[:3, 3]), gtsam.noiseModel.Diagonal.Sigmas(pose_stddevs)
-    )
+    covariance = position_stddev**2 * np.eye(6)
+    covariance[:3, :3] = attitude.covariance
+    model, rotation = gtsam.noiseModel.Gaussian.Covariance(covariance), gtsam.Rot3(attitude.R_map_imu)
+    yield gtsam.PriorFactorPose3(X(0), gtsam.Pose3(rotation, pose[:3, 3]), model)
     yield gtsam.PriorFactorVector(V(0), velocity, gtsam.noiseModel.Isotropic.Sigma(3, speed_stddev))
     bias_stddevs = np.repeat([noise.accelerometer_bias_stddev, noise.gyroscope_bias_stddev], 3)
     yield gtsam.PriorFactorConstantBias(

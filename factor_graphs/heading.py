@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from factor_graphs.alignment import AttitudePrior
 from factor_graphs.chi_square import quantile
 from factor_graphs.errors import EstimationError
 from factor_graphs.graph import motion_from
@@ -30,7 +29,7 @@ ANY = np.pi / np.sqrt(3)
 
 def with_heading(problem: Problem) -> Problem:
     """The problem with the first guess of which the solution is best, and with the doubt whether another is as good."""
-    if problem.is_bound or problem.attitude.stddevs[2] < UNKNOWN or not _is_slow(problem):
+    if problem.is_bound or problem.attitude.heading_stddev < UNKNOWN or not _is_slow(problem):
         return problem
     tried = [_solved(_turned(problem, turn)) for turn in TURNS_DEG]
     found = [one for one in tried if one is not None]
@@ -73,7 +72,7 @@ def _turned(problem: Problem, turn_deg: float) -> Problem:
     antenna = T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna
     T[:, :3, :3] = turn @ T[:, :3, :3]
     T[:, :3, 3] = antenna - T[:, :3, :3] @ problem.p_imu_antenna
-    attitude = AttitudePrior(turn @ problem.attitude.R_map_imu, problem.attitude.stddevs)
+    attitude = replace(problem.attitude, R_map_imu=turn @ problem.attitude.R_map_imu)
     return replace(problem, guess=(T, velocities), attitude=attitude)
 
 

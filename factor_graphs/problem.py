@@ -161,7 +161,7 @@ def pose_problem(
     noise = noise_as_sampled(imu, settings.imu_noise or ImuNoise())
     at, guess = intervals.keyframe_of(kept.stamps), first_guess(intervals, kept, p_imu_antenna, attitude)
     unknown = np.array([*[settings.start_tilt_stddev_rad] * 2, settings.start_heading_stddev_rad])
-    attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown)
+    attitude = attitude or AttitudePrior(guess[0][0, :3, :3], unknown, in_map=True)
     return Problem(
         settings=settings,
         frame=frame,

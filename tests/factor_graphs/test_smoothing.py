@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import anees_band, errors, nees, state_error
 from factor_graphs.alignment import AttitudePrior
@@ -121,6 +122,20 @@ def test_a_frame_elsewhere_on_the_earth_sees_the_same_trajectory(mems):
     after = smooth(mems.imu, fixes, far, None, LEVER).trajectory
     np.testing.assert_allclose(after.positions, before.positions, atol=5e-3)
     np.testing.assert_allclose(after.T_map_imu[:, :3, :3], before.T_map_imu[:, :3, :3], atol=1e-3)
+
+
+@pytest.mark.parametrize("euler_deg", [[0, 0, 90], [0, -90, 0], [123, -40, 77]])
+def test_an_imu_that_is_mounted_otherwise_sees_the_same_trajectory(mems, euler_deg):
+    """Which way it looks is unknown about the vertical, not about an axis of the IMU."""
+    turn = Rotation.from_euler("ZYX", euler_deg, degrees=True).as_matrix()  # to the level imu
+    force, rate = mems.imu.specific_force @ turn, mems.imu.angular_rate @ turn
+    settings = SmootherSettings(vehicle_constraint="off")
+    level = smooth(mems.imu, mems.fixes, FRAME, settings, LEVER)
+    turned = smooth(ImuSamples(mems.imu.stamps, force, rate), mems.fixes, FRAME, settings, LEVER @ turn)
+    assert turned.chi2_per_dof == pytest.approx(level.chi2_per_dof, rel=0.02)
+    np.testing.assert_allclose(turned.trajectory.positions, level.trajectory.positions, atol=0.02)
+    R = turned.trajectory.T_map_imu[:, :3, :3] @ turn.T
+    np.testing.assert_allclose(R, level.trajectory.T_map_imu[:, :3, :3], atol=5e-3)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])

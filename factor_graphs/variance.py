@@ -68,9 +68,12 @@ def imu_noise_shown(problem: Problem, fit: Fit, covariances: Array, steps: BiasS
 def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     """How many times more noise the fixes have than they say, at least 1; as the problem has it if it fits.
 
-    By the good ones, and the state covariances (k, 15, 15) of a fit: outliers are no noise.
+    By the good ones, and the state covariances (k, 15, 15) of a fit: outliers are no noise. Where most look like
+    outliers, they are noise, and the median tells how much; the next fits tell it better.
     """
     good = fit.squares < GATE
+    if 2 * good.sum() < len(good):
+        return problem.of_fixes * min(float(np.sqrt(np.median(fit.squares) / quantile(0.5, 3))), MOST)
     at, (x, y, z) = problem.at[good], problem.p_imu_antenna
     R_map_imu = motion_from(fit.values)[0][at, :3, :3]
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

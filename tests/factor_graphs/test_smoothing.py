@@ -138,6 +138,19 @@ def test_an_imu_that_is_mounted_otherwise_sees_the_same_trajectory(mems, euler_d
     np.testing.assert_allclose(R, level.trajectory.T_map_imu[:, :3, :3], atol=5e-3)
 
 
+@pytest.mark.parametrize("claimed", [0.05, 1e-6])
+def test_fixes_that_claim_centimetres_and_scatter_by_a_metre_are_not_taken_for_a_bad_imu(mems, claimed):
+    fixes = GnssFixes(mems.fixes.stamps, mems.fixes.positions, claimed * mems.fixes.stddevs)
+    s = smooth(mems.imu, fixes, FRAME, None, LEVER)
+    believed = np.maximum(fixes.stddevs[0], SmootherSettings().min_fix_stddev_m)
+    assert s.fix_inflation == pytest.approx(
+        np.sqrt(np.mean((mems.fixes.stddevs[0] / believed) ** 2)), rel=0.2
+    )
+    assert s.inflation < 1.2
+    assert s.rejected.sum() < 0.05 * len(fixes)
+    assert error_of(s, mems).horizontal_rms_m < 0.5
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_outliers_are_rejected_and_hardly_hurt(simulate, share):
     drive = simulate(5, noise=ImuNoise(), outlier_share=share)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.chi_square import quantile
+from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import EstimationError
 from factor_graphs.graph import motion_from
 from factor_graphs.problem import Fit, Problem, fit_as_expected
@@ -23,6 +24,8 @@ SLOW_MPS, COURSE_S, UNKNOWN = 3.0, 20.0, 1.0
 TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 # Another heading, so far away, rad, fits as well when its cost is that of a good one of 999 in a thousand.
 APART, AS_GOOD = 0.5, quantile(0.999, 1)
+# Within so many standard deviations a heading is sure.
+SURELY = 3.0
 # Standard deviation of a heading that may be any, rad.
 ANY = np.pi / np.sqrt(3)
 
@@ -42,7 +45,15 @@ def with_heading(problem: Problem) -> Problem:
     off = Rotation.from_matrix(R_map_imu @ R_map_imu[int(costs.argmin())].T).as_rotvec()[:, 2]
     as_good = costs - costs.min() < AS_GOOD
     in_doubt = bool(np.any(as_good & (np.abs(off) > APART)))
+    if len(found) < len(tried):  # a guess without solution excludes no heading
+        in_doubt |= SURELY * _heading_stddev(best_fit, len(problem.intervals.keyframes)) > APART
     return replace(best, guess=motion_from(best_fit.values), heading_in_doubt=in_doubt)
+
+
+def _heading_stddev(fit: Fit, k: int) -> float:
+    """Standard deviation of the heading where it is known best, rad."""
+    up, covariances = motion_from(fit.values)[0][:, 2, :3], keyframe_covariances(fit.graph, fit.values, k)[0]
+    return float(np.sqrt(np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up).min()))
 
 
 def _is_slow(problem: Problem) -> bool:

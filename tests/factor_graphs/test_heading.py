@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from factor_graphs import heading
 from factor_graphs.accuracy import errors, pose_nees
 from factor_graphs.chi_square import quantile
 from factor_graphs.geodesy import LocalFrame
@@ -50,6 +51,16 @@ def test_the_heading_of_a_slow_vehicle_does_not_lean_to_that_of_the_guess(simula
     assert off.heading_rms_deg < 3 * np.degrees(heading_stddevs(found.keyframes).max())
     assert np.degrees(heading_stddevs(found.keyframes).max()) < 15.0
     assert not any("heading" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(("speed", "in_doubt"), [(0.0, True), (1.4, False)])
+def test_a_guess_without_a_solution_excludes_no_heading(simulate, monkeypatch, speed, in_doubt):
+    """The optimiser crawls where every heading fits. What is known by the one solution that is found needs no other."""
+    drive = simulate(62, noise=ImuNoise(), moves=winding(speed, 30.0))
+    problem = pose_problem(drive.imu, drive.fixes, FRAME, SmootherSettings(), LEVER, None)
+    found = [heading._solved(problem), None, None, None]
+    monkeypatch.setattr(heading, "_solved", lambda _: found.pop(0))
+    assert with_heading(problem).heading_in_doubt == in_doubt
 
 
 def test_a_vehicle_that_drives_is_looked_at_once(simulate, mems):

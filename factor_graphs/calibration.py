@@ -79,5 +79,5 @@ def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
     by_pose = np.concatenate([-R @ lever, R], axis=2) * scales
     by_calibration = np.concatenate([velocities[problem.at, :, None], R], axis=2) * scales
     off = (problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna) * scales[:, :, 0]
-    for i, *row, right in zip(problem.at.tolist(), by_pose, by_calibration, off, strict=True):
-        yield gtsam.JacobianFactor(X(i), row[0], C(0), row[1], right, unit)
+    for i, pose, calibration, right in zip(problem.at.tolist(), by_pose, by_calibration, off, strict=True):
+        yield gtsam.JacobianFactor(X(i), pose, C(0), calibration, right, unit)

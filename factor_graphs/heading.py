@@ -46,14 +46,20 @@ def with_heading(problem: Problem) -> Problem:
     as_good = costs - costs.min() < AS_GOOD
     in_doubt = bool(np.any(as_good & (np.abs(off) > APART)))
     if len(found) < len(tried):  # a guess without solution excludes no heading
-        in_doubt |= SURELY * _heading_stddev(best_fit, len(problem.intervals.keyframes)) > APART
+        T, _ = motion_from(best_fit.values)
+        covariances, _ = keyframe_covariances(best_fit.graph, best_fit.values, len(T))
+        in_doubt |= bool(SURELY * stddevs_of_heading(T[:, :3, :3], covariances).min() > APART)
     return replace(best, guess=motion_from(best_fit.values), heading_in_doubt=in_doubt)
 
 
-def _heading_stddev(fit: Fit, k: int) -> float:
-    """Standard deviation of the heading where it is known best, rad."""
-    up, covariances = motion_from(fit.values)[0][:, 2, :3], keyframe_covariances(fit.graph, fit.values, k)[0]
-    return float(np.sqrt(np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up).min()))
+def stddevs_of_heading(R_map_imu: Array, covariances: Array) -> Array:
+    """Standard deviation of the heading (k,) rad by covariances (k, n, n), whose first three are of the rotation.
+
+    The rotation of the tangent, in the axes that R_map_imu (k, 3, 3) turns to the map, about the map's up axis.
+    """
+    up = R_map_imu[:, 2]
+    variances: Array = np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up)
+    return np.sqrt(variances)
 
 
 def _is_slow(problem: Problem) -> bool:

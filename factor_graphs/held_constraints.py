@@ -18,6 +18,7 @@ from factor_graphs.constraints import (
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import FITTING_CHI2, fit_noise_from
 from factor_graphs.graph import from_values
+from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.slip import Slip
@@ -190,8 +191,7 @@ def _heading_if_gentle(problem: Problem, fit: Fit) -> float:
     if np.quantile(np.linalg.norm(changes, axis=1), 0.9) > GENTLE:
         return 0.0
     covariances, _ = keyframe_covariances(fit.graph, fit.values, k)
-    up = T[:, 2, :3]
-    return float(np.sqrt(np.median(np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up))))
+    return float(np.median(stddevs_of_heading(T[:, :3, :3], covariances)))
 
 
 def _quiet(problem: Problem) -> NDArray[np.bool_]:

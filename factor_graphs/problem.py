@@ -294,7 +294,7 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
 def _minimise(
     problem: Problem, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float
 ) -> tuple[gtsam.Values, int]:
-    """Levenberg-Marquardt: our own where relative poses bind the keyframes, which are many then, else GTSAM's.
+    """Levenberg-Marquardt where relative poses bind the keyframes; else Gauss-Newton, or GTSAM's if that fails.
 
     By QR: Cholesky stalls and throws where a stiff IMU meets weak fixes, in short drives and outages. Where relative
     poses bind the keyframes it does neither, but stops elsewhere: in the demo 8 mm and 0.03 degrees away.

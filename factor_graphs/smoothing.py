@@ -21,7 +21,7 @@ from factor_graphs.fitting import (
 )
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
-from factor_graphs.heading import of_any_heading, with_heading
+from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
 from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
 from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
@@ -295,8 +295,6 @@ def _correlation(problem: Problem, fit: Fit, fixes: GnssFixes, residuals: Array)
 
 
 def heading_stddevs(trajectory: Trajectory) -> Array:
-    """Standard deviation of the heading, (k,) rad: the tangent's rotation, turned to the map's up axis."""
+    """Standard deviation of the heading, (k,) rad."""
     assert trajectory.covariances is not None
-    up = trajectory.T_map_imu[:, 2, :3]
-    variances: Array = np.einsum("ki,kij,kj->k", up, trajectory.covariances[:, :3, :3], up)
-    return np.sqrt(variances)
+    return stddevs_of_heading(trajectory.T_map_imu[:, :3, :3], trajectory.covariances)

@@ -258,13 +258,16 @@ def over_the_floor(seen: list[LabelledScan], voxels: int) -> Figures:
     for part, s in zip(keys, seen, strict=True):
         table.add(part, s.pixels, s.classes)
     shuffled = [rng.permutation(part) for part in keys]
-    places = [rng.integers(0, len(table._rows), len(part)) for part in keys]
+    places = [rng.integers(0, len(table._table.rows), len(part)) for part in keys]
     race, nothing = Race(), np.zeros(8, np.int32)
     for i, s in enumerate(seen):
         race.run("drive order, looks", lambda i=i, s=s: table.add(keys[i], s.pixels, s.classes))
         race.run("drive order", lambda i=i: table.add(keys[i]))
         race.run("random order", lambda i=i: table.add(shuffled[i]))
-        race.run("floor", lambda i=i: _touch(table._rows, table._rows.view(np.int32), places[i], nothing))
+        race.run(
+            "floor",
+            lambda i=i: _touch(table._table.rows, table._table.rows.view(np.int32), places[i], nothing),
+        )
     n = np.median([len(part) for part in keys])
     s_ = {name: 1e9 * value / n for name, value in race.medians().items()}
     return {

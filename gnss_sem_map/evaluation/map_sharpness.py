@@ -24,11 +24,12 @@ from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.sensor_log import Points, Scan, SensorLog
-from gnss_sem_map.voxels import kernels
+from gnss_sem_map.voxels.hash_table import HashTable, room_in, slot_of
 from gnss_sem_map.voxels.voxel_map import keys_of
 
 Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
+Slots = NDArray[np.int32]
 
 UPPER = np.triu_indices(3)
 GROUND_NORMAL, WALL_NORMAL = 0.9, 0.3
@@ -219,28 +220,37 @@ class _Stretch:
     def __init__(self, settings: SharpnessSettings) -> None:
         self.scans = 0
         self._settings = settings
-        self._cubes, self._voxels = _empty(SMALLEST_TABLE, CUBE_WORDS), _empty(SMALLEST_TABLE, 1)
-        self._cube_count = self.voxels = 0
+        self._cubes, self._voxels = HashTable(CUBE_WORDS, SMALLEST_TABLE), HashTable(1, SMALLEST_TABLE)
+
+    @property
+    def voxels(self) -> int:
+        """How many are occupied."""
+        return self._voxels.count
 
     def add(self, cloud: _Cloud) -> None:
         """Add one sweep."""
         self.scans += 1
         done = 0
         while done < len(cloud.cubes):
-            self._cubes = _with_room(self._cubes, self._cube_count)
-            self._cube_count, done = _gather(
-                self._cubes, self._cubes.view(np.float64), self._cube_count, done, cloud.cubes, cloud.p_map,
+            cubes = self._cubes
+            cubes.count, done = _gather(
+                cubes.rows, cubes.rows.view(np.float64), cubes.slots, cubes.count, done, cloud.cubes, cloud.p_map,
                 self._settings.cell_size_m, self.scans,
             )  # fmt: skip
+            if done < len(cloud.cubes):
+                cubes.grow()
         done = 0
         while done < len(cloud.voxels):
-            self._voxels = _with_room(self._voxels, self.voxels)
-            self.voxels, done = _occupy(self._voxels, self.voxels, done, cloud.voxels)
+            voxels = self._voxels
+            voxels.count, done = _occupy(voxels.rows, voxels.slots, voxels.count, done, cloud.voxels)
+            if done < len(cloud.voxels):
+                voxels.grow()
 
     def surfaces(self) -> tuple[Array, Array]:
         """Variances (c, 3), ascending, of cubes with enough points and sweeps, and |z| of their normals (c,)."""
-        seen = self._cubes[:, SCANS] >= self._settings.min_scans
-        sums = self._cubes.view(np.float64)[seen, SUMS:]
+        cubes = self._cubes.filled
+        seen = cubes[:, SCANS] >= self._settings.min_scans
+        sums = cubes.view(np.float64)[seen, SUMS:]
         sums = sums[sums[:, 0] >= self._settings.min_points]
         mean = sums[:, 1:4] / sums[:, :1]
         covariances = np.empty((len(sums), 3, 3))
@@ -250,41 +260,31 @@ class _Stretch:
         return np.maximum(variances, THINNEST_M**2), np.abs(axes[:, 2, 0])
 
 
-def _empty(slots: int, words: int) -> Keys:
-    return np.zeros((slots, words), np.int64)
-
-
-def _with_room(rows: Keys, count: int) -> Keys:
-    """The table itself, or a table of twice the size when it is half full."""
-    if 2 * count < len(rows):
-        return rows
-    larger = _empty(2 * len(rows), rows.shape[1])
-    kernels.rehash(rows, larger)
-    return larger
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _row_of(rows: Keys, key: int) -> tuple[int, bool]:
-    """Row of a key, inserted if it is new, and whether it is new; one row must be empty."""
-    row = kernels.find_or_insert(rows, key)
-    is_new = rows[row, 0] == 0
-    rows[row, 0] = key
-    return row, is_new
-
-
 @njit(cache=True, nogil=True)
 def _gather(
-    rows: Keys, sums: Array, count: int, start: int, keys: Keys, p_map: Array, size_m: float, scan: int
+    rows: Keys,
+    sums: Array,
+    slots: Slots,
+    count: int,
+    start: int,
+    keys: Keys,
+    p_map: Array,
+    size_m: float,
+    scan: int,
 ) -> tuple[int, int]:
-    """Add points from `start` on to their cubes, with moments about the cube's centre, until the table is half full.
+    """Add points from `start` on to their cubes, with moments about the cube's centre, until the table is full.
 
     `sums` are the rows of the table read as float64. Returns how many cubes there are, and the first point not added.
     """
+    room, names, size = room_in(rows, slots), rows[:, 0], len(slots)
     for i in range(start, len(keys)):
-        if 2 * count >= len(rows):
+        if count == room:
             return count, i
-        row, is_new = _row_of(rows, keys[i])
-        count += is_new
+        slot = slot_of(keys[i], names, slots, size)
+        if slots[slot] < 0:
+            slots[slot], names[count] = count, keys[i]
+            count += 1
+        row = slots[slot]
         if rows[row, LAST_SCAN] != scan:
             rows[row, LAST_SCAN] = scan
             rows[row, SCANS] += 1
@@ -309,13 +309,16 @@ def _gather(
 
 
 @njit(cache=True, nogil=True)
-def _occupy(rows: Keys, count: int, start: int, keys: Keys) -> tuple[int, int]:
-    """Add keys from `start` on, until the table is half full; returns how many there are, and the first not added."""
+def _occupy(rows: Keys, slots: Slots, count: int, start: int, keys: Keys) -> tuple[int, int]:
+    """Add keys from `start` on, until the table is full; returns how many there are, and the first not added."""
+    room, names, size = room_in(rows, slots), rows[:, 0], len(slots)
     for i in range(start, len(keys)):
-        if 2 * count >= len(rows):
+        if count == room:
             return count, i
-        _, is_new = _row_of(rows, keys[i])
-        count += is_new
+        slot = slot_of(keys[i], names, slots, size)
+        if slots[slot] < 0:
+            slots[slot], names[count] = count, keys[i]
+            count += 1
     return count, len(keys)
 
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.scans.kernels import coordinates, mark_usable
 from gnss_sem_map.sensor_log import Points
-from gnss_sem_map.voxels.hash_unique import LEAST_BITS, distinct, grown, slot_of
+from gnss_sem_map.voxels.hash_table import slot_of, slots_of
+from gnss_sem_map.voxels.hash_unique import FEWEST_SLOTS, distinct
 from gnss_sem_map.voxels.kernels import pack_keys
 
 SLOTS_PER_S = 20.0
@@ -63,8 +64,8 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
     """
     usable, is_timed = np.empty(len(means), np.bool_), len(stamps) > 0
     mark_usable(rows, stamps, nearest_m, farthest_m, usable)
-    bits, count, row, previous, stamp = LEAST_BITS, 0, 0, int64(-1), 0.0
-    table = np.full(1 << bits, -1, np.int32)
+    count, row, previous, stamp, size = 0, 0, int64(-1), 0.0, FEWEST_SLOTS
+    slots = np.full(size, -1, np.int32)
     keys, counts = np.empty(len(means), np.int64), np.empty(len(means), np.int64)
     for i in range(len(means)):
         if not usable[i]:
@@ -75,14 +76,14 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
         key = _key(x / edge_m, y / edge_m, z / edge_m, stamp * SLOTS_PER_S)
         if key != previous:
             previous = key
-            slot = slot_of(key, keys, table, bits)
-            if table[slot] < 0:
-                table[slot], keys[count], counts[count], means[count] = count, key, 0, 0.0
+            slot = slot_of(key, keys, slots, size)
+            if slots[slot] < 0:
+                slots[slot], keys[count], counts[count], means[count] = count, key, 0, 0.0
                 count += 1
-            row = table[slot]
-            if 2 * count > len(table):
-                bits += 1
-                table = grown(keys, count, bits)
+            row = slots[slot]
+            if 2 * count > size:
+                size *= 2
+                slots = slots_of(keys, count, size)
         counts[row] += 1
         means[row, 0] += x
         means[row, 1] += y

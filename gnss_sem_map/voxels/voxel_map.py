@@ -18,8 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.labels.label_set import UNLABELLED, LabelSet
-from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import attribute_table, kernels
+from gnss_sem_map.voxels.hash_table import HashTable
 from gnss_sem_map.voxels.kernels import (
     AXIS_BITS,
     AXIS_OFFSET,
@@ -29,11 +29,7 @@ from gnss_sem_map.voxels.kernels import (
 )
 
 SMALLEST_TABLE = 1 << 16
-LARGE_TABLE = 1 << 18
-"""Rows (25 MB for five classes and attributes) up to which a table grows by half. A larger one grows by a twelfth, to
-stay under 63 bytes per voxel, and because old and new are held at once; growing is cheap, for it reads and writes
-memory in order."""
-HIGHEST_LOAD = 0.7
+"""Rows."""
 ANSWER_SHARE = 0.5
 """With a confusion model, an observation is half the likelihood of the predicted class and half the probabilities of
 the network: of all mixtures tried on held-out drives this was the most robust."""
@@ -227,22 +223,14 @@ class VoxelTable:
         self._floor_percent = round(100 * probability_floor)
         self._words = VoxelMap.words(label_set) + (attribute_table.WORDS if with_attributes else 0)
         self._columns = tuple(range(len(label_set.names)))
-        self._count, self._knows_heights = 0, True
-        self._rows = np.zeros((SMALLEST_TABLE, self._words), np.int64)
+        self._table, self._knows_heights = HashTable(self._words, SMALLEST_TABLE), True
         share = 1.0 if answers is None else 1.0 - ANSWER_SHARE
         self._log_table = log_table(len(label_set.names), self._floor_percent, share)
         self._log_percent = self._log_table[100 * np.arange(256)]
         self._answers, self._abstain = answer_table(answers, len(label_set.names)), abstain
 
-    def _grow(self) -> None:
-        size = len(self._rows)
-        release_memory()  # for both tables
-        larger = np.zeros((size + size // (2 if size < LARGE_TABLE else 12), self._words), np.int64)
-        kernels.rehash(self._rows, larger)
-        self._rows = larger
-
     def __len__(self) -> int:
-        return self._count
+        return self._table.count
 
     def add(
         self,
@@ -271,10 +259,9 @@ class VoxelTable:
         )  # fmt: skip
         done = 0
         while done < len(keys):
-            self._count, done = kernels.fuse(
-                *self._views, self._count, int(HIGHEST_LOAD * len(self._rows)), done,
-                keys, pixels, heights, observations, *seen, self._columns,
-            )  # fmt: skip
+            self._table.count, done = kernels.fuse(
+                *self._views, len(self), done, keys, pixels, heights, observations, *seen, self._columns
+            )
             if done < 0:
                 voxel = unpack(keys[[-1 - done]])[0]
                 raise DataError(
@@ -282,48 +269,49 @@ class VoxelTable:
                     " there for hours?"
                 )
             if done < len(keys):
-                self._grow()
+                self._table.grow()
 
     def see(self, keys: NDArray[np.int64], seen: Seen) -> None:
         """Add attributes of points (n,) that were added without."""
         kernels.see(*self._views, keys, *seen)
 
     @property
-    def _views(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint8]]:
-        return self._rows, self._rows.view(np.int32), self._rows.view(np.uint8)
+    def _views(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint8], NDArray[np.int32]]:
+        rows = self._table.rows
+        return rows, rows.view(np.int32), rows.view(np.uint8), self._table.slots
 
     def put_aside(self, path: Path) -> None:
-        """Write the table into a file: until `take_back`, it takes no memory and cannot be used. Raises OSError."""
-        path.write_bytes(self._rows.data)  # `tofile` does not say why it failed
-        self._rows = np.empty((0, self._words), np.int64)
+        """Write the rows into a file: until `take_back`, they take no memory and cannot be used. Raises OSError."""
+        path.write_bytes(self._table.filled.data)  # `tofile` does not say why it failed
+        self._table.rows = np.empty((0, self._words), np.int64)
 
     def take_back(self, path: Path) -> None:
-        """Read the table that was put aside, and remove the file; raises OSError."""
-        self._rows = np.fromfile(path, np.int64).reshape(-1, self._words)
+        """Read the rows that were put aside, and remove the file; raises OSError."""
+        self._table.rows = np.fromfile(path, np.dtype((np.int64, self._words)))
         path.unlink()
 
     @property
     def nbytes(self) -> int:
         """Size of the table in memory."""
-        return self._rows.nbytes
+        return self._table.nbytes
 
     def to_map(self) -> VoxelMap:
         """The voxels so far, sorted by key."""
-        filled = np.flatnonzero(self._rows[:, 0])
-        order = filled[np.argsort(self._rows[filled, 0])]
-        ints, end = self._rows.view(np.int32), FIRST_SUM + len(self._columns)
+        rows = self._table.filled
+        order = np.argsort(rows[:, 0])
+        ints, end = rows.view(np.int32), FIRST_SUM + len(self._columns)
         return VoxelMap(
             self.voxel_size_m,
             self.label_set,
-            keys=self._rows[order, 0],
+            keys=rows[order, 0],
             evidence=ints[order, FIRST_SUM:end],
             hits=ints[order, end].astype(np.uint32),
-            heights=self._rows[order, end // 2 + 1] if self._knows_heights else None,
+            heights=rows[order, end // 2 + 1] if self._knows_heights else None,
         )
 
     def attributes(self) -> tuple[NDArray[Any], ...]:
         """Those of the voxels so far, as the columns of `Attributes`."""
-        return attribute_table.columns_of(self._rows)
+        return attribute_table.columns_of(self._table.filled)
 
 
 def keys_of(p_map: NDArray[np.float64], voxel_size_m: float) -> NDArray[np.int64]:

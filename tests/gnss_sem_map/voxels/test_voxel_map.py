@@ -18,7 +18,6 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels import voxel_map
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import (
-    LARGE_TABLE,
     VoxelMap,
     VoxelTable,
     keys_of,
@@ -224,9 +223,9 @@ def test_a_large_table_takes_at_most_63_bytes_per_voxel_and_keeps_all() -> None:
     worst = 0.0
     for part in np.array_split(keys, 30):
         table.add(part)
-        if len(table) > LARGE_TABLE:
+        if len(table) > 1 << 18:
             worst = max(worst, table.nbytes / len(table))
-    assert 57 < worst <= 63
+    assert 48 < worst <= 63
     np.testing.assert_array_equal(table.to_map().keys, np.sort(keys))
 
 
@@ -236,7 +235,7 @@ def test_a_table_that_was_put_aside_goes_on_as_one_that_was_not(tmp_path: Path) 
     for table in (away, stays):
         table.add(keys_of(first, 0.2), pixels, classes)
     away.put_aside(tmp_path / "table")
-    assert away.nbytes == 0
+    assert away.nbytes < stays.nbytes / 5
     away.take_back(tmp_path / "table")
     assert not list(tmp_path.iterdir())
     for table in (away, stays):

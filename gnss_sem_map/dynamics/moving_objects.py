@@ -37,6 +37,7 @@ from gnss_sem_map.dynamics.visibility import (
     spatial_order,
 )
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels.hash_unique import distinct
 
 Array = NDArray[np.float64]
@@ -77,7 +78,9 @@ def decide(
     of_places, is_sharp = _told_by_others(observations, places, before, settings)
 
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
-        return (of_places[:, place] for place in places)
+        for place in places:
+            release_memory()  # what one scan after another has used lies among what lasts: 90 MB
+            yield of_places[:, place]
 
     parted = (
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)

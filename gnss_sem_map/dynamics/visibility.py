@@ -84,20 +84,26 @@ class KeyframeScans:
 
 
 class Keyframes(Protocol):
-    """Keyframe scans that need not be in memory."""
+    """Keyframe scans whose images need not be in memory."""
 
-    def __len__(self) -> int:
-        """The number of scans."""
+    @property
+    def T_lidar_map(self) -> NDArray[np.float64]:
+        """(k, 4, 4): poses, in the order of the parts."""
 
     def parts(self) -> Iterator[KeyframeScans]:
         """The scans, some at a time."""
+
+
+def origins_of(T_lidar_map: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where the LiDAR was, in the map (k, 3) m, by poses (k, 4, 4)."""
+    return np.asarray(-np.einsum("kji,kj->ki", T_lidar_map[:, :3, :3], T_lidar_map[:, :3, 3]))
 
 
 def are_near(
     T_lidar_map: NDArray[np.float64], positions: NDArray[np.float64], reach_m: float
 ) -> NDArray[np.bool_]:
     """Which poses (k, 4, 4) are at most `reach_m` from the bounding box of positions (m, 3) m: (k,)."""
-    origins = -np.einsum("kji,kj->ki", T_lidar_map[:, :3, :3], T_lidar_map[:, :3, 3])
+    origins = origins_of(T_lidar_map)
     outside = np.maximum(positions.min(axis=0) - origins, origins - positions.max(axis=0)).max(axis=1)
     return np.asarray(outside <= reach_m)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,15 @@ from typing import BinaryIO
 from gnss_sem_map.errors import DataError
 
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+def unfinished(path: Path) -> Path:
+    """A hidden name beside a file or folder, for it while it is written.
+
+    Another one for every call, not that of the process: those of two containers may have one number, and a worker that
+    is thought lost may still write what another one writes.
+    """
+    return path.with_name(f".{path.name}.{secrets.randbelow(1 << 60)}.part")
 
 
 @contextmanager
@@ -37,7 +47,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[BinaryIO]:
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = unfinished(path)
     try:
         with beside.open("wb") as file:
             yield file
@@ -57,7 +67,7 @@ def adding_folder(path: Path) -> Iterator[Path]:
     """
     if path.exists():
         raise DataError(f"{path}: exists; move it away or choose another folder")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = unfinished(path)
     try:
         beside.mkdir()
         yield beside

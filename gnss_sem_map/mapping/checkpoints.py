@@ -17,7 +17,6 @@ import errno
 import hashlib
 import io
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -32,7 +31,7 @@ from gnss_sem_map.dynamics.motion_state import LEAST_TRACKED_POINTS, Motion, Tra
 from gnss_sem_map.dynamics.object_track import ObjectTrack
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.atomic import write_whole
+from gnss_sem_map.files.atomic import unfinished, write_whole
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.chunks import MappedChunk
@@ -70,7 +69,7 @@ class ChunkStore:
         A chunk that is there already stays: a worker that was thought lost may have saved it. Unfinished files are
         removed.
         """
-        beside = self.folder / f".{chunk.number}.{os.getpid()}.part"
+        beside = unfinished(self.folder / str(chunk.number))
         checksums: dict[str, str] = {}
         try:
             for name, content in _files(chunk):

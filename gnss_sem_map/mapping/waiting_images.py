@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics.visibility import SCANS_PER_PART, KeyframeScans, RangeImage
 
@@ -34,8 +35,10 @@ class WaitingImages:
         poses = np.stack([one.T_lidar_map for one in scans])
         return cls(path, KeyframeScans(np.empty((len(scans), 0, 0), np.uint16), poses, scans[0].rows))
 
-    def __len__(self) -> int:
-        return len(self.without_images)
+    @property
+    def T_lidar_map(self) -> NDArray[np.float64]:
+        """(k, 4, 4): poses."""
+        return self.without_images.T_lidar_map
 
     def parts(self) -> Iterator[KeyframeScans]:
         """The scans, some at a time; raises OSError."""

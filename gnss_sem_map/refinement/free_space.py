@@ -6,13 +6,17 @@ be tracked, in no image, or too close to a wall. Static voxels are hit again fro
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial.distance import cdist
 
-from gnss_sem_map.dynamics.range_images import FARTHEST_M
-from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, spatial_order
+from gnss_sem_map.dynamics.clusters import boxes_of
+from gnss_sem_map.dynamics.range_images import CLUSTER, FARTHEST_M
+from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, origins_of, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
 from gnss_sem_map.voxels.semantic_map import Reason, State
@@ -61,28 +65,41 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
 
     Needs sharp poses: with a pose error of half a metre rays traverse walls. Ground voxels are kept,
     because grazing rays traverse them. Scans are read part by part. A voxel is asked about no longer once even misses
-    in all the scans left would not make it free.
+    in all the scans left, as far as they are in range, would not make it free.
     """
-    stands = _stands_over(voxels)
-    left = len(keyframes)
-    undecided = np.flatnonzero(stands & (voxels.hits < POINTS_PER_MISS * left))
+    undecided = np.flatnonzero(_stands_over(voxels))
     places = voxels.centres[undecided]
     order = spatial_order(places)
     undecided, places = undecided[order], places[order]
-    counts = np.zeros((2, len(undecided)), np.int32)
-    for part in keyframes.parts():
-        counts += hits_and_misses(places, part, settings.farthest_m, WIDE_RATIO)
-        left -= len(part)
-        hits, most_misses = counts[0], counts[1] + left
+    group, in_range = _scans_in_range(places, keyframes.T_lidar_map, settings.farthest_m)
+    left, counts = in_range.sum(axis=1), np.zeros((2, len(undecided)), np.int32)
+    for part in chain([None], keyframes.parts()):
+        if part is not None:
+            counts += hits_and_misses(places, part, settings.farthest_m, WIDE_RATIO)
+            left -= in_range[:, : len(part)].sum(axis=1)
+            in_range = in_range[:, len(part) :]
+        hits, most_misses = counts[0], counts[1] + left[group]
         may_be_free = most_misses >= settings.least_misses
         too_many = most_misses - settings.misses_per_hit * hits
         may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * too_many
-        undecided, places, counts = undecided[may_be_free], places[may_be_free], counts[:, may_be_free]
+        undecided, places, group = undecided[may_be_free], places[may_be_free], group[may_be_free]
+        counts = counts[:, may_be_free]
         if not len(undecided):
             break
     free = np.zeros(len(voxels), np.bool_)
     free[undecided] = True
     return free
+
+
+def _scans_in_range(
+    places: NDArray[np.float64], T_lidar_map: NDArray[np.float64], farthest_m: float
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """The group of neighbours that each place (v, 3) m is in, and which scans may be in range of each group (g, k)."""
+    group = np.arange(len(places)) // CLUSTER
+    low, high = boxes_of(places, group, -(-len(places) // CLUSTER))
+    reach = farthest_m + np.linalg.norm(high - low, axis=1) / 2
+    distance = cdist((low + high) / 2, origins_of(T_lidar_map))
+    return group, distance <= (1 + 1e-9) * reach[:, None]
 
 
 def _stands_over(voxels: VoxelMap) -> NDArray[np.bool_]:

@@ -146,7 +146,9 @@ def _about_refinement(report: RefinementReport) -> dict[str, Any]:
                 "points": thing.points,
                 "first_stamp": thing.first_stamp,
                 "last_stamp": thing.last_stamp,
-                "path": thing.path.round(2).tolist(),
+                # a path of all scans would be half of the file; those of what moved are in objects.parquet
+                "first_place": thing.path[0].round(2).tolist(),
+                "last_place": thing.path[-1].round(2).tolist(),
             }
             for thing in report.tracked
         ],

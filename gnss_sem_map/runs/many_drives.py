@@ -339,7 +339,7 @@ def _frame_of(drives: Sequence[Path], drive_format: str | None) -> LocalFrame:
     for drive in drives:
         try:
             frame = open_drive(drive, drive_format, with_imu=False).frame
-        except (SemMapError, FactorGraphError):
+        except (SemMapError, FactorGraphError, OSError):
             continue  # its own task says why
         if frame is not None:
             return frame

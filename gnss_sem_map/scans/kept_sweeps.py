@@ -29,6 +29,10 @@ class KeptSweeps:
         """The log, with sweeps that are read only if they are not kept; afterwards they are kept no longer."""
         return _with_reader(log, self._take)
 
+    def forget(self) -> None:
+        """Let go of those that nobody has taken."""
+        self._kept.clear()
+
     def _keep(self, scan: Scan) -> Points:
         with self._locks[scan.stamp]:
             points = self._kept.get(scan.stamp)

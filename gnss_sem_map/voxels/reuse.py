@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.atomic import unfinished
 from gnss_sem_map.files.untrusted import is_file, read_bytes
 from gnss_sem_map.voxels.map_json import files_of, is_about_a_tile, name_of, tile_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -105,7 +105,7 @@ def _record_of(tile: Tile, folder: Path) -> Path:
 
 def _write(path: Path, content: bytes) -> None:
     # no fsync: what a crash of the machine cuts short is found by its checksum, and made again
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = unfinished(path)
     try:
         beside.write_bytes(content)
         beside.replace(path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.atomic import link_or_copy
+from gnss_sem_map.files.atomic import link_or_copy, unfinished
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.memory import release_memory
@@ -58,7 +57,7 @@ def write_tiles(
     """
     if folder.exists():
         raise DataError(f"{folder}: exists; remove it or choose another folder")
-    beside = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    beside = unfinished(folder)
     files: dict[str, dict[str, Any]] = {}
     try:
         beside.mkdir(parents=True)

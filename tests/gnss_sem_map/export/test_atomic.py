@@ -25,6 +25,19 @@ def test_the_file_appears_only_when_the_block_has_ended(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_two_that_write_one_file_at_a_time_do_not_mix_their_bytes(tmp_path: Path) -> None:
+    """A worker that is thought lost may go on, in another container with the same process number."""
+    path = tmp_path / "map.ply"
+    with replacing(path) as first:
+        first.write(b"half of the fir")
+        with replacing(path) as second:
+            second.write(b"second")
+        assert path.read_bytes() == b"second"
+        first.write(b"st")
+    assert path.read_bytes() == b"half of the first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     path.write_bytes(b"old")

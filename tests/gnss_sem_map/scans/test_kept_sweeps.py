@@ -62,6 +62,14 @@ def test_threads_that_want_the_same_sweep_read_it_once(files: Files) -> None:
     assert files.reads == {1: 1}
 
 
+def test_what_nobody_takes_can_be_let_go(files: Files) -> None:
+    sweeps = KeptSweeps()
+    sweeps.keeping(files.log).scans[1].read()
+    sweeps.forget()
+    assert sweeps.taking(files.log).scans[1].read().xyz[0, 0] == 1
+    assert files.reads == {1: 2}
+
+
 def test_memory_is_bounded(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kept_sweeps, "MOST_KEPT", 2)
     sweeps = KeptSweeps()

@@ -12,9 +12,18 @@ if TYPE_CHECKING:  # signals are taken before anything else is imported
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
-LOCKING = ("threading", "concurrent.futures", "queue", "importlib", "weakref", "_weakrefset", "contextlib")
+LOCKING = (
+    "threading",
+    "concurrent.futures",
+    "queue",
+    "importlib",
+    "weakref",
+    "_weakrefset",
+    "contextlib",
+    "zipfile",
+)
 """Modules whose functions take locks, or enter and leave blocks that do: one that is left between taking a lock and
-giving it back blocks all threads."""
+giving it back blocks all threads, and an archive of which a member is half opened cannot be closed."""
 WHOLE = (
     "importlib._bootstrap",
     "_frozen_importlib",

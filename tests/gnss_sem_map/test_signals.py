@@ -13,8 +13,9 @@ import pytest
 pytestmark = pytest.mark.integration
 
 PROGRAM = """
-import ctypes, os, signal, threading, time
+import ctypes, io, os, signal, threading, time, zipfile
 from functools import partial
+from operator import methodcaller
 from types import SimpleNamespace
 from gnss_sem_map.cli.signals import Stopped, stop_on_signals
 
@@ -32,6 +33,15 @@ def while_a_lock_is_taken():
     lock = SimpleNamespace(acquire=None, release=None, __enter__=interrupt, __exit__=given_back)
     with threading.Condition(lock):
         pass
+
+def while_a_member_is_opened():
+    class Opened(zipfile.ZipInfo):
+        interrupt = staticmethod(interrupt)
+        compress_level = _compresslevel = property(methodcaller("interrupt"), lambda *_: None)
+
+    with zipfile.ZipFile(io.BytesIO(), "w") as archive:
+        with archive.open(Opened("array.npy"), "w") as member:
+            member.write(b"numbers")
 
 def while_it_waits():
     threading.Timer(0.2, interrupt).start()
@@ -53,6 +63,7 @@ except Stopped as stopped:
         ("InFinalizer", "15"),
         ("in_a_callback", "15"),
         ("while_a_lock_is_taken", "given back 15"),
+        ("while_a_member_is_opened", "15"),
         ("while_it_waits", "15"),
     ],
 )

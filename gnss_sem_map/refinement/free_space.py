@@ -93,9 +93,9 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
 
 def _scans_in_range(
     places: NDArray[np.float64], T_lidar_map: NDArray[np.float64], farthest_m: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """The group of neighbours that each place (v, 3) m is in, and which scans may be in range of each group (g, k)."""
-    group = np.arange(len(places)) // CLUSTER
+    group = np.arange(len(places), dtype=np.int32) // CLUSTER
     low, high = boxes_of(places, group, -(-len(places) // CLUSTER))
     reach = farthest_m + np.linalg.norm(high - low, axis=1) / 2
     distance = cdist((low + high) / 2, origins_of(T_lidar_map))

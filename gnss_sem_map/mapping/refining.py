@@ -22,6 +22,7 @@ from uuid import uuid4
 import numpy as np
 
 from gnss_sem_map.config import Settings
+from gnss_sem_map.dynamics.visibility import origins_of
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
@@ -170,7 +171,7 @@ class _Refinement:
     def _made_from(self, around: Mapping[Tile, str], figures: Figures) -> dict[Tile, str]:
         """Digest of all that decides each tile."""
         poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
-        at = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])[:, :2]
+        at = origins_of(poses)[:, :2]
         edge = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
         steps = self.settings.refinement
         reach = steps.free_space.farthest_m + _moved_reach_m(steps, self.raw.fused.voxel_size_m)

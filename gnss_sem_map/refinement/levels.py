@@ -43,7 +43,7 @@ SUREST = 0.98
 """Upper limit of the images' probability of road against sidewalk, so that height can change it."""
 VOXEL_STDDEV_M = 0.03
 """Surfaces of voxels lie at least so far over or under the plane that they belong to."""
-X, Y, ON_SIDEWALK, Z = 1, 2, 3, 4
+X, Y, ON_SIDEWALK, Z, TERMS = 1, 2, 3, 4, 5
 """Of the terms of a fit; the first is one."""
 
 
@@ -134,21 +134,14 @@ class _Planes:
 
 def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
     """Least squares around every cell, each voxel (g,) on the sidewalk as far as it is probable."""
-    x, y, z = ground.p.T
-    terms = np.stack([np.ones_like(x), x, y, on_sidewalk, z])
+    rows, columns = np.triu_indices(TERMS)
     cells = len(ground.surroundings[0])
-
-    def moment(a: np.intp, b: np.intp) -> NDArray[np.float64]:
-        one = on_sidewalk if a == b == ON_SIDEWALK else terms[a] * terms[b]  # a class is 0 or 1: E[s²] = E[s]
-        # one row more, of zeros: the place -1 finds it
-        return np.asarray(np.bincount(ground.cell, one, cells + 1), np.float64)
-
-    rows, columns = np.triu_indices(len(terms))
-    own = np.stack([moment(a, b) for a, b in zip(rows, columns, strict=True)], axis=1)
+    own = np.zeros((cells, len(rows)))
+    _add_moments(ground.p, ground.cell, on_sidewalk, own)
     around_each = np.zeros((cells, len(rows)))
     for there in ground.surroundings:
         _add_rows(own, there, around_each)
-    sums = np.empty((cells, len(terms), len(terms)))
+    sums = np.empty((cells, TERMS, TERMS))
     sums[:, rows, columns] = sums[:, columns, rows] = around_each
     count = sums[:, 0, 0]
     scatter = sums - sums[:, :, :1] * sums[:, :1, :] / count[:, None, None]
@@ -157,16 +150,36 @@ def _fit(ground: _Ground, on_sidewalk: NDArray[np.float64]) -> _Planes:
     z0 = (sums[:, 0, Z] - (slopes * sums[:, 0, 1:Z]).sum(axis=1)) / count
     left_over = scatter[:, Z, Z] - (slopes * with_z).sum(axis=1)
     fewer = np.minimum(sums[:, 0, ON_SIDEWALK], count - sums[:, 0, ON_SIDEWALK])
-    variance = np.where(fewer >= FEWEST, left_over / np.maximum(count - len(terms) + 1, 1), np.inf)
+    variance = np.where(fewer >= FEWEST, left_over / np.maximum(count - TERMS + 1, 1), np.inf)
     return _Planes(z0, np.asarray(slopes), variance)
 
 
 @njit(cache=True, nogil=True)
+def _add_moments(
+    p: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    on_sidewalk: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Add the products of every two terms of each voxel (g,) to the sums of its cell (k, m)."""
+    for i in range(len(cell)):
+        s = on_sidewalk[i]
+        terms = (1.0, p[i, 0], p[i, 1], s, p[i, 2])
+        m = 0
+        for a in range(TERMS):
+            for b in range(a, TERMS):
+                # a class is 0 or 1: E[s²] = E[s]
+                sums[cell[i], m] += s if a == b == ON_SIDEWALK else terms[a] * terms[b]
+                m += 1
+
+
+@njit(cache=True, nogil=True)
 def _add_rows(rows: NDArray[np.float64], places: NDArray[np.int64], sums: NDArray[np.float64]) -> None:
-    """Add to every row of the sums (k, m) the row at its place (k,)."""
+    """Add to every row of the sums (k, m) the row at its place (k,), if there is one."""
     for i in range(len(places)):
-        for j in range(sums.shape[1]):
-            sums[i, j] += rows[places[i], j]
+        if places[i] >= 0:
+            for j in range(sums.shape[1]):
+                sums[i, j] += rows[places[i], j]
 
 
 def _are_two(planes: _Planes, settings: LevelSettings) -> NDArray[np.bool_]:
@@ -177,11 +190,31 @@ def _are_two(planes: _Planes, settings: LevelSettings) -> NDArray[np.bool_]:
 
 def _log_odds(planes: _Planes, ground: _Ground, settings: LevelSettings) -> NDArray[np.float64]:
     """What height says for the sidewalk (g,): the planes are two normal distributions; 0 where it is silent."""
-    of_road = planes.z0[ground.cell] + (planes.slopes[ground.cell, :2] * ground.p[:, :2]).sum(axis=1)
-    step = np.maximum(planes.slopes[ground.cell, 2], settings.least_m)  # no lower one is believed in
-    up = (ground.p[:, 2] - of_road) / step  # 0 on the road, 1 on the sidewalk
-    odds = step**2 * (up - FACE_BEGINS) / _variance(planes)[ground.cell]
-    return np.where((up > -1) & (up < 2), odds, 0.0)  # what lies a whole step off both is neither
+    odds, variance = np.empty(len(ground.cell)), _variance(planes)
+    _fill_log_odds(
+        ground.p, ground.cell, planes.z0, planes.slopes, variance, settings.least_m, FACE_BEGINS, odds
+    )
+    return odds
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_log_odds(
+    p: NDArray[np.float64],
+    cell: NDArray[np.int64],
+    z0: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    least_m: float,
+    face_begins: float,
+    odds: NDArray[np.float64],
+) -> None:
+    for i in range(len(cell)):
+        c = cell[i]
+        of_road = z0[c] + (slopes[c, 0] * p[i, 0] + slopes[c, 1] * p[i, 1])
+        step = max(slopes[c, 2], least_m)  # no lower one is believed in
+        up = (p[i, 2] - of_road) / step  # 0 on the road, 1 on the sidewalk
+        # what lies a whole step off both is neither
+        odds[i] = step * step * (up - face_begins) / variance[c] if -1 < up < 2 else 0.0
 
 
 def _variance(planes: _Planes) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.many_drives import HowMapped, run_drives
 from gnss_sem_map.scans.deskew import points_in_map
 from gnss_sem_map.scans.downsampling import thinned
-from gnss_sem_map.scans.local_maps import LocalMaps, normals
+from gnss_sem_map.scans.local_maps import LocalMaps, normals, sweeps_along
 from gnss_sem_map.scans.revisits import RevisitSettings, pass_of, register_passes
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.simulation import simulate, write_corrupted_labels
@@ -84,7 +84,8 @@ def days_of(drives: Sequence[Path], out: Path) -> list[Day]:
         assert found.solution.condensed is not None
         assert log.frame is not None
         _, alone = in_frame(log, found.trajectory, frame)
-        located = LocatedDrive(drive.name, log, alone, found.solution.condensed.at(alone))
+        assert found.sweeps is not None
+        located = LocatedDrive(drive.name, found.sweeps, alone, found.solution.condensed.at(alone))
         bound = Trajectory.load(out / "drives" / drive.name / "trajectory.parquet")
         days.append(Day(log, truth_of(drive).moved(frame.pose_of(log.frame)), located, bound))
     return days
@@ -98,7 +99,7 @@ def surfaces_apart(days: Sequence[Day]) -> tuple[Array, Array]:
     """Distances between the surfaces of both days, across each, by the poses alone and bound: against the truth, m."""
     first, second = days
     places = np.arange(second.true.start + 1.0, second.true.end - 1.0, 1.0)
-    maps = LocalMaps(second.log, second.true, places)
+    maps = LocalMaps(sweeps_along(second.log, second.true), second.true, places)
     stamps = np.arange(first.true.start + 0.5, first.true.end - 0.5, 0.1)
     track, distances = first.true.at(stamps)[:, :3, 3], ([], [])
     for n, at in enumerate(places):
@@ -169,7 +170,7 @@ def planted(days: Sequence[Day], seed: int) -> tuple[int, int]:
     They are shifted along the street or across it by 2.5 to 12 m, as bays, facades and lanes repeat themselves.
     """
     drives, rng = [day.alone for day in days], np.random.default_rng(seed)
-    passes = [pass_of(drive.log, drive.trajectory, drive.condensed, REVISITS) for drive in drives]
+    passes = [pass_of(drive.sweeps, drive.trajectory, drive.condensed, REVISITS) for drive in drives]
     pairs, taken = register_passes(passes, REVISITS).pairs, 0
     for _ in range(PLANTED):
         wrong, T = int(rng.integers(len(pairs))), pairs.T.copy()
@@ -284,7 +285,8 @@ def real() -> Figures | None:
         found = locate(half, SETTINGS, RunStats(), bound=False)
         assert found.solution is not None
         assert found.solution.condensed is not None
-        located.append(LocatedDrive(name, half, found.trajectory, found.solution.condensed))
+        assert found.sweeps is not None
+        located.append(LocatedDrive(name, found.sweeps, found.trajectory, found.solution.condensed))
     together = bind_passes(located, REVISITS)
     bound = [
         drive.trajectory if correction is None else correction.of(drive.trajectory)

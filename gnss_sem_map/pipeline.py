@@ -25,11 +25,12 @@ from gnss_sem_map.dynamics.motion_state import TrackedObject
 from gnss_sem_map.evaluation import preflight
 from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sample
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
+from gnss_sem_map.files.work_folder import SWEEPS
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
-from gnss_sem_map.mapping.labelled_scans import Drive
+from gnss_sem_map.mapping.labelled_scans import Drive, pattern_sweeps
 from gnss_sem_map.mapping.passes import TwoPasses
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
 from gnss_sem_map.mapping.refining import Refined, opened_sensor_model, refine_map
@@ -60,6 +61,7 @@ __all__ = [
     "map_drive",
     "refine",
     "run",
+    "saving_sweeps",
 ]
 
 
@@ -137,8 +139,11 @@ def run(
     check_georeference(log, origin, settings.mapping.voxel_size_m)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
+    saved = (
+        work / SWEEPS if match is not None and settings.trajectory.lidar_odometry and not log.given else None
+    )
     page, found, sharpness = _checked_and_located(
-        log, segmenter, settings, stats, progress, force, match, registrar_of, bound=correction is None
+        log, segmenter, settings, stats, progress, force, match, registrar_of, saved, bound=correction is None
     )
     located = _in_map(log, found, origin, correction)
     passes, from_lidar_odometry = found.passes, found.from_lidar_odometry
@@ -148,7 +153,7 @@ def run(
             write(located)
         located = located.in_short()
     release_memory(always=True)  # of graph and local map: holes too small for the arrays of scans
-    drive = Drive(located.log, located.trajectory, segmenter, settings)
+    drive = Drive(located.log, located.trajectory, segmenter, settings, saved)
     mapped = map_drive(
         drive, folder, work, stats, progress, resume=resume, elsewhere=elsewhere, labels_from=labels_from
     )
@@ -182,6 +187,7 @@ def _checked_and_located(
     force: bool,
     match: Matcher | None,
     registrar_of: RegistrarOf | None,
+    saved: Path | None,
     bound: bool,
 ) -> tuple[Preflight, DriveTrajectory, dict[str, Sharpness]]:
     """All that comes before the map; the sweeps that the check has read are not read again."""
@@ -190,7 +196,7 @@ def _checked_and_located(
     page = check_drive(sweeps.keeping(log), segmenter, settings, stats, force)
     progress("preflight", 1, 1)
     found, sharpness = _located(
-        sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, bound
+        sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, saved, bound
     )
     sweeps.forget()  # sections that are tasks have read their own: 35 MB
     return replace(page, solution=None), found, sharpness
@@ -204,18 +210,24 @@ def _located(
     first: Solution | None,
     match: Matcher | None,
     registrar_of: RegistrarOf | None,
+    saved: Path | None,
     bound: bool,
 ) -> tuple[DriveTrajectory, dict[str, Sharpness]]:
-    """The trajectory of a drive, and how sharp a map it makes; the sweeps that tell it are not held any longer."""
-    sample = SweepSample(log)
+    """The trajectory of a drive, and how sharp a map it makes."""
     with stats.stage("trajectory"):
         progress("trajectory", 0, 1)
-        found = locate(sample.listening(), settings, stats, progress, first, match, bound, registrar_of)
+        found = locate(log, settings, stats, progress, first, match, bound, registrar_of, saved)
         progress("trajectory", 1, 1)
     with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
-        figures = of_sample(sample, trajectories, progress)
+        figures = of_sample(SweepSample(log, folder=saved), trajectories, progress)
     return replace(found, without_lidar=None), dict(zip(("map", "gnss and imu"), figures, strict=False))
+
+
+def saving_sweeps(log: SensorLog, folder: Path) -> SensorLog:
+    """The log, of which the sweeps that are needed once more beside mapping are saved when they are read."""
+    log = SweepSample(log, folder=folder).sweeps.listening()
+    return pattern_sweeps(log, folder).listening()
 
 
 def map_drive(

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, dataclass
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 from numba import njit
@@ -23,7 +24,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.scans.deskew import EXTRAPOLATE_S, usable_points_in_map
 from gnss_sem_map.scans.prefetch import prefetch
-from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
+from gnss_sem_map.sensor_log import Points, SensorLog
 from gnss_sem_map.voxels.hash_table import HashTable, room_in, slot_of
 from gnss_sem_map.voxels.voxel_map import keys_of
 
@@ -95,34 +97,15 @@ def of_clouds(
 
 
 class SweepSample:
-    """The sweeps of a drive with which sharpness is measured, thinned; a sweep that another stage reads is kept.
+    """The sweeps of a drive with which sharpness is measured; those that were saved in `folder` are not read again."""
 
-    Memory is bounded by the settings: 200 sweeps of 100,000 points take 100 MB.
-    """
-
-    def __init__(self, log: SensorLog, settings: SharpnessSettings | None = None) -> None:
-        self.log, self.settings = log, settings or SharpnessSettings()
-        self.stretches = _stretches(log.scans, self.settings)
-        self._kept: dict[float, Points] = {}
-
-    def listening(self) -> SensorLog:
-        """The same log, of which the sweeps of the sample are kept when they are read."""
-        sampled = {scan.stamp for stretch in self.stretches for scan in stretch}
-        scans = (
-            replace(scan, read=partial(self._read, scan)) if scan.stamp in sampled else scan
-            for scan in self.log.scans
-        )
-        return replace(self.log, scans=tuple(scans))
-
-    def take(self, scan: Scan) -> Points:
-        """The thinned points of a sweep, which are no longer kept; raises DataError where they have to be read."""
-        kept = self._kept.pop(scan.stamp, None)
-        return self._thinned(scan.read()) if kept is None else kept
-
-    def _read(self, scan: Scan) -> Points:
-        points = scan.read()
-        self._kept[scan.stamp] = self._thinned(points)
-        return points
+    def __init__(
+        self, log: SensorLog, settings: SharpnessSettings | None = None, folder: Path | None = None
+    ) -> None:
+        self.settings = settings or SharpnessSettings()
+        self.stretches = _stretches(len(log.scans), self.settings)
+        numbers = frozenset(chain.from_iterable(self.stretches))
+        self.sweeps = ThinnedSweeps(log, "sharpness", self._thinned, numbers, folder)
 
     def _thinned(self, points: Points) -> Points:
         every = self.settings.every_nth_point
@@ -144,21 +127,21 @@ def of_drive(
 def of_sample(
     sample: SweepSample, trajectories: Sequence[Trajectory], progress: Progress = silent
 ) -> list[Sharpness]:
-    """Sharpness of a drive by each of several trajectories; a sweep that is not kept is read once.
+    """Sharpness of a drive by each of several trajectories; a sweep that was not saved is read once.
 
     Sweeps that cannot be read, or that are outside of a trajectory, are left out for all of them. Moving objects are
     included: they blur the map in the same way for every trajectory.
     """
     gathered = [[_Stretch(sample.settings) for _ in sample.stretches] for _ in trajectories]
     stamps: list[list[float]] = [[] for _ in sample.stretches]
-    numbered = [(n, scan) for n, stretch in enumerate(sample.stretches) for scan in stretch]
+    numbered = [(n, number) for n, stretch in enumerate(sample.stretches) for number in stretch]
 
-    def clouds_of(numbered_scan: tuple[int, Scan]) -> list[_Cloud] | None:
-        return _clouds(numbered_scan[1], sample, trajectories)
+    def clouds_of(of_stretch: tuple[int, int]) -> list[_Cloud] | None:
+        return _clouds(of_stretch[1], sample, trajectories)
 
-    for done, ((n, scan), clouds) in enumerate(prefetch(clouds_of, numbered), 1):
+    for done, ((n, number), clouds) in enumerate(prefetch(clouds_of, numbered), 1):
         if clouds is not None:
-            stamps[n].append(scan.stamp)
+            stamps[n].append(sample.sweeps.log.scans[number].stamp)
             for of_one, cloud in zip(gathered, clouds, strict=True):
                 of_one[n].add(cloud)
         progress("sharpness", done, len(numbered))
@@ -166,24 +149,24 @@ def of_sample(
     return [_sharpness(of_one, length) for of_one, length in zip(gathered, lengths, strict=True)]
 
 
-def _stretches(scans: tuple[Scan, ...], settings: SharpnessSettings) -> list[tuple[Scan, ...]]:
+def _stretches(scans: int, settings: SharpnessSettings) -> list[range]:
     """The whole drive, or sections of consecutive sweeps spread evenly over it."""
-    if len(scans) <= settings.max_scans:
-        return [scans] if scans else []
+    if scans <= settings.max_scans:
+        return [range(scans)] if scans else []
     count = max(1, settings.max_scans // settings.stretch_scans)
-    starts = np.linspace(0, len(scans) - settings.stretch_scans, count).astype(int)
-    return [scans[start : start + settings.stretch_scans] for start in starts.tolist()]
+    starts = np.linspace(0, scans - settings.stretch_scans, count).astype(int)
+    return [range(start, min(start + settings.stretch_scans, scans)) for start in starts.tolist()]
 
 
-def _clouds(scan: Scan, sample: SweepSample, trajectories: Sequence[Trajectory]) -> list[_Cloud] | None:
+def _clouds(number: int, sample: SweepSample, trajectories: Sequence[Trajectory]) -> list[_Cloud] | None:
     """A sweep in the map by each trajectory; None if it cannot be read, or is outside of a trajectory or the map."""
-    settings, T_imu_lidar = sample.settings, sample.log.calibration.T_imu_lidar
+    settings, log = sample.settings, sample.sweeps.log
+    stamp, T_imu_lidar = log.scans[number].stamp, log.calibration.T_imu_lidar
+    nearest_m, farthest_m = settings.nearest_m, settings.farthest_m
     try:
-        points = sample.take(scan)
+        points = sample.sweeps[number]
         placed = [
-            usable_points_in_map(points, scan.stamp, t, T_imu_lidar, settings.nearest_m, settings.farthest_m)[
-                0
-            ]
+            usable_points_in_map(points, stamp, t, T_imu_lidar, nearest_m, farthest_m)[0]
             for t in trajectories
         ]
         return [_Cloud.of(p_map, settings) for p_map in placed]

@@ -5,6 +5,7 @@
           edges/                 what the edges of ranges of chunks tell of motion (`mapping.edge_windows`)
           job.json, trajectory.npz   what other processes need to map chunks (`runs.drive_job`)
           matches/               LiDAR odometry of sections of the drive (`runs.match_tasks`)
+          sweeps/                sweeps that later stages need, thinned (`scans.thinned_sweeps`)
           revisits/              places that are passed again, registered (`runs.revisit_tasks`)
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
@@ -28,7 +29,8 @@ from pathlib import Path
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership
 
-CHUNKS, MATCHES, REVISITS, ANSWERS, DRIVES = "chunks.json", "matches", "revisits", "answers", "drives"
+CHUNKS, MATCHES, SWEEPS, REVISITS = "chunks.json", "matches", "sweeps", "revisits"
+ANSWERS, DRIVES = "answers", "drives"
 BOUND, TILES, EDGES, PART, OLD = "bound", "tiles", "edges", "part", "old"
 JOB, TRAJECTORY = "job.json", "trajectory.npz"
 OF_CHUNKS = re.compile(
@@ -39,6 +41,7 @@ OF_CHUNKS = re.compile(
 OURS = re.compile(
     r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"
     r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
+    r"|sweeps/(about\.json|\d+\.\w+\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -125,8 +128,9 @@ def remove_damaged_drives(folder: Path) -> None:
 
 
 def remove_matches(folder: Path) -> None:
-    """Remove saved LiDAR odometry, and what was registered along it; raises OSError."""
+    """Remove saved LiDAR odometry, its sweeps, and what was registered along it; raises OSError."""
     _remove_known(folder, folder / MATCHES)
+    _remove_known(folder, folder / SWEEPS)
     _remove_known(folder, folder / REVISITS)
 
 

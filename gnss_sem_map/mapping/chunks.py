@@ -76,7 +76,7 @@ def chunks_of(drive: Drive) -> list[Sequence[Scan]]:
 
 
 def _chunks_of(drive: Drive) -> list[Sequence[Scan]]:
-    scans, window = drive.scans, drive.settings.dynamics.window_scans
+    scans, window = drive.log.scans, drive.settings.dynamics.window_scans
     count = 1 + max(0, len(scans) - window) // (WINDOWS * window)
     edges = [*range(0, count * WINDOWS * window, WINDOWS * window), len(scans)]
     return [scans[start:end] for start, end in pairwise(edges)]
@@ -109,9 +109,7 @@ def _map_chunks(
     start = sum(map(len, chunks[: numbers.start]))
     total = sum(len(chunks[number]) for number in numbers)
     is_sought = drive.settings.dynamics.enabled
-    if is_sought:
-        _ = drive.image_rows  # the scans that tell them are kept for their turn
-    images = range_images(drive, drive.scans[max(start - window, 0) : start]) if is_sought else []
+    images = range_images(drive, drive.log.scans[max(start - window, 0) : start]) if is_sought else []
     with writing_to(folder):
         before = WaitingImages.write(images, folder)
     del images

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,6 @@ from gnss_sem_map.labels.probabilities import KeepsLabels
 from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.scans import kernels
 from gnss_sem_map.scans.deskew import KNOTS_PER_S, knots_of, usable_points_in_map
-from gnss_sem_map.scans.kept_sweeps import KeptSweeps
 from gnss_sem_map.scans.own_vehicle import reach_of_vehicle
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.projection import (
@@ -36,6 +36,7 @@ from gnss_sem_map.scans.projection import (
     view_at,
     visible,
 )
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 from gnss_sem_map.segmentation import Segmenter
 from gnss_sem_map.sensor_log import Image, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
@@ -58,6 +59,8 @@ class Drive:
     trajectory: Trajectory
     segmenter: Segmenter | None
     settings: Settings
+    saved: Path | None = None
+    """The folder of sweeps that were saved when they were read, see `pattern_sweeps`."""
 
     @cached_property
     def label_set(self) -> LabelSet:
@@ -68,7 +71,10 @@ class Drive:
     def by_lidar(self) -> tuple[Drive, ...]:
         """The drive once for each of its LiDARs, with its scans alone."""
         logs = self.log.by_lidar
-        return (self,) if len(logs) == 1 else tuple(replace(self, log=log) for log in logs)
+        if len(logs) == 1:
+            return (self,)
+        saved = self.saved, *(None for _ in logs[1:])  # of the first LiDAR, as all sweeps of the odometry
+        return tuple(replace(self, log=log, saved=one) for log, one in zip(logs, saved, strict=True))
 
     @property
     def image_rows(self) -> Rows:
@@ -87,19 +93,13 @@ class Drive:
         return self._pattern.reach_m if said is None else said
 
     @cached_property
-    def scans(self) -> tuple[Scan, ...]:
-        """Those of the log; what told the rows is not read again."""
-        return self._kept.taking(self.log).scans
-
-    @cached_property
     def _pattern(self) -> _Pattern:
-        scans = _sample(self._kept.keeping(self.log).scans)
+        sweeps, scans = pattern_sweeps(self.log, self.saved), []
+        for number in sorted(sweeps.numbers):
+            with suppress(DataError):  # reported where all scans are read
+                scans.append(sweeps[number].xyz)
         rows = Rows.of(scans)
         return _Pattern(rows, share_seen_through(scans, rows), reach_of_vehicle(scans))
-
-    @cached_property
-    def _kept(self) -> KeptSweeps:
-        return KeptSweeps()
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +114,14 @@ class _Pattern:
     """How far the vehicle itself reaches."""
 
 
-def _sample(scans: Sequence[Scan]) -> list[NDArray[np.float32]]:
-    """The points of some scans; those that cannot be read are reported elsewhere."""
-    found = []
-    for scan in scans[:: max(len(scans) // SAMPLED_SCANS, 1)]:
-        with suppress(DataError):
-            found.append(scan.read().xyz)
-    return found
+def pattern_sweeps(log: SensorLog, folder: Path | None = None) -> ThinnedSweeps:
+    """Some sweeps of the whole drive, with all their points: they tell how a LiDAR measures."""
+    numbers = range(0, len(log.scans), max(len(log.scans) // SAMPLED_SCANS, 1))
+    return ThinnedSweeps(log, "pattern", _without_stamps, frozenset(numbers), folder)
+
+
+def _without_stamps(points: Points) -> Points:
+    return replace(points, stamps=None)
 
 
 @dataclass(frozen=True, eq=False)

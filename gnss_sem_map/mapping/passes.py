@@ -23,7 +23,7 @@ from gnss_sem_map.scans.revisits import (
     register_passes,
     register_to_base,
 )
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,8 @@ class LocatedDrive:
     """A drive that can be bound to others, in the frame of all."""
 
     name: str
-    log: SensorLog
+    sweeps: ThinnedSweeps
+    """Along its track, see `local_maps.sweeps_along`."""
     trajectory: Trajectory
     condensed: CondensedDrive
 
@@ -76,7 +77,7 @@ def bind_passes(
     A `base` stands, and counts as one more drive. Of several drives, one that only passes its own places again is left
     to bind itself. `registrar`: see `register_passes`.
     """
-    passes = [pass_of(drive.log, drive.trajectory, drive.condensed, settings) for drive in drives]
+    passes = [pass_of(drive.sweeps, drive.trajectory, drive.condensed, settings) for drive in drives]
     revisits = register_passes(passes, settings, registrar)
     condensed = [drive.condensed for drive in drives]
     names = [drive.name for drive in drives]

@@ -79,14 +79,14 @@ def label_points(
     moving: dict[int, NDArray[np.int64]] = {}
     drive = Drive(log, trajectory, None, settings)
     _ = drive.nearest_m  # the scans that tell it are kept for their turn
-    for start in range(0, len(drive.scans), SCANS_AT_ONCE):
-        scans = drive.scans[start : start + SCANS_AT_ONCE]
+    for start in range(0, len(drive.log.scans), SCANS_AT_ONCE):
+        scans = drive.log.scans[start : start + SCANS_AT_ONCE]
         box = _box_of(scans, log, trajectory, settings.mapping.farthest_m)
         if box is None:
             continue
         parts = [tiled.inside(box) for tiled in maps]
         # skipped scans are in no file: the files of these scans end where one holds the last of them, or a later one
-        enough = {scan.number for scan in drive.scans[start + len(scans) - 1 :]}
+        enough = {scan.number for scan in drive.log.scans[start + len(scans) - 1 :]}
         while files and enough.isdisjoint(moving):
             moving |= read_moving_points(files.pop(0))
         yield from _label_some(drive, scans, parts, moving, kerbs)

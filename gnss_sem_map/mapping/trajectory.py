@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes, co
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, TrajectorySettings, match_scans
+from gnss_sem_map.scans.local_maps import sweeps_along
 from gnss_sem_map.scans.revisits import Registrar
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.kernels import AXIS_BITS
 from gnss_sem_map.voxels.tile_files import Z_OFFSET
@@ -49,6 +52,8 @@ class DriveTrajectory:
     """The trajectory before it was bound to itself; None where nothing binds it."""
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again, and how well it fits."""
+    sweeps: ThinnedSweeps | None = None
+    """Along the track, for what is passed again; None if LiDAR odometry was not used."""
 
 
 def estimate_trajectory(
@@ -68,20 +73,22 @@ def locate(
     match: Matcher | None = None,
     bound: bool = True,
     registrar_of: RegistrarOf | None = None,
+    saved: Path | None = None,
 ) -> DriveTrajectory:
     """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
     `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
     default `match_scans` in this process. If not `bound`, places that are passed again stay as they are; else they are
-    registered by threads of this process, or as `registrar_of` says.
+    registered by threads of this process, or as `registrar_of` says. `saved`: the folder of sweeps that `match` saves.
     """
     if log.given is not None:
         return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
     with_lidar = settings.trajectory.lidar_odometry and bool(log.scans)
     found = first if first is not None else smooth_log(log, _plain(settings.trajectory, with_lidar))
-    from_lidar_odometry, without_lidar = False, None
+    from_lidar_odometry, without_lidar, sweeps = False, None, None
     if with_lidar:
+        sweeps = sweeps_along(log, found.trajectory, saved)
         matches = (match or _in_this_process)(log, found.trajectory, settings, progress)
         release_memory()  # of the local map
         stats.counts.update(matches.counts)
@@ -94,7 +101,7 @@ def locate(
         elif first is None:
             found = smooth_log(log, settings.trajectory)
     stats.warnings.extend(found.notes)
-    located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry)
+    located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry, sweeps=sweeps)
     return _bound(located, log, settings, stats, registrar_of) if bound else located
 
 
@@ -113,10 +120,10 @@ def _bound(
     registrar_of: RegistrarOf | None,
 ) -> DriveTrajectory:
     """The trajectory, bound to itself where it comes to a place again."""
-    if found.solution is None or found.solution.condensed is None:
+    if found.solution is None or found.solution.condensed is None or found.sweeps is None:
         return found
     release_memory()  # of the graph
-    located = LocatedDrive(log.name, log, found.trajectory, found.solution.condensed)
+    located = LocatedDrive(log.name, found.sweeps, found.trajectory, found.solution.condensed)
     registrar = None if registrar_of is None else registrar_of(log, found.trajectory, settings)
     together = bind_passes([located], settings.trajectory.revisits, registrar=registrar)
     count_passes(together, stats)

@@ -34,7 +34,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import npz_of
 from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
-from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, TRAJECTORY, writing_to
+from gnss_sem_map.files.work_folder import BOUND, DRIVES, JOB, SWEEPS, TRAJECTORY, writing_to
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.mapping.passes import LocatedDrive, TwoPasses, bind_passes
@@ -46,6 +46,7 @@ from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
+from gnss_sem_map.scans.local_maps import sweeps_of
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.reuse import read_record, write_record
 
@@ -173,12 +174,15 @@ def _locate_one(source: Source, settings: Settings, frame: LocalFrame, work: Pat
             (folder / name).unlink(missing_ok=True)
         match = SavedMatches(source, claim.work, resume=True)
         found = pipeline.locate(log, settings, RunStats(), match=match, bound=False)
-        if found.solution is None or found.solution.condensed is None:
+        if found.solution is None or found.solution.condensed is None or found.sweeps is None:
             return
         log, trajectory = pipeline.in_frame(log, found.trajectory, frame)
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / CONDENSED, found.solution.condensed.to_bytes())
-        write_job(folder, source, settings, trajectory, fingerprint)
+        write_job(
+            folder, source, settings, trajectory, fingerprint,
+            sweeps=sorted(found.sweeps.numbers), saved=str((claim.work / SWEEPS).resolve()),
+        )  # fmt: skip
         write_record({"fingerprint": fingerprint, "sha256": _checksums(folder)}, folder / LOCATED)
 
 
@@ -219,9 +223,10 @@ def _bound(
 
 
 def _read(folder: Path) -> LocatedDrive:
-    _, source, _, log, trajectory = read_job(folder)
+    about, source, _, log, trajectory = read_job(folder)
     condensed = CondensedDrive.from_bytes(read_bytes(folder / CONDENSED))
-    return LocatedDrive(source.name, log, trajectory, condensed.at(trajectory))
+    sweeps = sweeps_of(log, about["sweeps"], Path(about["saved"]))
+    return LocatedDrive(source.name, sweeps, trajectory, condensed.at(trajectory))
 
 
 def read_correction(file: str) -> tuple[Correction | None, str]:

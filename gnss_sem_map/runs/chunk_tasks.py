@@ -69,6 +69,7 @@ def _write_job(work: Path, source: Source, drive: Drive, store: ChunkStore) -> N
         work, source, drive.settings, drive.trajectory, store.fingerprint,
         probabilities=None if cache is None else str(cache),
         chunks=store.count,
+        saved=None if drive.saved is None else str(drive.saved.resolve()),
     )  # fmt: skip
 
 
@@ -82,7 +83,7 @@ def _opened(work: str, fingerprint: str) -> tuple[Drive, ChunkStore]:
         network = CachedSegmenter(
             network, label_set, log.calibration.image_sizes, Path(about["probabilities"])
         )
-    drive = Drive(log, trajectory, network, settings)
+    drive = Drive(log, trajectory, network, settings, Path(about["saved"]) if about["saved"] else None)
     if not fingerprints.of_map(drive, source.labels_from) == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     store = ChunkStore(Path(work), fingerprint, about["chunks"], settings.mapping.voxel_size_m, label_set)

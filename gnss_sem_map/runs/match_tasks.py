@@ -2,6 +2,8 @@
 
 WORK/matches/job.json, trajectory.npz    the drive, for the workers (`runs.drive_job`)
              N.npz, N.json               relative poses of section N; its counts and skips, and the checksum of N.npz
+     sweeps/                             sweeps that sections share or later stages need (`scans.thinned_sweeps`)
+            about.json                   what they are from
 """
 
 from __future__ import annotations
@@ -20,21 +22,25 @@ import numpy as np
 
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.archives import npz_of
 from gnss_sem_map.files.atomic import write_whole
 from gnss_sem_map.files.untrusted import read_bytes
-from gnss_sem_map.files.work_folder import MATCHES
+from gnss_sem_map.files.work_folder import MATCHES, SWEEPS
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_section, sections_of
+from gnss_sem_map.scans.local_maps import sweeps_along
 from gnss_sem_map.sensor_log import SensorLog, Skip
-from gnss_sem_map.voxels.reuse import read_record
+from gnss_sem_map.voxels.reuse import read_record, write_record
+
+ABOUT = "about.json"
 
 
 @dataclass(frozen=True)
@@ -56,10 +62,13 @@ class SavedMatches:
         sections = sections_of(len(log.scans), settings.trajectory.scan_matching)
         fingerprint = fingerprints.of_matches(log, trajectory, settings)
         work_folder.make(self.work)
-        if not self.resume:
+        if not self.resume or not _are_sweeps_of(self.work / SWEEPS, fingerprint):
             work_folder.remove_matches(self.work)
         folder = (self.work / MATCHES).resolve()
-        folder.mkdir(exist_ok=True)
+        with work_folder.writing_to(self.work):
+            folder.mkdir(exist_ok=True)
+            (self.work / SWEEPS).mkdir(exist_ok=True)
+            write_record({"fingerprint": fingerprint}, self.work / SWEEPS / ABOUT)
         pending = [n for n in range(len(sections)) if _read(folder, n, fingerprint) is None]
         done = len(log.scans) - sum(len(sections[n]) for n in pending)  # of an interrupted run
         for n in self._matched(log, trajectory, settings, pending, folder, fingerprint, progress):
@@ -80,7 +89,7 @@ class SavedMatches:
         """Match sections, and yield the number of each when it is saved."""
         if self.executor is None or len(pending) < 2:
             for n in pending:
-                _save(_match(log, trajectory, settings, n, progress), folder, n, fingerprint)
+                _save(_match(log, trajectory, settings, n, self.work, progress), folder, n, fingerprint)
                 yield n
             return
         write_job(folder, self.source, settings, trajectory, fingerprint)
@@ -107,15 +116,25 @@ def match_one(folder: str, fingerprint: str, number: int) -> None:
     """Match one section, and save it: a task. Raises DataError if the drive is another one here."""
     if _read(Path(folder), number, fingerprint) is None:
         log, trajectory, settings = _opened(folder, fingerprint)
-        _save(_match(log, trajectory, settings, number), Path(folder), number, fingerprint)
+        found = _match(log, trajectory, settings, number, Path(folder).parent)
+        _save(found, Path(folder), number, fingerprint)
 
 
 def _match(
-    log: SensorLog, trajectory: Trajectory, settings: Settings, number: int, progress: Progress = silent
+    log: SensorLog,
+    trajectory: Trajectory,
+    settings: Settings,
+    number: int,
+    work: Path,
+    progress: Progress = silent,
 ) -> ScanMatches:
-    matching = settings.trajectory.scan_matching
+    """Match a section; what later stages need of its sweeps is saved."""
+    matching, saved = settings.trajectory.scan_matching, work / SWEEPS
+    log = pipeline.saving_sweeps(log, saved)
+    if settings.trajectory.revisits.enabled:
+        log = sweeps_along(log, trajectory, saved).listening()
     section = sections_of(len(log.scans), matching)[number]
-    return match_section(log, trajectory, matching, section, progress)
+    return match_section(log, trajectory, matching, section, progress, saved)
 
 
 @lru_cache(1)
@@ -125,6 +144,10 @@ def _opened(folder: str, fingerprint: str) -> tuple[SensorLog, Trajectory, Setti
     if fingerprints.of_matches(log, trajectory, settings) != fingerprint:
         raise other_drive(source)
     return log, trajectory, settings
+
+
+def _are_sweeps_of(folder: Path, fingerprint: str) -> bool:
+    return read_record(folder / ABOUT) == {"fingerprint": fingerprint}
 
 
 def _save(found: ScanMatches, folder: Path, number: int, fingerprint: str) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.files import work_folder
-from gnss_sem_map.files.work_folder import REVISITS
+from gnss_sem_map.files.work_folder import REVISITS, SWEEPS
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor, Task, path_of, run_tasks
 from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
-from gnss_sem_map.scans.local_maps import LocalMaps
+from gnss_sem_map.scans.local_maps import LocalMaps, sweeps_of
 from gnss_sem_map.scans.revisits import Found, Pair, Pass, Registrar, RevisitSettings, register_pair
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.reuse import digest, read_record, write_record
@@ -58,8 +58,8 @@ class RevisitTasks:
         work_folder.make(self.work)
         folder = (self.work / REVISITS).resolve()
         folder.mkdir(exist_ok=True)
-        stamps = places.stamps.tolist()
-        write_job(folder, self.source, settings, trajectory, fingerprint, stamps=stamps)
+        stamps, sweeps = places.stamps.tolist(), sorted(places.maps.sweeps.numbers)
+        write_job(folder, self.source, settings, trajectory, fingerprint, stamps=stamps, sweeps=sweeps)
         groups = [pairs[start : start + PAIRS_PER_TASK] for start in range(0, len(pairs), PAIRS_PER_TASK)]
         function = path_of(register_some)
         tasks = [
@@ -74,8 +74,8 @@ class RevisitTasks:
 def register_some(folder: str, fingerprint: str, number: int, pairs: list[list[int]]) -> list[Any]:
     """Register pairs, and save what was found: a task. Raises DataError if the drive is another one here."""
     file = Path(folder) / f"{number}.json"
-    passes, settings, stamps = _opened(folder, fingerprint)
-    made_from = digest([fingerprint, stamps, settings.model_dump_json(), pairs])
+    passes, settings, places = _opened(folder, fingerprint)
+    made_from = digest([fingerprint, places, settings.model_dump_json(), pairs])
     known = read_record(file)
     if known is not None and known.get("made_from") == made_from:
         return list(known["found"])
@@ -85,15 +85,17 @@ def register_some(folder: str, fingerprint: str, number: int, pairs: list[list[i
 
 
 @lru_cache(1)
-def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings, list[float]]:
-    """The places of a job: opened once for all tasks of a worker."""
+def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings, list[Any]]:
+    """The places of a job, and what the job says of them: opened once for all tasks of a worker."""
     about, source, settings, log, trajectory = read_job(Path(folder))
     if not fingerprints.of_matches(log, trajectory, settings) == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     stamps = np.array(about["stamps"])
-    maps = LocalMaps(log, trajectory, stamps)
+    sweeps = sweeps_of(log, about["sweeps"], Path(folder).parent / SWEEPS)
+    maps = LocalMaps(sweeps, trajectory, stamps)
     anchors = np.empty(0, np.intp)  # of the graph, which is elsewhere
-    return [Pass(anchors, stamps, trajectory.at(stamps), maps)], settings.trajectory.revisits, about["stamps"]
+    places = [about["stamps"], about["sweeps"]]
+    return [Pass(anchors, stamps, trajectory.at(stamps), maps)], settings.trajectory.revisits, places
 
 
 def _packed(found: Found | None) -> Any:

@@ -14,8 +14,9 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import add
+from pathlib import Path
 
 import numpy as np
 import small_gicp
@@ -34,7 +35,8 @@ from gnss_sem_map.scans.downsampling import thinned
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.registration import DegenerateSettings
 from gnss_sem_map.scans.revisits import RevisitSettings
-from gnss_sem_map.sensor_log import Scan, SensorLog, Skip
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog, Skip
 
 Array = NDArray[np.float64]
 
@@ -157,16 +159,22 @@ def match_section(
     settings: ScanMatchingSettings,
     section: range,
     progress: Progress = silent,
+    saved: Path | None = None,
 ) -> ScanMatches:
-    """Relative poses of the sweeps of a section to earlier ones; see `match_scans`."""
+    """Relative poses of the sweeps of a section to earlier ones; see `match_scans`.
+
+    Sweeps that two sections need are saved in the folder `saved` by the one that reads them first.
+    """
     odometry = _Odometry(settings)
     matches: list[_Match] = []
     skips: list[Skip] = []
     first = max(section.start - WARM_UP_SCANS, 0)
     before = 0  # matches of the section before
     # the next sweeps are read, downsampled and deskewed on a second core while one is matched
-    prepare = partial(_prepare, log=log, trajectory=trajectory, settings=settings)
-    for number, (scan, sweep) in enumerate(prefetch(prepare, log.scans[first : section.stop]), first):
+    sweeps = _sweeps_of(log, settings, saved)
+    prepare = partial(_prepare, sweeps=sweeps, trajectory=trajectory, settings=settings)
+    for number, sweep in prefetch(prepare, range(first, section.stop)):
+        scan = log.scans[number]
         if number == section.start:
             before, skips = len(matches), []
         try:
@@ -197,25 +205,40 @@ class _Sweep:
     T_map_lidar: Array
 
 
+def _sweeps_of(log: SensorLog, settings: ScanMatchingSettings, saved: Path | None) -> ThinnedSweeps:
+    """The sweeps of a drive, one point per cube; those that end a section begin the next one, too."""
+
+    def one_per_cube(points: Points) -> Points:
+        nearest_m, farthest_m = settings.nearest_m, settings.farthest_m
+        some = thinned(points, settings.downsampling_m, nearest_m, farthest_m)
+        if not len(some.xyz):
+            raise DataError(f"no point between {nearest_m:g} and {farthest_m:g} m of {len(points.xyz)}")
+        return some
+
+    starts = [section.start for section in sections_of(len(log.scans), settings)]
+    shared = (range(max(start - WARM_UP_SCANS, 0), start) for start in starts)
+    return ThinnedSweeps(log, "odometry", one_per_cube, frozenset(chain.from_iterable(shared)), saved)
+
+
 def _prepare(
-    scan: Scan, log: SensorLog, trajectory: Trajectory, settings: ScanMatchingSettings
+    number: int, sweeps: ThinnedSweeps, trajectory: Trajectory, settings: ScanMatchingSettings
 ) -> _Sweep | Skip:
     """The sweep ready for registration, or the reason why it is skipped."""
+    log = sweeps.log
+    scan = log.scans[number]
     try:
-        return _sweep(scan, trajectory, log.calibration.T_imu_lidar, settings)
+        return _sweep(sweeps[number], scan.stamp, trajectory, log.calibration.T_imu_lidar, settings)
     except (DataError, MeasurementError) as error:
         return Skip("scan", f"frame {log.frame_of(scan)}", str(error))
     except _NoMatch as error:
         return Skip("scan matching", f"frame {log.frame_of(scan)}", str(error))
 
 
-def _sweep(scan: Scan, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings) -> _Sweep:
-    """Keep one point per cube of a sweep, deskew these, and fit a plane to each."""
-    raw, nearest_m, farthest_m = scan.read(), settings.nearest_m, settings.farthest_m
-    some = thinned(raw, settings.downsampling_m, nearest_m, farthest_m)
-    if not len(some.xyz):
-        raise DataError(f"no point between {nearest_m:g} and {farthest_m:g} m of {len(raw.xyz)}")
-    cloud, T_map_lidar = usable_points_at_stamp(some, scan.stamp, trajectory, T_imu_lidar)
+def _sweep(
+    some: Points, stamp: float, trajectory: Trajectory, T_imu_lidar: Array, settings: ScanMatchingSettings
+) -> _Sweep:
+    """Deskew the points of a thinned sweep, and fit a plane to each."""
+    cloud, T_map_lidar = usable_points_at_stamp(some, stamp, trajectory, T_imu_lidar)
     points = small_gicp.PointCloud(cloud)
     if points.size() < settings.min_points:
         raise _NoMatch(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import small_gicp
@@ -13,7 +15,8 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.scans.deskew import usable_points_in_map
 from gnss_sem_map.scans.downsampling import one_per_cube, thinned
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
+from gnss_sem_map.sensor_log import Points, SensorLog
 
 Array = NDArray[np.float64]
 
@@ -30,16 +33,13 @@ KEPT_SWEEPS, KEPT_MAPS = 16, 4
 class LocalMaps:
     """The local maps of a drive, made when they are asked for; sweeps that cannot be read are left out.
 
-    `stamps` (p,) s are those of the places, in the span of the sweeps; `trajectory` deskews these.
+    `sweeps` are those along its track; `stamps` (p,) s are of the places, in their span; `trajectory` deskews them.
     """
 
-    def __init__(self, log: SensorLog, trajectory: Trajectory, stamps: Array) -> None:
-        self._log, self._trajectory, self._stamps = log, trajectory, stamps
-        scans = np.array([scan.stamp for scan in log.scans])
-        way = way_along(trajectory, scans)
-        lattice = np.arange(0.0, way[-1] + SWEEP_M, SWEEP_M)
-        self._lattice = np.unique(nearest(way, lattice))
-        self._nearest = nearest(scans[self._lattice], stamps)
+    def __init__(self, sweeps: ThinnedSweeps, trajectory: Trajectory, stamps: Array) -> None:
+        self.sweeps, self._trajectory, self._stamps = sweeps, trajectory, stamps
+        self._numbers = sorted(sweeps.numbers)
+        self._nearest = nearest(np.array([sweeps.log.scans[n].stamp for n in self._numbers]), stamps)
         self._sweep = lru_cache(KEPT_SWEEPS)(self._read)
         self.at = lru_cache(KEPT_MAPS)(self._made)
         """The local map of a place: points, each with its plane, m; empty where no sweep can be read."""
@@ -51,19 +51,35 @@ class LocalMaps:
 
     def _made(self, place: int) -> small_gicp.PointCloud:
         first = max(int(self._nearest[place]) - SWEEPS // 2, 0)
-        there = [self._sweep(int(scan)) for scan in self._lattice[first : first + SWEEPS]]
+        there = [self._sweep(number) for number in self._numbers[first : first + SWEEPS]]
         T = np.linalg.inv(self._trajectory.at(self._stamps[place : place + 1])[0])
         points = np.concatenate(there) @ T[:3, :3].T + T[:3, 3]
         return cloud_of(one_per_cube(np.ascontiguousarray(points), CUBE_M))
 
     def _read(self, number: int) -> Array:
         """A thinned sweep in the map frame."""
-        scan, T_imu_lidar = self._log.scans[number], self._log.calibration.T_imu_lidar
+        log = self.sweeps.log
+        stamp, T_imu_lidar = log.scans[number].stamp, log.calibration.T_imu_lidar
         try:
-            some = thinned(scan.read(), CUBE_M, NEAREST_M, FARTHEST_M)
-            return usable_points_in_map(some, scan.stamp, self._trajectory, T_imu_lidar)[0]
+            return usable_points_in_map(self.sweeps[number], stamp, self._trajectory, T_imu_lidar)[0]
         except (DataError, MeasurementError):  # reported when the map is built
             return np.empty((0, 3))
+
+
+def sweeps_along(log: SensorLog, trajectory: Trajectory, folder: Path | None = None) -> ThinnedSweeps:
+    """The sweeps of which local maps are made, SWEEP_M apart along the track."""
+    way = way_along(trajectory, np.array([scan.stamp for scan in log.scans]))
+    numbers = nearest(way, np.arange(0.0, way[-1] + SWEEP_M, SWEEP_M))
+    return sweeps_of(log, numbers.tolist(), folder)
+
+
+def sweeps_of(log: SensorLog, numbers: Iterable[int], folder: Path | None = None) -> ThinnedSweeps:
+    """The sweeps of these numbers, as local maps need them."""
+    return ThinnedSweeps(log, "surroundings", _thinned, frozenset(numbers), folder)
+
+
+def _thinned(points: Points) -> Points:
+    return thinned(points, CUBE_M, NEAREST_M, FARTHEST_M)
 
 
 def nearest(values: Array, wanted: Array) -> NDArray[np.intp]:

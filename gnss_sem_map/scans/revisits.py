@@ -25,7 +25,7 @@ from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.local_maps import LocalMaps, normals, way_along
 from gnss_sem_map.scans.prefetch import prefetch
 from gnss_sem_map.scans.registration import DegenerateSettings
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.scans.thinned_sweeps import ThinnedSweeps
 
 Array = NDArray[np.float64]
 
@@ -67,11 +67,11 @@ class Pass:
 
 
 def pass_of(
-    log: SensorLog, trajectory: Trajectory, condensed: CondensedDrive, settings: RevisitSettings
+    sweeps: ThinnedSweeps, trajectory: Trajectory, condensed: CondensedDrive, settings: RevisitSettings
 ) -> Pass:
-    """The places of a drive: anchors within its scans, `every_m` apart."""
-    scans = np.array([scan.stamp for scan in log.scans])
-    inside = np.flatnonzero((condensed.stamps >= scans[0]) & (condensed.stamps <= scans[-1]))
+    """The places of a drive: anchors within its scans, `every_m` apart. `sweeps` are those along its track."""
+    scans = sweeps.log.scans
+    inside = np.flatnonzero((condensed.stamps >= scans[0].stamp) & (condensed.stamps <= scans[-1].stamp))
     places, last = [], -np.inf
     way = way_along(trajectory, condensed.stamps)
     for anchor in inside.tolist():
@@ -80,7 +80,7 @@ def pass_of(
             last = way[anchor]
     anchors = np.array(places, np.intp)
     stamps = condensed.stamps[anchors]
-    return Pass(anchors, stamps, trajectory.at(stamps), LocalMaps(log, trajectory, stamps))
+    return Pass(anchors, stamps, trajectory.at(stamps), LocalMaps(sweeps, trajectory, stamps))
 
 
 Pair = tuple[int, int, int, int]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +14,18 @@ from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.files.work_folder import clear
+from gnss_sem_map.evaluation.map_sharpness import SweepSample, of_sample
+from gnss_sem_map.files.work_folder import SWEEPS, clear
 from gnss_sem_map.mapping.execution import Executor, InProcess
+from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.run_stats import silent
 from gnss_sem_map.runs import match_tasks
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_scans, sections_of
-from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.scans.local_maps import LocalMaps, sweeps_along
+from gnss_sem_map.sensor_log import Points, Scan, SensorLog
 
 SETTINGS = Settings.model_validate({"trajectory": {"scan_matching": {"section_scans": 3, "min_points": 20}}})
 MATCHING = SETTINGS.trajectory.scan_matching
@@ -103,6 +108,45 @@ def test_matches_of_another_first_trajectory_are_not_taken(
     T[:, 0, 3] += 0.01 * (small_track.stamps - small_track.start)
     moved = Trajectory(small_track.stamps, T)
     assert_same(match(small_log, moved, SETTINGS, silent), match_scans(small_log, moved, MATCHING))
+
+
+def test_later_stages_take_what_was_saved_of_a_sweep(
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path, expected: ScanMatches
+) -> None:
+    reads: Counter[int] = Counter()
+
+    def read(scan: Scan) -> Points:
+        reads[scan.number] += 1
+        return scan.read()
+
+    log = replace(small_log, scans=tuple(replace(scan, read=partial(read, scan)) for scan in small_log.scans))
+    assert_same(SavedMatches(small_source, tmp_path)(log, small_track, SETTINGS, silent), expected)
+    assert reads == dict.fromkeys((scan.number for scan in log.scans), 1), "though its sections overlap"
+    saved, places = tmp_path / SWEEPS, small_track.stamps[[2, 5, 9]]
+    along, sharpness = sweeps_along(log, small_track, saved), SweepSample(log, folder=saved)
+    for sweeps in (along, sharpness.sweeps):
+        for number in sorted(sweeps.numbers):
+            thinned = sweeps.thin(small_log.scans[number].read())
+            np.testing.assert_array_equal(sweeps[number].rows, thinned.rows)
+    maps = LocalMaps(along, small_track, places)
+    assert all(maps.at(place).size() for place in range(len(places)))
+    of_sample(sharpness, [small_track])
+    _ = Drive(log, small_track, None, SETTINGS, saved).image_rows
+    assert max(reads.values()) == 1
+
+
+def test_sweeps_of_other_files_are_not_taken(
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path
+) -> None:
+    match = SavedMatches(small_source, tmp_path, resume=True)
+    match(small_log, small_track, SETTINGS, silent)
+    (file,) = (tmp_path / SWEEPS).glob("0.sharpness.npz")
+    file.write_bytes(b"of another drive")
+    match(small_log, small_track, SETTINGS, silent)
+    assert file.read_bytes() == b"of another drive"  # of this one, as far as anyone can tell
+    later = replace(small_track, stamps=small_track.stamps + 1e-3)
+    match(small_log, later, SETTINGS, silent)
+    assert len(file.read_bytes()) > 100
 
 
 def test_a_worker_that_finds_another_drive_says_so(

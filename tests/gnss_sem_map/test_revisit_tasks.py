@@ -19,7 +19,7 @@ from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.runs import revisit_tasks
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.source import Source
-from gnss_sem_map.scans.local_maps import LocalMaps
+from gnss_sem_map.scans.local_maps import LocalMaps, sweeps_along
 from gnss_sem_map.scans.revisits import Found, Pair, Pass, register_pair
 from gnss_sem_map.sensor_log import SensorLog
 
@@ -31,7 +31,10 @@ PAIRS: list[Pair] = [(0, 0, 0, 1), (0, 0, 0, 2), (0, 1, 0, 2), (0, 0, 0, 3), (0,
 def places(small_log: SensorLog, small_track: Trajectory) -> Pass:
     stamps = np.array([scan.stamp for scan in small_log.scans])[[1, 4, 7, 9]]
     return Pass(
-        np.arange(len(stamps)), stamps, small_track.at(stamps), LocalMaps(small_log, small_track, stamps)
+        np.arange(len(stamps)),
+        stamps,
+        small_track.at(stamps),
+        LocalMaps(sweeps_along(small_log, small_track), small_track, stamps),
     )
 
 
@@ -101,7 +104,10 @@ def test_a_worker_that_finds_another_trajectory_registers_again(
     T[:, 0, 3] += 0.01 * (small_track.stamps - small_track.start)
     moved = Trajectory(small_track.stamps, T)
     there = Pass(
-        places.anchors, places.stamps, moved.at(places.stamps), LocalMaps(small_log, moved, places.stamps)
+        places.anchors,
+        places.stamps,
+        moved.at(places.stamps),
+        LocalMaps(sweeps_along(small_log, moved), moved, places.stamps),
     )
     found = list(
         RevisitTasks(small_source, tmp_path, InProcess())(small_log, moved, SETTINGS)([there], PAIRS)

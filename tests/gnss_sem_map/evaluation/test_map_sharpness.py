@@ -126,7 +126,7 @@ def test_unreadable_sweeps_are_left_out() -> None:
     assert (nothing.scans, nothing.voxels, nothing.as_dict()["voxels_per_m"]) == (0, 0, None)
 
 
-def test_sweeps_that_were_read_for_odometry_are_not_read_again() -> None:
+def test_sweeps_that_were_read_for_odometry_are_not_read_again(tmp_path: Path) -> None:
     log, truth = street()
     reads: Counter[int] = Counter()
 
@@ -137,8 +137,8 @@ def test_sweeps_that_were_read_for_odometry_are_not_read_again() -> None:
     counted = replace(log, scans=tuple(replace(scan, read=partial(read, scan)) for scan in log.scans))
     some = SharpnessSettings(max_scans=8, stretch_scans=4, min_scans=2)
     (expected,) = map_sharpness.of_drive(log, [truth], some)
-    sample = SweepSample(counted, some)
-    match_scans(sample.listening(), truth)
+    sample = SweepSample(counted, some, tmp_path)
+    match_scans(sample.sweeps.listening(), truth)
     (found,) = map_sharpness.of_sample(sample, [truth])
     assert set(reads.values()) == {1}
     assert len(reads) == len(log.scans)

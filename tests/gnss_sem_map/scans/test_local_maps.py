@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.scans.local_maps import LocalMaps, nearest
+from gnss_sem_map.scans.local_maps import LocalMaps, nearest, sweeps_along
 
 
 def test_the_nearest_value_is_the_first_of_equal_ones_as_a_search_of_all_finds_it() -> None:
@@ -27,7 +27,7 @@ def memory_of(scans: int) -> int:
     )
     trajectory = Trajectory(stamps, T)
     tracemalloc.start()
-    LocalMaps(log, trajectory, stamps[::7])
+    LocalMaps(sweeps_along(log, trajectory), trajectory, stamps[::7])
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return most

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.condensing import CondensedDrive
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.scans.local_maps import cloud_of, normals
+from gnss_sem_map.scans.local_maps import cloud_of, normals, sweeps_along
 from gnss_sem_map.scans.revisits import Pass, RevisitSettings, candidates, pass_of, register_passes
 from gnss_sem_map.sensor_log import Points, SensorLog
 
@@ -43,7 +43,7 @@ def condensed(trajectory: Trajectory) -> CondensedDrive:
 
 
 def pass_with(log: SensorLog, trajectory: Trajectory) -> Pass:
-    return pass_of(log, trajectory, condensed(trajectory), SETTINGS)
+    return pass_of(sweeps_along(log, trajectory), trajectory, condensed(trajectory), SETTINGS)
 
 
 def wrong_by(trajectory: Trajectory, metres: Array, degrees: float) -> Trajectory:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.machine import threads
+from gnss_sem_map.mapping.execution import failure_of
 
 
 def times(a: float, b: float) -> float:
@@ -95,6 +96,11 @@ def is_wrong(kind: str) -> None:
     if kind == "defect":
         raise KeyError("no such thing")
     raise {"data": DataError, "write": WriteError}[kind](f"{kind}: wrong; change it")
+
+
+def fails(how: str) -> str:
+    """Says why it failed, as the mapping of a drive does."""
+    return failure_of(lambda: is_wrong(how))
 
 
 def dies_once(folder: str) -> bool:

@@ -108,12 +108,13 @@ def _answer_in_time(
     from distributed import get_worker
 
     address = get_worker().address
+    place = f" (on Dask worker {address})"
     if version != _version():  # a worker that came later
-        message = f"{PACKAGE} {_version()} is installed; expected {version}"
+        message = f"{PACKAGE} {_version()} is installed; expected {version}{place}"
         return address, json.dumps({"error": "DataError", "message": message})
     answers: list[str] = []
     calling = threading.Thread(
-        target=lambda: answers.append(answer(function, arguments, allowed)), daemon=True
+        target=lambda: answers.append(answer(function, arguments, allowed, place)), daemon=True
     )
     calling.start()
     calling.join(timeout_s)
@@ -141,7 +142,7 @@ def _result(client: Client, task: Task, future: Future[Any]) -> Any:
             ) from None
         raise Lost(f"Dask lost it ({error!r})") from None
     try:
-        return result_of(task, answered, f" (on Dask worker {address})")
+        return result_of(task, answered)
     except Lost:
         client.restart_workers([address], timeout=CONNECT_S, raise_for_error=False)
         raise

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 import traceback
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -28,6 +29,8 @@ _REMADE: dict[str, type[Exception]] = {
     kind.__name__: kind for kind in (WriteError, DataError, ConfigError, EstimationError, MeasurementError)
 }
 """Errors that are raised again in the main process: a second attempt would not avoid them."""
+
+_of_thread = threading.local()
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,15 +66,17 @@ def failure_of(call: Callable[[], object]) -> str:
     """Make a call, and return why it fails, by an error of ours or of the system; empty when it does not."""
     try:
         call()
-    except (SemMapError, FactorGraphError) as error:
-        return str(error) or "failed"
-    except OSError as error:
+    except (SemMapError, FactorGraphError, OSError) as error:
         return _told(error)
     return ""
 
 
-def _told(error: OSError) -> str:
-    return f"{error.filename or 'a file'}: {error.strerror or error}"
+def _told(error: SemMapError | FactorGraphError | OSError) -> str:
+    """The message of an error, and on which worker it is one: there a disk may be full, or a file missing."""
+    said = str(error) or "failed"
+    if isinstance(error, OSError):
+        said = f"{error.filename or 'a file'}: {error.strerror or error}"
+    return said + getattr(_of_thread, "place", "")
 
 
 class Executor(Protocol):
@@ -139,31 +144,32 @@ def call(function: str, arguments: str, allowed: str = ALLOWED) -> str:
     return json.dumps(called(*json.loads(arguments)))
 
 
-def answer(function: str, arguments: str, allowed: str = ALLOWED) -> str:
-    """As `call`, on behalf of another process: every outcome is an answer in JSON, for `result_of` there."""
+def answer(function: str, arguments: str, allowed: str = ALLOWED, place: str = "") -> str:
+    """As `call`, on behalf of another process: every outcome is an answer in JSON, for `result_of` there.
+
+    `place`, where it is called, ends the message of an error.
+    """
+    _of_thread.place = place
     try:
         return json.dumps({"result": call(function, arguments, allowed)})
     except MemoryError:
         return json.dumps({"lost": "it ran out of memory"})
     except (SemMapError, FactorGraphError) as error:
         kind = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _REMADE), "DataError")
-        return json.dumps({"error": kind, "message": str(error)})
+        return json.dumps({"error": kind, "message": _told(error)})
     except OSError as error:
         return json.dumps({"error": "DataError", "message": _told(error)})
     except Exception:  # noqa: BLE001 (a defect: it is raised where somebody sees it)
         return json.dumps({"defect": traceback.format_exc()})
 
 
-def result_of(task: Task, answered: str, where: str = "") -> Any:
-    """The result in an answer; raises what it reports, and Lost when a second attempt may succeed.
-
-    `where` ends the message of an error.
-    """
+def result_of(task: Task, answered: str) -> Any:
+    """The result in an answer; raises what it reports, and Lost when a second attempt may succeed."""
     found = json.loads(answered)
     if "lost" in found:
         raise Lost(found["lost"])
     if "error" in found:
-        raise _REMADE[found["error"]](found["message"] + where)
+        raise _REMADE[found["error"]](found["message"])
     if "defect" in found:
         raise RuntimeError(f"{task.name} failed in its process:\n{found['defect']}")
     return json.loads(found["result"])

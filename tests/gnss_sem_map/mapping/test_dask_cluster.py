@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -123,6 +124,10 @@ def test_errors_of_ours_name_the_dask_worker(scheduler: str, tmp_path: Path) -> 
         results([task("is_wrong", "os")], cluster)
     with pytest.raises(RuntimeError, match=r"(?s)Traceback.*KeyError: 'no such thing'"):
         results([task("is_wrong", "defect")], cluster)
+    for how, said in (("os", "/full/disk: "), ("write", "write: wrong; change it ")):
+        (reason,) = results([task("fails", how)], cluster).values()
+        assert re.match(rf"{said}.*\(on Dask worker tcp://\S+\)$", reason)
+        assert "worker" not in small_tasks.fails(how), "here there is none"
     with pytest.raises(ConfigError, match="may not be called"):
         results(products(1), Cluster(scheduler, tmp_path))
 

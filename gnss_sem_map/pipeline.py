@@ -139,9 +139,8 @@ def run(
     check_georeference(log, origin, settings.mapping.voxel_size_m)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
-    saved = (
-        work / SWEEPS if match is not None and settings.trajectory.lidar_odometry and not log.given else None
-    )
+    has_odometry = match is not None and log.given is None and settings.trajectory.lidar_odometry
+    saved = work / SWEEPS if has_odometry else None
     page, found, sharpness = _checked_and_located(
         log, segmenter, settings, stats, progress, force, match, registrar_of, saved, bound=correction is None
     )

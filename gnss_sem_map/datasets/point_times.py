@@ -19,7 +19,8 @@ SWEEPS_S = (0.01, 0.6)
 
 def are_returns(rows: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Which rows (n, 3 or more) are returns: where nothing came back drivers write zeros, or NaN, and any time."""
-    size = np.abs(rows[:, 0]) + np.abs(rows[:, 1]) + np.abs(rows[:, 2])
+    with np.errstate(over="ignore"):
+        size = np.abs(rows[:, 0]) + np.abs(rows[:, 1]) + np.abs(rows[:, 2])
     return np.asarray((size > 0) & (size < np.inf))
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.errors import DataError
+from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.structured import read_json
 from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet
@@ -29,7 +30,7 @@ def tile_of(name: str) -> Tile:
     match = NAME.fullmatch(name)
     if match is None:
         raise DataError(
-            f"{MAP_JSON}: found tile {name!r}, expected a name like 3_-4.parquet; make the map again"
+            f"{MAP_JSON}: found tile {brief(name)}, expected a name like 3_-4.parquet; make the map again"
         )
     return int(match[1]), int(match[2])
 
@@ -71,7 +72,7 @@ def read_description(path: Path) -> dict[str, Any]:
     about = read_json(path)
     if about.get("format") != FORMAT:
         raise DataError(
-            f"{shown(path)}: found format {about.get('format')!r}, expected {FORMAT}; make the map again"
+            f"{shown(path)}: found format {brief(about.get('format'))}, expected {FORMAT}; make the map again"
         )
     damaged = [name for name, is_right in (
         ("voxel_size_m", _is_size(about.get("voxel_size_m"))),
@@ -105,7 +106,8 @@ def read_frame(folder: Path) -> LocalFrame | None:
         )
     except (TypeError, ValueError, AttributeError) as error:
         raise DataError(
-            f"{shown(folder / 'map.json')}: found origin {origin}, expected lat_deg, lon_deg, alt_m ({error})"
+            f"{shown(folder / 'map.json')}: found origin {brief(origin)}, expected lat_deg, lon_deg, alt_m"
+            f" ({one_line(error)})"
         ) from None
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
@@ -167,8 +168,9 @@ class Taxonomy:
 def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> LabelSet:
     """Read a class set: the name of a shipped one, the user's YAML file, or what `about` gave. Raises ConfigError."""
     if isinstance(name_or_file, Mapping):
-        content = name_or_file
+        content, said = name_or_file, brief(name_or_file)
     else:
+        said = shown(name_or_file)
         content = _read(name_or_file, "class set", SHIPPED_CLASS_SETS)
     try:
         classes = content["classes"]
@@ -191,7 +193,7 @@ def open_label_set(name_or_file: str | Path | Mapping[str, Any] = "urban") -> La
         raise
     except _CONTENT_ERRORS as error:
         raise ConfigError(
-            f"class set {shown(name_or_file)}: {type(error).__name__} {str(error)[:200]};"
+            f"class set {said}: {type(error).__name__} {str(error)[:200]};"
             " expected name, classes (name, colour, semantic_kitti_id, asprs_code) and sources"
         ) from None
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from reprlib import repr as brief
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
@@ -150,7 +151,7 @@ def open_map(
     label_set = label_set or open_label_set(about.get("class_set", "urban"))
     if tuple(about["classes"]) != label_set.names:
         raise DataError(
-            f"{shown(folder)}: found classes {about['classes']}, expected {list(label_set.names)}"
+            f"{shown(folder)}: found classes {brief(about['classes'])}, expected {list(label_set.names)}"
         )
     files: dict[str, dict[str, Any]] = about["files"]
     missing = [name for name in files if not is_file(folder / name)]

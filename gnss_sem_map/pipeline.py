@@ -219,7 +219,9 @@ def _located(
         progress("trajectory", 1, 1)
     with stats.stage("sharpness"):
         trajectories = [found.trajectory, *([found.without_lidar] if found.without_lidar else [])]
-        figures = of_sample(SweepSample(log, folder=saved), trajectories, progress)
+        sample = SweepSample(log, folder=saved)
+        figures = of_sample(sample, trajectories, progress)
+        sample.sweeps.forget()  # 100 MB
     return replace(found, without_lidar=None), dict(zip(("map", "gnss and imu"), figures, strict=False))
 
 

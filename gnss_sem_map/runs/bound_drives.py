@@ -172,7 +172,7 @@ def _locate_one(source: Source, settings: Settings, frame: LocalFrame, work: Pat
     with run_folder.claimed_run(work / DRIVES / source.name) as claim:
         for name in (LOCATED, JOB):  # of the drive as it was
             (folder / name).unlink(missing_ok=True)
-        match = SavedMatches(source, claim.work, resume=True)
+        match = SavedMatches(source, claim.work, resume=True, mapped_next=False)
         found = pipeline.locate(log, settings, RunStats(), match=match, bound=False)
         if found.solution is None or found.solution.condensed is None or found.sweeps is None:
             return

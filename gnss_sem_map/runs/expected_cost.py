@@ -7,9 +7,9 @@ from dataclasses import dataclass
 CPU_MS_PER_SCAN = 101
 """Of a core, with labels from files, for the points of `POINTS_PER_SCAN`."""
 POINTS_PER_SCAN = 105_000
-PEAK_MB = 902
+PEAK_MB = 888
 """Of a process that maps."""
-TRAJECTORY_MB_PER_HOUR = 1610
+TRAJECTORY_MB_PER_HOUR = 1140
 """Of the process that smooths, beside that."""
 
 

@@ -54,6 +54,8 @@ class SavedMatches:
     work: Path
     executor: Executor | None = None
     resume: bool = False
+    mapped_next: bool = True
+    """What the drive's mapping needs of sweeps is saved: 110 MB, too much for thousands of drives that are located."""
 
     def __call__(
         self, log: SensorLog, trajectory: Trajectory, settings: Settings, progress: Progress
@@ -89,7 +91,8 @@ class SavedMatches:
         """Match sections, and yield the number of each when it is saved."""
         if self.executor is None or len(pending) < 2:
             for n in pending:
-                _save(_match(log, trajectory, settings, n, self.work, progress), folder, n, fingerprint)
+                listening = _listening(log, trajectory, settings, self.work, self.mapped_next)
+                _save(_match(listening, trajectory, settings, n, self.work, progress), folder, n, fingerprint)
                 yield n
             return
         write_job(folder, self.source, settings, trajectory, fingerprint)
@@ -116,8 +119,9 @@ def match_one(folder: str, fingerprint: str, number: int) -> None:
     """Match one section, and save it: a task. Raises DataError if the drive is another one here."""
     if _read(Path(folder), number, fingerprint) is None:
         log, trajectory, settings = _opened(folder, fingerprint)
-        found = _match(log, trajectory, settings, number, Path(folder).parent)
-        _save(found, Path(folder), number, fingerprint)
+        work = Path(folder).parent
+        listening = _listening(log, trajectory, settings, work)
+        _save(_match(listening, trajectory, settings, number, work), Path(folder), number, fingerprint)
 
 
 def _match(
@@ -128,13 +132,21 @@ def _match(
     work: Path,
     progress: Progress = silent,
 ) -> ScanMatches:
-    """Match a section; what later stages need of its sweeps is saved."""
-    matching, saved = settings.trajectory.scan_matching, work / SWEEPS
-    log = pipeline.saving_sweeps(log, saved)
+    matching = settings.trajectory.scan_matching
+    section = sections_of(len(log.scans), matching)[number]
+    return match_section(log, trajectory, matching, section, progress, work / SWEEPS)
+
+
+def _listening(
+    log: SensorLog, trajectory: Trajectory, settings: Settings, work: Path, mapped_next: bool = True
+) -> SensorLog:
+    """The log, of which what later stages need of its sweeps is saved when they are read."""
+    saved = work / SWEEPS
+    if mapped_next:
+        log = pipeline.saving_sweeps(log, saved)
     if settings.trajectory.revisits.enabled:
         log = sweeps_along(log, trajectory, saved).listening()
-    section = sections_of(len(log.scans), matching)[number]
-    return match_section(log, trajectory, matching, section, progress, saved)
+    return log
 
 
 @lru_cache(1)

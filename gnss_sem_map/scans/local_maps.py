@@ -45,7 +45,8 @@ class LocalMaps:
         """The local map of a place: points, each with its plane, m; empty where no sweep can be read."""
 
     def forget(self) -> None:
-        """Let go of the sweeps and maps that are kept."""
+        """Let go of the sweeps and maps that are kept, and of the sweeps on disk: 50 MB per km."""
+        self.sweeps.forget()
         self._sweep.cache_clear()
         self.at.cache_clear()
 

@@ -60,6 +60,11 @@ class ThinnedSweeps:
         self._save(number, thinned)
         return thinned
 
+    def forget(self) -> None:
+        """Remove what was saved for this use; a sweep that is needed again is read again."""
+        for number in self.numbers if self.folder is not None else ():
+            self._file(number).unlink(missing_ok=True)
+
     def _read(self, scan: Scan, number: int) -> Points:
         points = scan.read()
         if not self._file(number).exists():

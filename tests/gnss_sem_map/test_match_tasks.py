@@ -155,3 +155,14 @@ def test_a_worker_that_finds_another_drive_says_so(
     shorter = replace(small_log, scans=small_log.scans[:-1])
     with pytest.raises(DataError, match="a worker finds another drive"):
         SavedMatches(small_source, tmp_path, InProcess())(shorter, small_track, SETTINGS, silent)
+
+
+def test_of_a_drive_that_is_not_mapped_next_only_what_binds_it_is_saved(
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path, expected: ScanMatches
+) -> None:
+    match = SavedMatches(small_source, tmp_path, resume=True, mapped_next=False)
+    assert_same(match(small_log, small_track, SETTINGS, silent), expected)
+    uses = {path.name.split(".")[1] for path in (tmp_path / SWEEPS).glob("*.npz")}
+    assert uses == {"odometry", "surroundings"}
+    again = replace(match, mapped_next=True)
+    assert_same(again(small_log, small_track, SETTINGS, silent), expected)

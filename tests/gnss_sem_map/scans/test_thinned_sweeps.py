@@ -70,6 +70,17 @@ def test_what_one_stage_has_read_another_one_takes_bit_for_bit(files: Files, tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.some.npz", f"{IS_TIMED}.some.npz"]
 
 
+def test_what_is_forgotten_is_read_again(files: Files, tmp_path: Path) -> None:
+    sweeps, other = sweeps_of(files, tmp_path), sweeps_of(files, tmp_path, "other")
+    _ = sweeps[1], other[1]
+    sweeps.forget()
+    assert [path.name for path in tmp_path.iterdir()] == ["1.other.npz"]
+    files.reads.clear()
+    assert_same(sweeps[1], other[1])
+    assert files.reads == {1: 1}
+    sweeps_of(files, None).forget()
+
+
 def test_who_needs_a_sweep_first_reads_and_saves_it(files: Files, tmp_path: Path) -> None:
     for _ in range(3):
         assert_same(sweeps_of(files, tmp_path)[1], every_fifth(Files().read(1)))

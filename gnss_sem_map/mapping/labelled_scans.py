@@ -70,11 +70,11 @@ class Drive:
     @cached_property
     def by_lidar(self) -> tuple[Drive, ...]:
         """The drive once for each of its LiDARs, with its scans alone."""
-        logs = self.log.by_lidar
-        if len(logs) == 1:
+        first, *others = self.log.by_lidar
+        if not others:
             return (self,)
-        saved = self.saved, *(None for _ in logs[1:])  # of the first LiDAR, as all sweeps of the odometry
-        return tuple(replace(self, log=log, saved=one) for log, one in zip(logs, saved, strict=True))
+        # the sweeps that are saved are of the first one, as all of the odometry
+        return replace(self, log=first), *(replace(self, log=other, saved=None) for other in others)
 
     @property
     def image_rows(self) -> Rows:

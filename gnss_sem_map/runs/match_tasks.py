@@ -90,8 +90,8 @@ class SavedMatches:
     ) -> Iterator[int]:
         """Match sections, and yield the number of each when it is saved."""
         if self.executor is None or len(pending) < 2:
+            listening = _listening(log, trajectory, settings, self.work, self.mapped_next)
             for n in pending:
-                listening = _listening(log, trajectory, settings, self.work, self.mapped_next)
                 _save(_match(listening, trajectory, settings, n, self.work, progress), folder, n, fingerprint)
                 yield n
             return
@@ -119,9 +119,8 @@ def match_one(folder: str, fingerprint: str, number: int) -> None:
     """Match one section, and save it: a task. Raises DataError if the drive is another one here."""
     if _read(Path(folder), number, fingerprint) is None:
         log, trajectory, settings = _opened(folder, fingerprint)
-        work = Path(folder).parent
-        listening = _listening(log, trajectory, settings, work)
-        _save(_match(listening, trajectory, settings, number, work), Path(folder), number, fingerprint)
+        found = _match(log, trajectory, settings, number, Path(folder).parent)
+        _save(found, Path(folder), number, fingerprint)
 
 
 def _match(
@@ -151,11 +150,11 @@ def _listening(
 
 @lru_cache(1)
 def _opened(folder: str, fingerprint: str) -> tuple[SensorLog, Trajectory, Settings]:
-    """The drive of a job: opened once for all tasks of a worker."""
+    """The drive of a job, of which sweeps are saved: opened once for all tasks of a worker."""
     _, source, settings, log, trajectory = read_job(Path(folder))
     if fingerprints.of_matches(log, trajectory, settings) != fingerprint:
         raise other_drive(source)
-    return log, trajectory, settings
+    return _listening(log, trajectory, settings, Path(folder).parent), trajectory, settings
 
 
 def _are_sweeps_of(folder: Path, fingerprint: str) -> bool:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from counted_reads import counted
 
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.trajectory import Trajectory
@@ -25,7 +24,7 @@ from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.lidar_odometry import ScanMatches, match_scans, sections_of
 from gnss_sem_map.scans.local_maps import LocalMaps, sweeps_along
-from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.sensor_log import SensorLog
 
 SETTINGS = Settings.model_validate({"trajectory": {"scan_matching": {"section_scans": 3, "min_points": 20}}})
 MATCHING = SETTINGS.trajectory.scan_matching
@@ -113,13 +112,7 @@ def test_matches_of_another_first_trajectory_are_not_taken(
 def test_later_stages_take_what_was_saved_of_a_sweep(
     small_log: SensorLog, small_track: Trajectory, small_source: Source, tmp_path: Path, expected: ScanMatches
 ) -> None:
-    reads: Counter[int] = Counter()
-
-    def read(scan: Scan) -> Points:
-        reads[scan.number] += 1
-        return scan.read()
-
-    log = replace(small_log, scans=tuple(replace(scan, read=partial(read, scan)) for scan in small_log.scans))
+    log, reads = counted(small_log)
     assert_same(SavedMatches(small_source, tmp_path)(log, small_track, SETTINGS, silent), expected)
     assert reads == dict.fromkeys((scan.number for scan in log.scans), 1), "though its sections overlap"
     saved, places = tmp_path / SWEEPS, small_track.stamps[[2, 5, 9]]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
+from counted_reads import counted
 from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
@@ -18,7 +18,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.evaluation import map_sharpness
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, SweepSample
 from gnss_sem_map.scans.lidar_odometry import match_scans
-from gnss_sem_map.sensor_log import Points, Scan, SensorLog
+from gnss_sem_map.sensor_log import Points, SensorLog
 
 Array = NDArray[np.float64]
 FEW = SharpnessSettings(min_scans=3, every_nth_point=1)
@@ -128,16 +128,10 @@ def test_unreadable_sweeps_are_left_out() -> None:
 
 def test_sweeps_that_were_read_for_odometry_are_not_read_again(tmp_path: Path) -> None:
     log, truth = street()
-    reads: Counter[int] = Counter()
-
-    def read(scan: Scan) -> Points:
-        reads[scan.number] += 1
-        return scan.read()
-
-    counted = replace(log, scans=tuple(replace(scan, read=partial(read, scan)) for scan in log.scans))
+    listened, reads = counted(log)
     some = SharpnessSettings(max_scans=8, stretch_scans=4, min_scans=2)
     (expected,) = map_sharpness.of_drive(log, [truth], some)
-    sample = SweepSample(counted, some, tmp_path)
+    sample = SweepSample(listened, some, tmp_path)
     match_scans(sample.sweeps.listening(), truth)
     (found,) = map_sharpness.of_sample(sample, [truth])
     assert set(reads.values()) == {1}

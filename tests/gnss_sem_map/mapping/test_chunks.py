@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from chunks import assert_same, build_maps, by_chunks
+from counted_reads import counted
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
@@ -31,7 +32,6 @@ CARS = [  # one ahead, one that comes towards us, and one that overtakes
     ((45.0, 1.6, 0.0), (49.0, 3.4, 1.5), (-9.0, 0.0, 0.0)),
     ((-8.0, -4.0, 0.0), (-4.0, -2.4, 1.5), (12.0, 0.0, 0.0)),
 ]
-Read = Callable[[], Points]
 
 
 @pytest.fixture(scope="module")
@@ -122,24 +122,16 @@ def test_a_window_that_another_process_has_looked_at_is_not_read_again_unless_it
     assert [path.name for path in (tmp_path / "edges").iterdir()] == ["1.npz"]
     if damage is not None:
         (tmp_path / "edges/1.npz").write_bytes(damage)
-    reads: Counter[int] = Counter()
-    first = list(map_chunks(counting(moving, reads), range(1), waiting, tmp_path))
+    drive, reads = counting(moving)
+    first = list(map_chunks(drive, range(1), waiting, tmp_path))
     assert_same_chunks(first, together[:1])
     assert (7 in reads) == (damage is not None), "an odd one, which does not tell the rows"
 
 
-def counting(drive: Drive, reads: Counter[int]) -> Drive:
-    """The drive, whose scans count how often they are read."""
-
-    def counted(number: int, read: Read) -> Read:
-        def look() -> Points:
-            reads[number] += 1
-            return read()
-
-        return look
-
-    scans = tuple(replace(scan, read=counted(scan.number, scan.read)) for scan in drive.log.scans)
-    return replace(drive, log=replace(drive.log, scans=scans))
+def counting(drive: Drive) -> tuple[Drive, Counter[int]]:
+    """The drive, and how often each of its scans is read."""
+    log, reads = counted(drive.log)
+    return replace(drive, log=log), reads
 
 
 @pytest.mark.parametrize(
@@ -149,9 +141,8 @@ def counting(drive: Drive, reads: Counter[int]) -> Drive:
 def test_a_range_of_chunks_reads_its_scans_and_a_window_on_either_side_once(
     moving: Drive, numbers: range, first: int, last: int, tmp_path: Path
 ) -> None:
-    reads: Counter[int] = Counter()
     (waiting := tmp_path / "waiting").mkdir()
-    drive = replace(counting(moving, reads), saved=tmp_path)
+    drive, reads = counting(replace(moving, saved=tmp_path))
     _ = drive.image_rows  # their scans are saved, as when odometry has read them
     reads.clear()
     for _ in map_chunks(drive, numbers, waiting, tmp_path):

@@ -60,18 +60,21 @@ class PointSets:
 
         A point stands for half of the gap (n,) m between the rings above and below it.
         """
-        ones, named = np.ones(len(p_map), np.int32), is_object.astype(np.int32)
-        if not gaps_m.any():
-            return cls(ones, named, p_map, p_map, p_map).merged(part, count)
-        half = np.outer(gaps_m, (0.0, 0.0, 0.5))
-        return cls(ones, named, p_map, p_map - half, p_map + half).merged(part, count)
+        sets = cls._empty(count)
+        _collect(
+            p_map, is_object, gaps_m, part, sets.points, sets.labelled, sets.sums, sets.lowest, sets.highest
+        )
+        return sets
+
+    @classmethod
+    def _empty(cls, count: int, axes: int = 3) -> PointSets:
+        """So many sets without points, whose boxes have so many axes."""
+        low = np.full((count, axes), np.inf)
+        return cls(np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros((count, 3)), low, -low)
 
     def merged(self, whole: NDArray[np.integer], count: int) -> PointSets:
         """Unions of these sets: `whole` (p,) is the union of each set, 0 to `count` - 1, or -1 for none."""
-        low = np.full((count, self.lowest.shape[1]), np.inf)
-        merged = PointSets(
-            np.zeros(count, np.int32), np.zeros(count, np.int32), np.zeros((count, 3)), low, -low
-        )
+        merged = self._empty(count, self.lowest.shape[1])
         _merge(
             self.points, self.labelled, self.sums, self.lowest, self.highest, whole,
             merged.points, merged.labelled, merged.sums, merged.lowest, merged.highest,
@@ -82,6 +85,21 @@ class PointSets:
         """The same without boxes, which take half the memory of 450 scans."""
         none = np.empty((len(self.points), 0))
         return replace(self, lowest=none, highest=none)
+
+
+@njit(cache=True, nogil=True)
+def _collect(p_map, is_object, gaps_m, part, points, labelled, sums, lowest, highest):
+    for i in range(len(part)):
+        p = part[i]
+        if p < 0:
+            continue
+        points[p] += 1
+        labelled[p] += is_object[i]
+        for axis in range(3):
+            half = 0.5 * gaps_m[i] if axis == 2 else 0.0
+            sums[p, axis] += p_map[i, axis]
+            lowest[p, axis] = min(lowest[p, axis], p_map[i, axis] - half)
+            highest[p, axis] = max(highest[p, axis], p_map[i, axis] + half)
 
 
 @njit(cache=True, nogil=True)
@@ -146,8 +164,11 @@ class Segments:
 
     def outline(self, number: int) -> NDArray[np.float32]:
         """The voxels of a segment by the means of their points (v, 2) m."""
-        mine = np.flatnonzero(self.number == number)
-        return (self.parts.sums[mine, :2] / self.parts.points[mine, None]).astype(np.float32)
+        return self.means(number)[:, :2].astype(np.float32)
+
+    def means(self, number: int) -> NDArray[np.float64]:
+        """The voxels of a segment by the means of their points (v, 3) m."""
+        return np.asarray(_means(self.number, number, self.parts.points, self.parts.sums))
 
     def levels(self) -> list[tuple[float, float]]:
         """For every segment the lowest and the highest of its voxels, by the means of their points, m."""
@@ -162,6 +183,19 @@ class Segments:
     def sums(self, values: NDArray[np.generic]) -> NDArray[np.float64]:
         """Sums over the voxels of every segment (s,) of values of all voxels (v,)."""
         return np.asarray(np.bincount(self.number + 1, values, len(self.truncated) + 1)[1:], np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _means(number, wanted, points, sums):
+    mine, count = np.empty(len(number), np.int32), 0
+    for v in range(len(number)):
+        mine[count] = v  # kept only if it counts: no branch
+        count += number[v] == wanted
+    means = np.empty((count, 3))
+    for i in range(count):
+        for axis in range(3):
+            means[i, axis] = sums[mine[i], axis] / points[mine[i]]
+    return means
 
 
 @njit(cache=True, nogil=True)
@@ -206,7 +240,8 @@ def find_segments(
     voxels = PointSets.of(p_map, is_object, gaps_m, voxel, len(keys))
     clusters, count = _object_clusters(keys, voxels, eps_m)
     whole = voxels.merged(clusters, count)
-    fits = _is_vehicle_sized(whole, np.asarray(np.bincount(clusters[voxel], beams, count), np.float64))
+    of_voxels = np.bincount(voxel, beams, len(keys))
+    fits = _is_vehicle_sized(whole, np.asarray(np.bincount(clusters, of_voxels, count), np.float64))
     number = np.where(fits, np.cumsum(fits) - 1, -1).astype(np.int32)[clusters]
     # of clusters that are too large or too small, the labelled part
     shown = ~fits[clusters] & (voxels.labelled > 0)

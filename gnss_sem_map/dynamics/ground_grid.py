@@ -65,7 +65,7 @@ def _cells(p_map, size_m):
     west = south = FARTHEST_CELL
     east = north = -FARTHEST_CELL
     for i in range(n):
-        x[i], y[i] = int32(np.floor(p_map[i, 0] / size_m)), int32(np.floor(p_map[i, 1] / size_m))
+        x[i], y[i] = _cell_of(p_map, i, size_m)
         west, south = min(west, x[i]), min(south, y[i])
         east, north = max(east, x[i]), max(north, y[i])
     length, width = east - west + 3, north - south + 3
@@ -106,18 +106,29 @@ def _in_cells_near(p_map, marked, size_m, found):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _closer_than(points, marked, asked, reach_m, found):
-    cells, length, width = _cells(points, reach_m)
-    latest, before = np.full(length * width, -1, np.int32), np.empty(len(cells), np.int32)
-    for i in np.flatnonzero(marked):  # a linked list of the marked points of each cell
-        before[i] = latest[cells[i]]
-        latest[cells[i]] = i
+    """Mark in `found` the asked points; the grid reaches no farther than the marked ones, which may be few."""
+    ones = np.flatnonzero(marked)
+    x, y = np.empty(len(ones), np.int32), np.empty(len(ones), np.int32)
+    for k in range(len(ones)):
+        x[k], y[k] = _cell_of(points, ones[k], reach_m)
+    west, east, south, north = x.min(), x.max() + 1, y.min(), y.max() + 1
+    latest, before = np.full((east - west, north - south), -1, np.int32), np.empty(len(ones), np.int32)
+    for k in range(len(ones)):  # a linked list of the marked points of each cell
+        before[k] = latest[x[k] - west, y[k] - south]
+        latest[x[k] - west, y[k] - south] = k
     for i in np.flatnonzero(asked):
-        for row in range(cells[i] - width, cells[i] + width + 1, width):
-            for cell in range(row - 1, row + 2):
-                j = latest[cell]
-                while j >= 0 and not found[i]:
-                    found[i] = _square(points, i, j) < reach_m * reach_m
-                    j = before[j]
+        column, row = _cell_of(points, i, reach_m)
+        for c in range(max(column - 1, west), min(column + 2, east)):
+            for r in range(max(row - 1, south), min(row + 2, north)):
+                k = latest[c - west, r - south]
+                while k >= 0 and not found[i]:
+                    found[i] = _square(points, i, ones[k]) < reach_m * reach_m
+                    k = before[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _cell_of(points, i, size_m):
+    return int32(np.floor(points[i, 0] / size_m)), int32(np.floor(points[i, 1] / size_m))
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -86,7 +86,7 @@ class Rows:
                 gaps[first:end] = np.maximum(gaps[first:end], np.radians((high - low + 1) * CELL_DEG))
         return gaps
 
-    @property
+    @cached_property
     def gap_on_ground_deg(self) -> float:
         """The usual gap between rings that meet the ground around the vehicle."""
         ground = slice(FINE[0], HORIZON)

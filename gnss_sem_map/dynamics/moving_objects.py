@@ -80,7 +80,7 @@ def decide(
     def counts() -> Iterator[NDArray[np.int32]]:  # those of all scans side by side take 50 MB
         for place in places:
             release_memory()  # what one scan after another has used lies among what lasts: 90 MB
-            yield of_places[:, place]
+            yield of_places.take(place, axis=1)
 
     parted = (
         _parted(seen.segments, counted[0], counted[1], settings, is_sharp)

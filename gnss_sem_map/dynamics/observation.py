@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics import range_images
@@ -86,11 +87,26 @@ def observe(
     voxel = np.full(len(above), -1, np.int32)
     voxel[candidates] = voxel_of_candidates
     keep = np.flatnonzero(in_cells_near(p_above, voxel >= 0, settings.grow_m))
+    indices, p_near = above.take(keep).astype(np.int32), np.empty((len(keep), 3), np.float32)
+    _relative(p_map, indices, T_map_lidar[:3, 3], p_near)
     near = NearPoints(
-        indices=above.take(keep).astype(np.int32),
-        p_near=(p_above.take(keep, axis=0) - T_map_lidar[:3, 3]).astype(np.float32),
+        indices=indices,
+        p_near=p_near,
         is_body=is_body.take(keep),
         voxel=voxel.take(keep),
     )
     segments = replace(segments, truncated=segments.truncated | hidden)
     return Observation(number, stamp, seen, segments, delays or SweepDelays.none()), near
+
+
+@njit(cache=True, nogil=True)
+def _relative(
+    p_map: NDArray[np.float64],
+    chosen: NDArray[np.int32],
+    origin: NDArray[np.float64],
+    p_near: NDArray[np.float32],
+) -> None:
+    """Some points (n, 3) m, chosen by their indices, relative to an origin (3,) m; in numpy this takes 0.7 ms more."""
+    for i in range(len(chosen)):
+        for axis in range(3):
+            p_near[i, axis] = p_map[chosen[i], axis] - origin[axis]

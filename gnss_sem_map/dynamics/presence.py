@@ -101,7 +101,9 @@ def near_movers(
             for scan, k, way in _course(stamps, scans, one.path, seconds):
                 predicted[scan].append((scans[k], numbers[k], way))
         for is_near, of_scan, there in zip(near, segments, predicted, strict=True):
-            is_near |= _closer(of_scan, [_points(segments, *one) for one in there], reach)
+            is_near |= _closer(
+                of_scan, [segments[scan].means(number) + way for scan, number, way in there], reach
+            )
     return near
 
 
@@ -127,13 +129,6 @@ def _course(
     for scan in np.flatnonzero(abs(late) <= seconds).tolist():
         k = int(nearest[scan])
         yield start + scan, k, late[scan] * np.append(speed[k], 0.0)
-
-
-def _points(segments: Sequence[Segments], scan: int, number: int, way: Array) -> Array:
-    """The voxels of a segment (p, 3) m, by the means of their points, moved on."""
-    mine = np.flatnonzero(segments[scan].number == number)
-    parts = segments[scan].parts
-    return np.asarray(parts.sums[mine] / parts.points[mine, None] + way)
 
 
 def _closer(of_scan: Segments, predicted: Sequence[Array], reach_m: float) -> NDArray[np.bool_]:

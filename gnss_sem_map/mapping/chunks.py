@@ -232,8 +232,8 @@ class _Chunk:
 
         removed, moving = new_table(settings), {}
         for place, (points, moved) in prefetch(taken, range(len(numbers)), THREADS):
-            stays = ~moved
-            self._all.see(points.keys[stays], (points.levels[stays], points.moments_us[stays]))
+            stays = np.flatnonzero(~moved)
+            self._all.see(points.keys.take(stays), (points.levels.take(stays), points.moments_us.take(stays)))
             removed.add(
                 points.keys[moved], points.pixels[moved], points.classes, points.heights[moved],
                 (points.levels[moved], points.moments_us[moved]),

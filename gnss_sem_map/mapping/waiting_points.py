@@ -39,12 +39,12 @@ class WaitingPoints:
     @classmethod
     def of(cls, seen: LabelledScan, near: NearPoints) -> WaitingPoints:
         """What a scan with labels says of its points in or near a segment."""
-        here = near.indices
-        pixels = seen.pixels[here]
+        here = near.indices.astype(np.intp)
+        pixels = seen.pixels.take(here)
         is_shown = pixels >= 0
         return cls(
-            near, seen.keys[here], seen.heights[here], seen.levels[here], seen.moments_us[here],
-            is_shown, seen.classes[pixels[is_shown]],
+            near, seen.keys.take(here), seen.heights.take(here), seen.levels.take(here), seen.moments_us.take(here),
+            is_shown, seen.classes.take(pixels[is_shown], axis=0),
         )  # fmt: skip
 
     @property
@@ -62,10 +62,10 @@ class WaitingPoints:
         columns = {name: getattr(self, name) for name in AS_THEY_ARE} | vars(near)
         columns |= {"sizes": sizes, "first_us": first_us, "after_us": self.moments_us - first_us}
         columns["indices"] = np.packbits(is_near)
-        record = np.empty(1, _record_of(*sizes))
-        for name in record.dtype.names or ():
-            record[name] = columns[name]
-        path.write_bytes(record.view(np.uint8).data)
+        record = _record_of(*sizes)
+        with path.open("wb") as file:
+            for name in record.names or ():
+                file.write(np.ascontiguousarray(columns[name], record[name].base).data)
 
     @classmethod
     def take(cls, path: Path) -> WaitingPoints:

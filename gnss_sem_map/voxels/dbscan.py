@@ -24,6 +24,7 @@ LARGEST_EPS_VOXELS = 16
 TIE = 1e-9
 """Voxels at exactly eps are neighbours even where eps is a rounded quotient: 0.6 / 0.2 is below 3."""
 _BLOCK_BITS, _Y_BITS, _MARGIN = 17, 22, 1 << 5
+_BLOCK_MASK = (1 << _BLOCK_BITS) - 1
 """A word's key is x, y and z / 32 in one integer, with room on all sides for the stencil."""
 
 
@@ -51,32 +52,33 @@ def dbscan(indices: NDArray[np.integer], eps_voxels: float, min_samples: int) ->
         return _dbscan_by_distance(voxels, eps_voxels, min_samples)
     keys, positions = pack(voxels), np.arange(len(voxels))
     if (np.diff(keys) > 0).all():
-        return _dbscan_sorted(voxels, positions, _stencil(eps_voxels), min_samples)
+        return _dbscan_sorted(voxels, positions, eps_voxels, min_samples)
     order = np.argsort(keys, kind="stable")
     if (np.diff(keys[order]) == 0).any():
         raise DataError("dbscan: found a voxel twice, expected each once; pass unique indices")
     clusters = np.empty(len(voxels), np.int32)
     positions[order] = positions.copy()
-    clusters[order] = _dbscan_sorted(voxels[order], positions, _stencil(eps_voxels), min_samples)
+    clusters[order] = _dbscan_sorted(voxels[order], positions, eps_voxels, min_samples)
     return clusters
 
 
 def _dbscan_sorted(
-    voxels: NDArray[np.int64], positions: NDArray[np.int64], stencil: NDArray[np.int64], min_samples: int
+    voxels: NDArray[np.int64], positions: NDArray[np.int64], eps_voxels: float, min_samples: int
 ) -> NDArray[np.int32]:
     """Clusters of sorted voxels, numbered in the order of `positions`: where the input's voxels now are."""
     x, y, z = np.ascontiguousarray((voxels + AXIS_OFFSET).T)
     columns = ((x + _MARGIN) << _Y_BITS | (y + _MARGIN)) << _BLOCK_BITS
     keys, masks, first, own, bits = _words(columns, z)
-    parents = np.arange(len(voxels))
+    parents, half_heights = np.arange(len(voxels)), _half_heights(eps_voxels)
     if min_samples == 1:  # every voxel is its own sample
-        _join_cores(keys, masks, first, own, bits, stencil, parents)
+        _join_cores(keys, masks, first, own, bits, half_heights, parents)
         return np.asarray(_number(parents, positions))
+    stencil = _stencil(eps_voxels)
     core = _count_neighbours(keys, masks, own, bits, stencil) >= min_samples
     around = keys[own]
     keys, masks, first, own, core_bits = _words(columns[core], z[core])
     parents = parents[: core.sum()]
-    _join_cores(keys, masks, first, own, core_bits, stencil, parents)
+    _join_cores(keys, masks, first, own, core_bits, half_heights, parents)
     rank = np.cumsum(core) - 1
     clusters = np.full(len(voxels), NOISE, np.int32)
     clusters[core] = _number(parents, rank[positions[core[positions]]])
@@ -93,14 +95,27 @@ def _dbscan_by_distance(voxels: NDArray[np.int64], eps_voxels: float, min_sample
 
 
 @cache
+def _half_heights(eps_voxels: float) -> NDArray[np.int64]:
+    """Half height in voxels (r + 1, 2 r + 1) of the ball, r its radius, in each column from x = 0 and y = -r on.
+
+    -1 for a column outside of it.
+    """
+    reach, limit = int(eps_voxels + TIE), (eps_voxels + TIE) ** 2
+    x, y = np.arange(reach + 1)[:, None], np.arange(-reach, reach + 1)
+    rest = limit - x * x - y * y
+    return np.where(rest >= 0, np.sqrt(np.maximum(rest, 0.0)).astype(np.int64), -1)
+
+
+@cache
 def _stencil(eps_voxels: float) -> NDArray[np.int64]:
     """Columns within the radius: (k, 2) packed offset, ascending, and half height in voxels."""
-    reach, limit = int(eps_voxels + TIE), (eps_voxels + TIE) ** 2
+    upper = _half_heights(eps_voxels)
+    reach = len(upper) - 1
     rows = [
-        ((dx << _Y_BITS) + dy << _BLOCK_BITS, int(np.sqrt(limit - dx * dx - dy * dy)))
+        ((dx << _Y_BITS) + dy << _BLOCK_BITS, int(upper[abs(dx), dy + reach]))
         for dx in range(-reach, reach + 1)
         for dy in range(-reach, reach + 1)
-        if dx * dx + dy * dy <= limit
+        if upper[abs(dx), dy + reach] >= 0
     ]
     return np.array(rows, np.int64)
 
@@ -211,35 +226,45 @@ def _runs(own, bits, column_reach, parents):
 
 
 @njit(cache=True, nogil=True)
-def _join_cores(keys, masks, first, own, bits, stencil, parents):
-    """Union of all core voxels within the radius of each other; half of the stencil sees every pair once.
+def _join_cores(keys, masks, first, own, bits, half_heights, parents):
+    """Union of all core voxels within the radius of each other; half of the ball around a voxel sees every pair once.
 
-    A run is joined to whatever is near it in a column. Bits that lie within the radius of the bit below are skipped:
-    they are joined to that one within their own column.
+    A run is joined to whatever is near it in a column. Of the columns at one x, those within the radius follow each
+    other. Bits that lie within the radius of the bit below are skipped: they are joined to that one within their own
+    column.
     """
-    column_reach = stencil[len(stencil) // 2, 1]
+    reach = len(half_heights) - 1
+    column_reach = half_heights[0, reach]
     words, runs = _runs(own, bits, column_reach, parents)
-    for s in range(len(stencil) // 2 + 1):
-        offset, half = stencil[s]
-        j = 0
+    for dx in range(reach + 1):
+        start, lowest = 0, ((dx << _Y_BITS) - reach) << _BLOCK_BITS
+        width = (reach if dx == 0 else 2 * reach) << _BLOCK_BITS
         for r in range(len(words)):
             w = words[r]
-            wanted = keys[w] + offset
-            while j < len(keys) and keys[j] < wanted:
+            while start < len(keys) and keys[start] < keys[w] + lowest:
+                start += 1
+            j = start
+            while j < len(keys) and keys[j] <= keys[w] + lowest + width:
+                offset = keys[j] - keys[w] - lowest
+                half = half_heights[dx, offset >> _BLOCK_BITS]
+                if offset & _BLOCK_MASK == 0 and half >= 0:  # the same part of its column
+                    _join_run(runs[r], w, j, half, column_reach, masks, first, parents)
                 j += 1
-            if j == len(keys) or keys[j] != wanted:
-                continue
-            found = masks[j] & _widened(runs[r], half)
-            if found == 0:
-                continue
-            voxel = _voxel_of(_lowest_bit(runs[r]), masks[w], first[w])
-            last = -LARGEST_EPS_VOXELS - 1
-            while found != 0:
-                bit = _lowest_bit(found)
-                found &= found - uint64(1)
-                if bit - last > column_reach:
-                    _join(parents, voxel, _voxel_of(bit, masks[j], first[j]))
-                last = bit
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _join_run(run, w, j, half, column_reach, masks, first, parents):
+    """Join a run of word `w` to what lies within `half` of it in word `j`."""
+    found = masks[j] & _widened(run, half)
+    if found == 0:
+        return
+    voxel, last = _voxel_of(_lowest_bit(run), masks[w], first[w]), -LARGEST_EPS_VOXELS - 1
+    while found != 0:
+        bit = _lowest_bit(found)
+        found &= found - uint64(1)
+        if bit - last > column_reach:
+            _join(parents, voxel, _voxel_of(bit, masks[j], first[j]))
+        last = bit
 
 
 @njit(cache=True, nogil=True, inline="always")

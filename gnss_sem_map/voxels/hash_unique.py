@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.voxels.hash_table import slot_of, slots_of
 
-FEWEST_SLOTS = 1 << 10
+FEWEST_SLOTS = 1 << 14
 
 
 def distinct(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

@@ -88,7 +88,7 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
 def _overviews(folder: Path) -> dict[str, Overview]:
     """Of the maps before and after refinement, as far as the folder has them."""
     found = {
-        name: overview_of(tiles.open_map(folder / name))
+        name: overview_of(tiles.open_map(folder / name, with_sums=False))
         for name in MAPS
         if is_file(folder / name / "map.json")
     }

@@ -77,7 +77,8 @@ def seconds_of(stats: RunStats) -> dict[str, float]:
 
 def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
     """What is in the maps of a run folder, for run.json."""
-    maps = {name: tiles.open_map(folder / place) for name, place in (("raw", MAP), ("refined", REFINED))}
+    places = {"raw": MAP, "refined": REFINED}
+    maps = {name: tiles.open_map(folder / place, with_sums=False) for name, place in places.items()}
     names = maps["raw"].label_set.names
     labelled = {name: np.zeros(len(names), np.int64) for name in maps}
     voxels = points = removed = 0

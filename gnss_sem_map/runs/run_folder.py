@@ -199,7 +199,7 @@ def exported_of(
     label_set: LabelSet | None = None,
 ) -> Exported:
     """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
-    refined = tiles.open_map(folder / REFINED, label_set)
+    refined = tiles.open_map(folder / REFINED, label_set, with_sums=False)
     return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder))
 
 

@@ -59,7 +59,7 @@ class VoxelMap:
     keys: NDArray[np.int64]
     """(v,) packed indices, sorted, unique."""
     evidence: NDArray[np.int32]
-    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no image shows the voxel."""
+    """(v, c) sums of log-likelihoods in 2^-10 nat; all zero where no image shows the voxel. (v, 0): not read."""
     hits: NDArray[np.uint32]
     """(v,) LiDAR points in the voxel."""
     heights: NDArray[np.int64] | None = None
@@ -69,7 +69,7 @@ class VoxelMap:
         v, c = len(self.keys), len(self.label_set.names)
         if self.heights is not None and self.heights.shape != (v,):
             raise DataError(f"voxel map: found {v} keys and heights {self.heights.shape}; expected ({v},)")
-        if self.evidence.shape != (v, c) or self.hits.shape != (v,):
+        if self.evidence.shape not in ((v, c), (v, 0)) or self.hits.shape != (v,):
             raise DataError(
                 f"voxel map: found {v} keys, evidence {self.evidence.shape}, hits {self.hits.shape};"
                 f" expected ({v}, {c}) and ({v},)"

@@ -175,6 +175,19 @@ def test_a_small_map_is_read_once_however_many_tiles_ask_for_their_surroundings(
     assert max(names.values()) == reads
 
 
+def test_a_map_read_without_sums_is_decided_as_with_them_and_cannot_be_written(tmp_path: Path) -> None:
+    tiles.write(random_map(count=20_000), tmp_path / "map", FRAME)
+    opened = tiles.open_map(tmp_path / "map", with_sums=False)
+    for decided, piece in zip(opened, tiles.open_map(tmp_path / "map"), strict=True):
+        assert decided.voxels.evidence.shape == (len(piece), 0)
+        for name in ("labels", "confidence", "states", "removed_hits", "told_reasons"):
+            np.testing.assert_array_equal(getattr(decided, name), getattr(piece, name))
+        for name in ("keys", "hits"):
+            np.testing.assert_array_equal(getattr(decided.voxels, name), getattr(piece.voxels, name))
+        with pytest.raises(ValueError, match="zip"):
+            tile_files.encode(decided)
+
+
 def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:
     tiles.write(random_map(), tmp_path / "map", FRAME)
     path = sorted((tmp_path / "map").glob("*.parquet"))[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -32,7 +33,7 @@ class Camera:
         """Distance from the eye to the image plane, in pixels."""
         return 0.5 * self.width_px / float(np.tan(np.radians(self.field_of_view_deg) / 2))
 
-    @property
+    @cached_property
     def axes(self) -> NDArray[np.float64]:
         """Rows: right, down, forward; unit vectors in the map frame. Looking straight up or down has no right."""
         forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
@@ -179,38 +180,45 @@ def lit(
 
 @njit(cache=True, nogil=True)
 def _hollows(depth, reach, most, found):
+    found[:] = 0
     for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            found[row, column] = _hollow(depth, row, column, reach, most)
+        _add_hollows(depth, row, reach, np.float32(1), most, found[row])
 
 
 @njit(cache=True, nogil=True)
-def _hollow(depth, row, column, reach, most):
-    """What `hollows` says of one pixel; beyond the edges the outermost pixels repeat."""
-    here, total = depth[row, column], np.float32(0)
-    total += min(max(here - depth[max(row - reach, 0), column], np.float32(0)), most)
-    total += min(max(here - depth[min(row + reach, depth.shape[0] - 1), column], np.float32(0)), most)
-    total += min(max(here - depth[row, max(column - reach, 0)], np.float32(0)), most)
-    total += min(max(here - depth[row, min(column + reach, depth.shape[1] - 1)], np.float32(0)), most)
-    return total / np.float32(4)
+def _add_hollows(depth, row, reach, strength, most, found):
+    """Add to `found` (w,) what `hollows` says of a row, so many times; beyond the edges the outermost pixels repeat.
+
+    The row is copied between what repeats: without a test for edges the compiler can use SIMD instructions.
+    """
+    height, width = depth.shape
+    here, upper, lower = depth[row], depth[max(row - reach, 0)], depth[min(row + reach, height - 1)]
+    beside = np.empty(width + 2 * reach, np.float32)
+    beside[:reach], beside[reach : reach + width], beside[reach + width :] = here[0], here, here[-1]
+    for column in range(width):
+        total = min(max(here[column] - upper[column], np.float32(0)), most)
+        total += min(max(here[column] - lower[column], np.float32(0)), most)
+        total += min(max(here[column] - beside[column], np.float32(0)), most)
+        total += min(max(here[column] - beside[column + 2 * reach], np.float32(0)), most)
+        found[column] += strength * (total / np.float32(4))
 
 
 @njit(cache=True, nogil=True)
 def _light(depth, log_depth, cube, face, rgb, sky, distance, hollow, image):
-    """Compiled, and all of a pixel at once: whole arrays of each step would take eight times as long."""
-    supersampling = depth.shape[0] // image.shape[0]
+    """Compiled, and all of a row at once: whole arrays of each step would take eight times as long."""
+    supersampling, width = depth.shape[0] // image.shape[0], depth.shape[1]
+    shadow = np.empty(width, np.float32)
     for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            pixel = image[row // supersampling, column // supersampling]
-            if cube[row, column] < 0:
-                pixel += sky[row]
-                continue
-            shadow = np.float32(0)
-            for k in range(len(hollow)):
-                reach, strength, most = hollow[k]
-                shadow += strength * _hollow(log_depth, row, column, int(reach), most)
-            light = FACE_LIGHT[face[row, column]] * np.exp(-shadow)
-            clear = np.exp(min(distance - depth[row, column], np.float32(0)) / (4 * distance))
+        shadow[:] = 0
+        for k in range(len(hollow)):
+            reach, strength, most = hollow[k]
+            _add_hollows(log_depth, row, int(reach), strength, most, shadow)
+        for column in range(width):
+            pixel, number = image[row // supersampling, column // supersampling], cube[row, column]
+            light = FACE_LIGHT[face[row, column]] * np.exp(-shadow[column])
+            beyond = depth[row, column] - distance
+            clear = np.exp(-beyond / (4 * distance)) if beyond > 0 else 1.0
             for channel in range(3):
-                colour = light * rgb[cube[row, column], channel]
-                pixel[channel] += sky[row, channel] + clear * (colour - sky[row, channel])
+                behind = sky[row, channel]
+                colour = behind if number < 0 else light * rgb[number, channel]
+                pixel[channel] += behind + clear * (colour - behind)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
@@ -92,18 +93,24 @@ def _seen_in_rows(
     for tile in exported.map.tiles:
         if tile[1] << TILE_BITS >= high_y or (tile[1] + 1) << TILE_BITS <= low_y:
             continue
-        piece = exported.map.read_tile(tile)
-        x, y, z = piece.voxels.indices.T
-        rows, columns = cells.north - 1 - first - y // cells.per_cell, x // cells.per_cell - cells.west
-        chosen = exported.extent.drawable(piece)
-        chosen &= (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
-        here = (z + 1 + ABOVE_ALL * exported.extent.visible(piece))[chosen]
-        order = np.argsort(here, kind="stable")
-        here, cell = here[order], (rows[chosen] * shape[1] + columns[chosen])[order]
-        higher = here >= rank.ravel()[cell]
-        rank.ravel()[cell[higher]] = here[higher]  # of repeated cells the last one stays
-        labels.ravel()[cell[higher]] = piece.labels[chosen][order][higher]
+        piece, extent = exported.map.read_tile(tile), exported.extent
+        _look(
+            piece.voxels.indices, piece.labels, extent.drawable(piece), extent.visible(piece),
+            cells.per_cell, cells.west, cells.north - 1 - first, labels, rank,
+        )  # fmt: skip
     return labels, rank
+
+
+@njit(cache=True, nogil=True)
+def _look(indices, labels, drawable, visible, per_cell, west, north, seen, rank):
+    """Look at voxels from above: of equal ranks in a cell the last is seen."""
+    for i in range(len(indices)):
+        row, column = north - indices[i, 1] // per_cell, indices[i, 0] // per_cell - west
+        if not drawable[i] or not (0 <= row < rank.shape[0] and 0 <= column < rank.shape[1]):
+            continue
+        here = indices[i, 2] + 1 + ABOVE_ALL * visible[i]
+        if here >= rank[row, column]:
+            rank[row, column], seen[row, column] = here, labels[i]
 
 
 def write_topview_geotiff(exported: Exported, path: Path | str) -> None:

@@ -43,8 +43,11 @@ def write_geopackage(exported: Exported, path: Path | str) -> None:
 
     Raises DataError for a map without a georeference, and when the file cannot be written.
     """
+    import rasterio
+
     georeference = exported.georeference_for("a GeoPackage")
-    with replacing(path) as file, _new_database(file.name) as database:
+    # every function of rasterio would make an environment of its own
+    with replacing(path) as file, _new_database(file.name) as database, rasterio.Env():
         _describe(database, georeference)
         boxes: dict[str, tuple[float, ...]] = {}
         for feature in features_of(exported.map, georeference):

@@ -248,8 +248,10 @@ def _beside(columns: NDArray[np.int64], reach: int, unread: set[Tile]) -> NDArra
     is_beside = np.zeros(len(columns), bool)
     for dx in (-reach, reach):
         for dy in (-reach, reach):
-            tiles, of = np.unique(columns[:, :2] + (dx, dy) >> TILE_BITS, axis=0, return_inverse=True)
-            is_beside |= np.array([tuple(tile) in unread for tile in tiles.tolist()], bool)[of.ravel()]
+            x, y = (columns[:, :2] + (dx, dy) >> TILE_BITS).T
+            _, first, of = np.unique((x << 32) + y, return_index=True, return_inverse=True)
+            tiles = zip(x[first].tolist(), y[first].tolist(), strict=True)
+            is_beside |= np.array([tile in unread for tile in tiles], bool)[of]
     return is_beside
 
 
@@ -303,7 +305,8 @@ def _outlines(cells: NDArray[np.int64], size: float) -> Iterator[tuple[shapely.P
 
 
 def _polygon(rings: list[list[tuple[float, float]]]) -> shapely.Polygon:
-    return shapely.Polygon(rings[0], rings[1:])
+    outline, *holes = map(np.array, rings)  # shapely would look at every coordinate by itself
+    return shapely.Polygon(outline, holes)
 
 
 def _placed(

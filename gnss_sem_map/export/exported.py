@@ -18,6 +18,7 @@ from gnss_sem_map.voxels.attributes import Attributes, TiledAttributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.tiles import TiledMap
+from gnss_sem_map.voxels.voxel_map import limits_of
 
 NO_VOXELS = "the map has no voxels to draw; run.json lists what was skipped"
 
@@ -96,7 +97,8 @@ class Extent:
             was_removed = piece.states == State.REMOVED
             indices = piece.voxels.indices
             for sums, chosen in ((labelled, piece.shown), (standing, ~was_removed), (removed, was_removed)):
-                sums.add(indices[chosen], piece.labels[chosen])
+                places = np.flatnonzero(chosen)
+                sums.add(indices.take(places, axis=0), piece.labels[places])
         drawable = standing if standing.count else removed
         visible = labelled if labelled.count else drawable
         return cls(
@@ -131,7 +133,7 @@ class _Sums:
         if not len(labels):
             return
         self.count += len(labels)
-        self.low = np.minimum(self.low, indices.min(axis=0))
-        self.high = np.maximum(self.high, indices.max(axis=0))
+        low, high = limits_of(indices)
+        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
         self.total += indices.sum(axis=0, dtype=np.int64)
         self.labels += np.roll(np.bincount(labels + 1, minlength=len(self.labels)), -1)

@@ -244,7 +244,8 @@ def _best_behind(exported: Exported) -> Camera:
         if not near:
             continue
         piece = exported.map.read_tile(tile)
-        chosen = exported.extent.drawable(piece) & (piece.voxels.indices[:, :2] % 2 == 0).all(axis=1)
+        x, y, _ = piece.voxels.indices.T
+        chosen = exported.extent.drawable(piece) & ((x | y) % 2 == 0)
         centres, numbers = piece.voxels.centres[chosen], np.arange(drawn, drawn + len(piece), dtype=np.int32)
         numbers[~exported.extent.visible(piece)] = -1  # hides others and does not count
         drawn += len(piece)

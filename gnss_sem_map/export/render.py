@@ -95,6 +95,7 @@ def _draw(centres, h, numbers, middle, reach_m, axes, focal, depth, cube, face):
     half_right = h * (abs(axes[0, 0]) + abs(axes[0, 1]) + abs(axes[0, 2]))
     half_down = h * (abs(axes[1, 0]) + abs(axes[1, 1]) + abs(axes[1, 2]))
     half_forward = h * (abs(axes[2, 0]) + abs(axes[2, 1]) + abs(axes[2, 2]))
+    across = (np.arange(width) + 0.5 - 0.5 * width) / focal
     for i in range(len(centres)):
         cx, cy, cz = centres[i, 0], centres[i, 1], centres[i, 2]
         forward = axes[2, 0] * cx + axes[2, 1] * cy + axes[2, 2] * cz
@@ -112,7 +113,7 @@ def _draw(centres, h, numbers, middle, reach_m, axes, focal, depth, cube, face):
             for column in range(left_column, right_column):
                 if depth[row, column] <= near:
                     continue
-                x = (column + 0.5 - 0.5 * width) / focal
+                x = across[column]
                 enter_x, leave_x = _slab(cx, h, x * axes[0, 0] + y * axes[1, 0] + axes[2, 0])
                 enter_y, leave_y = _slab(cy, h, x * axes[0, 1] + y * axes[1, 1] + axes[2, 1])
                 enter_z, leave_z = _slab(cz, h, x * axes[0, 2] + y * axes[1, 2] + axes[2, 2])

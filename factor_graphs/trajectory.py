@@ -239,7 +239,10 @@ def _columns(path: Path) -> dict[str, Array]:
             )
         table = table_file.read()
         # `to_numpy` imports pandas, which takes 0.3 s
-        return {name: np.array(np.from_dlpack(table[name].combine_chunks())) for name in table.column_names}
+        return {
+            name: np.array(np.from_dlpack(table[name].combine_chunks()), np.float64)
+            for name in table.column_names
+        }
     except FileNotFoundError:
         raise MeasurementError(f"{path}: no such file; expected a saved trajectory") from None
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:

@@ -171,10 +171,19 @@ class VoxelMap:
     def _known_heights(self) -> NDArray[np.int64]:
         return np.zeros(len(self), np.int64) if self.heights is None else self.heights
 
+    @property
+    def _sums(self) -> NDArray[np.int32]:
+        """The evidence; raises DataError where it was not read."""
+        if self.evidence.shape[1] != len(self.label_set.names):
+            raise DataError(
+                "voxel map: it was read without its sums; open it with them to ask what images show"
+            )
+        return self.evidence
+
     @cached_property
     def observed(self) -> NDArray[np.bool_]:
         """(v,) whether any image shows the voxel."""
-        return np.asarray(reduce(np.bitwise_or, self.evidence.T, np.zeros(len(self), np.int32)) != 0)
+        return np.asarray(reduce(np.bitwise_or, self._sums.T, np.zeros(len(self), np.int32)) != 0)
 
     @cached_property
     def labels(self) -> NDArray[np.int8]:
@@ -184,7 +193,7 @@ class VoxelMap:
     @cached_property
     def probabilities(self) -> NDArray[np.float32]:
         """(v, c) class probabilities (eq. 6, normalised); uniform where no image shows the voxel."""
-        return softmax(self.evidence.astype(np.float32) / np.float32(UNITS_PER_NAT))
+        return softmax(self._sums.astype(np.float32) / np.float32(UNITS_PER_NAT))
 
     def indices_of(self, keys: NDArray[np.int64]) -> NDArray[np.int64]:
         """Index (n,) in the map of each voxel key (n,), or -1 where the map has no such voxel."""

@@ -186,6 +186,9 @@ def test_a_map_read_without_sums_is_decided_as_with_them_and_cannot_be_written(t
             np.testing.assert_array_equal(getattr(decided.voxels, name), getattr(piece.voxels, name))
         with pytest.raises(ValueError, match="zip"):
             tile_files.encode(decided)
+        for asked in ("observed", "labels", "probabilities"):
+            with pytest.raises(DataError, match="read without its sums"):
+                getattr(decided.voxels, asked)
 
 
 def test_one_changed_byte_in_a_tile_is_noticed_and_named(tmp_path: Path) -> None:

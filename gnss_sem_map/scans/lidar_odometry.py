@@ -349,15 +349,19 @@ def _relative_poses(
     """Relative poses of the IMU from pairs of matches; covariances are the sum of both ends, plus the least
     variances.
     """
-    T_lidar_imu = np.linalg.inv(T_imu_lidar)
+    T_lidar_imu = registration.inverse(T_imu_lidar)
     to_imu = registration.adjoint(T_imu_lidar)
     floor = np.diag(np.repeat([settings.rotation_stddev_rad**2, settings.translation_stddev_m**2], 3))
-    T, covariances = np.zeros((len(pairs), 4, 4)), np.zeros((len(pairs), 6, 6))
-    for k, (earlier, later) in enumerate(pairs):
-        T_earlier_later = registration.rigid(np.linalg.inv(earlier.T_local_lidar) @ later.T_local_lidar)
-        back = registration.adjoint(registration.inverse(T_earlier_later))
-        in_lidar = later.covariance + back @ earlier.covariance @ back.T
-        T[k] = registration.rigid(T_imu_lidar @ T_earlier_later @ T_lidar_imu)
-        covariances[k] = to_imu @ in_lidar @ to_imu.T + floor
-    stamps = np.array([(a.scan.stamp, b.scan.stamp) for a, b in pairs]).reshape(-1, 2)
-    return RelativePoses(stamps, T, (covariances + np.swapaxes(covariances, 1, 2)) / 2)
+    ends = list(chain.from_iterable(pairs))
+    stamps = np.array([match.scan.stamp for match in ends]).reshape(-1, 2)
+    T = np.array([match.T_local_lidar for match in ends]).reshape(-1, 2, 4, 4)
+    covariances = np.array([match.covariance for match in ends]).reshape(-1, 2, 6, 6)
+    T_earlier_later = registration.rigid(registration.inverse(T[:, 0]) @ T[:, 1])
+    back = registration.adjoint(registration.inverse(T_earlier_later))
+    in_lidar = covariances[:, 1] + back @ covariances[:, 0] @ np.swapaxes(back, 1, 2)
+    in_imu = to_imu @ in_lidar @ to_imu.T + floor
+    return RelativePoses(
+        stamps,
+        registration.rigid(T_imu_lidar @ T_earlier_later @ T_lidar_imu),
+        (in_imu + np.swapaxes(in_imu, 1, 2)) / 2,
+    )

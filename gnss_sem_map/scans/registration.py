@@ -80,15 +80,15 @@ def remap_solution(
 
 
 def rigid(T: Array) -> Array:
-    """The nearest rigid transform: corrects the rounding errors of products of many transforms."""
-    result = np.eye(4)
-    result[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
-    result[:3, 3] = T[:3, 3]
+    """The nearest rigid transforms (..., 4, 4): corrects the rounding errors of products of many transforms."""
+    result = T.copy()
+    result[..., :3, :3] = Rotation.from_matrix(T[..., :3, :3]).as_matrix()
+    result[..., 3, :] = 0.0, 0.0, 0.0, 1.0
     return result
 
 
 def inverse(T: Array) -> Array:
-    """Of a transform (4, 4)."""
+    """Of transforms (..., 4, 4)."""
     return np.asarray(np.linalg.inv(T), np.float64)
 
 
@@ -98,17 +98,17 @@ def turn_deg(T: Array) -> float:
 
 
 def adjoint(T: Array) -> Array:
-    """(6, 6) with T Exp(x) T⁻¹ = Exp(adjoint x), x = (rotation, translation)."""
-    R = T[:3, :3]
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[3:, :3] = cross_matrix(T[:3, 3]) @ R
+    """(..., 6, 6) with T Exp(x) T⁻¹ = Exp(adjoint x), x = (rotation, translation)."""
+    R = T[..., :3, :3]
+    result = np.zeros((*T.shape[:-2], 6, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = R
+    result[..., 3:, :3] = cross_matrix(T[..., :3, 3]) @ R
     return result
 
 
 def cross_matrix(v: Array) -> Array:
-    """(3, 3) with cross_matrix(v) @ w = v x w."""
-    return np.cross(v, np.eye(3)).T
+    """(..., 3, 3) with cross_matrix(v) @ w = v x w."""
+    return np.swapaxes(np.cross(v[..., None, :], np.eye(3)), -1, -2)
 
 
 def _log(T: Array) -> Array:

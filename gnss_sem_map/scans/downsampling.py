@@ -6,11 +6,11 @@ import numpy as np
 from numba import int64, njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.scans.kernels import coordinates, mark_usable
+from gnss_sem_map.scans.kernels import COLUMNS, coordinates, mark_usable
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.hash_table import slot_of, slots_of
 from gnss_sem_map.voxels.hash_unique import FEWEST_SLOTS, distinct
-from gnss_sem_map.voxels.kernels import pack_keys
+from gnss_sem_map.voxels.kernels import pack_keys, run_starts
 
 SLOTS_PER_S = 20.0
 """Points of one cube are averaged if they were measured within the same 50 ms: where a sweep begins and ends, one cube
@@ -60,47 +60,60 @@ def _mean(points, cube, means):
 def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
     """Average the usable points (4 n,) of each cube into `means`; returns the number of cubes.
 
-    Consecutive points of a scan are often in the same cube: a key that repeats the one before needs no look-up.
+    Consecutive points of a scan are often in the same cube: their sums stay in registers, and need one look-up.
     """
-    usable, is_timed = np.empty(len(means), np.bool_), len(stamps) > 0
-    mark_usable(rows, stamps, nearest_m, farthest_m, usable)
-    count, row, previous, stamp, size = 0, 0, int64(-1), 0.0, FEWEST_SLOTS
+    keys = _keys(rows, stamps, edge_m, nearest_m, farthest_m)
+    starts, is_timed = run_starts(keys, 0), len(stamps) > 0
+    count, size = 0, FEWEST_SLOTS
     slots = np.full(size, -1, np.int32)
-    keys, counts = np.empty(len(means), np.int64), np.empty(len(means), np.int64)
-    for i in range(len(means)):
-        if not usable[i]:
+    cubes, counts = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
+    for run in range(len(starts) - 1):
+        first, end = starts[run], starts[run + 1]
+        if keys[first] == 0:
             continue
-        x, y, z = coordinates(rows, i)
-        if is_timed:
-            stamp = stamps[i]
-        key = _key(x / edge_m, y / edge_m, z / edge_m, stamp * SLOTS_PER_S)
-        if key != previous:
-            previous = key
-            slot = slot_of(key, keys, slots, size)
-            if slots[slot] < 0:
-                slots[slot], keys[count], counts[count], means[count] = count, key, 0, 0.0
-                count += 1
-            row = slots[slot]
-            if 2 * count > size:
-                size *= 2
-                slots = slots_of(keys, count, size)
-        counts[row] += 1
-        means[row, 0] += x
-        means[row, 1] += y
-        means[row, 2] += z
-        means[row, 3] += rows[4 * i + 3]
-        means[row, 4] += stamp
+        slot = slot_of(keys[first], cubes, slots, size)
+        if slots[slot] < 0:
+            slots[slot], cubes[count], counts[count], means[count] = count, keys[first], 0, 0.0
+            count += 1
+        row = slots[slot]
+        if 2 * count > size:
+            size *= 2
+            slots = slots_of(cubes, count, size)
+        sums = means[row]
+        x, y, z, intensity, stamp = sums[0], sums[1], sums[2], sums[3], sums[4]
+        for i in range(first, end):
+            x += rows[4 * i]
+            y += rows[4 * i + 1]
+            z += rows[4 * i + 2]
+            intensity += rows[4 * i + 3]
+            if is_timed:
+                stamp += stamps[i]
+        sums[0], sums[1], sums[2], sums[3], sums[4] = x, y, z, intensity, stamp
+        counts[row] += end - first
     for row in range(count):
-        for column in range(MEANS):
-            means[row, column] /= counts[row]
+        means[row] /= counts[row]
     return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _keys(rows, stamps, edge_m, nearest_m, farthest_m):
+    """Key (n,) of the cube of each point, at one time of several; 0 for a point that is not usable."""
+    keys = np.empty(len(rows) // COLUMNS, np.int64)
+    usable, is_timed = np.empty(len(keys), np.bool_), len(stamps) > 0
+    mark_usable(rows, stamps, nearest_m, farthest_m, usable)
+    for i in range(len(keys)):
+        x, y, z = coordinates(rows, i)
+        slot = stamps[i] * SLOTS_PER_S if is_timed else 0.0
+        key = _key(x / edge_m, y / edge_m, z / edge_m, slot)
+        keys[i] = key if usable[i] else 0
+    return keys
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _key(i, j, k, slot):
-    """Key of a cube, at one time of several; indices are taken modulo their number."""
-    cells = (1 << INDEX_BITS) - 1
-    key = int64(np.floor(slot)) & ((1 << SLOT_BITS) - 1)
+    """Key of a cube, at one time of several, never 0; indices are taken modulo their number."""
+    cells, slots = (1 << INDEX_BITS) - 1, 1 << SLOT_BITS
+    key = slots | (int64(np.floor(slot)) & (slots - 1))
     for index in (i, j, k):
         key = (key << INDEX_BITS) | (int64(np.floor(index)) & cells)
     return key

@@ -1,7 +1,6 @@
 """Compiled loops over the points of a scan: deskewing, voxel keys and projection into images (eq. 1, 3, 4).
 
-A scan is deskewed in blocks that fit into the L1 cache. Inside a block the coordinates are stored axis by axis, so that
-the compiler can use SIMD instructions. The tests hold a numpy version of each loop.
+The tests hold a numpy version of each loop.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ from numba import int64, njit
 from gnss_sem_map.sensor_log.cameras import ANGLE, PINHOLE
 from gnss_sem_map.voxels.kernels import height_in_voxel, pack_key
 
-BLOCK = 1024
-"""Points per block: their coordinates take 24 kB, which fits into the L1 cache."""
 COLUMNS = 4
 """Columns of a scan: x, y, z, intensity."""
 
@@ -22,26 +19,27 @@ COLUMNS = 4
 def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, p_map):
     """Transform the usable points of a scan into the map; returns their number m.
 
-    `rows` (4 n,) are the points as in the file; `stamps` (n,) s, or empty for a sweep with one pose; `poses` (k, 3, 8),
-    see `_move`, are those of knots with the rate `knots_per_s`, numbered from stamp zero. Writes `valid` (n,), the mask
-    of the usable points, see `mark_usable`, and `p_map` (3 m,) m, their positions.
+    `rows` (4 n,) are the points as in the file; `stamps` (n,) s, or empty for a sweep with one pose; `poses` (k, 3, 8)
+    are those of knots with the rate `knots_per_s`, numbered from stamp zero: the pose (3, 4), and its difference to the
+    next, of which the time since the knot tells the part. Writes `valid` (n,), the mask of the usable points, see
+    `mark_usable`, and `p_map` (3 m,) m, their positions.
     """
-    count, block, knots = 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
-    for start in range(0, len(valid), BLOCK):
-        m = _move_block(
-            rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
-        )
-        _append(block, count, m, p_map)
-        count += m
+    count = 0
+    for i in range(len(valid)):
+        x, y, z = coordinates(rows, i)
+        stamp = stamps[i] if len(stamps) > 0 else 0.0
+        valid[i] = _is_in_range(x, y, z, nearest_m, farthest_m) & np.isfinite(stamp)
+        if not valid[i]:
+            continue
+        knot = stamp * knots_per_s - first_knot
+        k = min(max(int64(knot), 0), len(poses) - 1)
+        part = knot - k
+        for axis in range(3):
+            T = poses[k, axis]
+            moved = T[0] * x + T[1] * y + T[2] * z + T[3]
+            p_map[3 * count + axis] = moved + part * (T[4] * x + T[5] * y + T[6] * z + T[7])
+        count += 1
     return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _append(block, count, m, p_map):
-    """Write the first m points of a block behind the `count` that are in p_map (3 n,)."""
-    x, y, z, here = block[0], block[1], block[2], p_map[3 * count : 3 * (count + m)]
-    for i in range(m):
-        here[3 * i], here[3 * i + 1], here[3 * i + 2] = x[i], y[i], z[i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,34 +51,12 @@ def place(
     As `to_map`, and writes the voxel `keys` (m,), 0 for a point outside of the addressable volume, and the `heights`
     (m,) of the points in their voxels.
     """
-    count, block, knots = 0, np.empty((3, BLOCK)), np.zeros(BLOCK)
-    for start in range(0, len(valid), BLOCK):
-        m = _move_block(
-            rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
-        )
-        x, y, z, here = block[0, :m], block[1, :m], block[2, :m], keys[count : count + m]
-        for i in range(m):
-            here[i] = pack_key(x[i], y[i], z[i], voxel_size_m)
-        over = heights[count : count + m]
-        for i in range(m):
-            over[i] = height_in_voxel(z[i], voxel_size_m)
-        _append(block, count, m, p_map)
-        count += m
+    count = to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, p_map)
+    for i in range(count):
+        x, y, z = p_map[3 * i], p_map[3 * i + 1], p_map[3 * i + 2]
+        keys[i] = pack_key(x, y, z, voxel_size_m)
+        heights[i] = height_in_voxel(z, voxel_size_m)
     return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _move_block(
-    rows, stamps, start, nearest_m, farthest_m, knots_per_s, first_knot, poses, valid, knots, block
-):
-    """Transform the usable points of the block from `start` into the first columns of `block`; returns their number."""
-    end = min(start + BLOCK, len(valid))
-    here, usable = rows[COLUMNS * start : COLUMNS * end], valid[start:end]
-    then = stamps[start:end]
-    mark_usable(here, then, nearest_m, farthest_m, usable)
-    for i in range(len(then)):
-        knots[i] = then[i] * knots_per_s - first_knot
-    return _transform(here, usable, knots, poses, block)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -94,52 +70,18 @@ def mark_usable(rows, stamps, nearest_m, farthest_m, valid):
 
     A point at zero is no return, whatever the range: so some drivers write that nothing came back.
     """
-    nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
     for i in range(len(valid)):
         x, y, z = coordinates(rows, i)
-        square = x * x + y * y + z * z
-        valid[i] = (square > 0) & (square >= nearest) & (square <= farthest)
+        valid[i] = _is_in_range(x, y, z, nearest_m, farthest_m)
     for i in range(len(stamps)):
         valid[i] &= np.isfinite(stamps[i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _transform(rows, valid, knots, poses, p_map):
-    """Transform the valid points, run by run of those between the same two knots; returns their number.
-
-    `knots` are stamps in units of knots since the first: the integer part is the knot, the rest the interpolation
-    weight.
-    """
-    i, to, n = 0, 0, len(valid)
-    while i < n:
-        if not valid[i]:
-            i += 1
-            continue
-        k = min(max(int64(knots[i]), 0), len(poses) - 1)
-        end = i + 1
-        while end < n and valid[end] and k <= knots[end] < k + 1:
-            end += 1
-        m = to + end - i
-        here = rows[COLUMNS * i : COLUMNS * end]
-        _move(here, knots[i:end], k, poses[k], p_map[0, to:m], p_map[1, to:m], p_map[2, to:m])
-        i, to = end, m
-    return to
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _move(rows, knots, k, pose, x_map, y_map, z_map):
-    """Transform one run with poses interpolated linearly: `pose` (3, 8) is a pose (3, 4) and the difference to the
-    next.
-    """
-    xx, xy, xz, x0, dxx, dxy, dxz, dx0 = pose[0]
-    yx, yy, yz, y0, dyx, dyy, dyz, dy0 = pose[1]
-    zx, zy, zz, z0, dzx, dzy, dzz, dz0 = pose[2]
-    for i in range(len(x_map)):
-        x, y, z = coordinates(rows, i)
-        part = knots[i] - k
-        x_map[i] = xx * x + xy * y + xz * z + x0 + part * (dxx * x + dxy * y + dxz * z + dx0)
-        y_map[i] = yx * x + yy * y + yz * z + y0 + part * (dyx * x + dyy * y + dyz * z + dy0)
-        z_map[i] = zx * x + zy * y + zz * z + z0 + part * (dzx * x + dzy * y + dzz * z + dz0)
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _is_in_range(x, y, z, nearest_m, farthest_m):
+    """Whether a point is finite, not at zero, and in range."""
+    square = x * x + y * y + z * z
+    return (square > 0) & (square >= nearest_m * nearest_m) & (square <= farthest_m * farthest_m)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

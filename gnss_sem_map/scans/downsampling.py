@@ -6,7 +6,7 @@ import numpy as np
 from numba import int64, njit
 from numpy.typing import NDArray
 
-from gnss_sem_map.scans.kernels import COLUMNS, coordinates, mark_usable
+from gnss_sem_map.scans.kernels import COLUMNS, coordinates, is_usable
 from gnss_sem_map.sensor_log import Points
 from gnss_sem_map.voxels.hash_table import slot_of, slots_of
 from gnss_sem_map.voxels.hash_unique import FEWEST_SLOTS, distinct
@@ -99,13 +99,11 @@ def _thin(rows, stamps, edge_m, nearest_m, farthest_m, means):
 def _keys(rows, stamps, edge_m, nearest_m, farthest_m):
     """Key (n,) of the cube of each point, at one time of several; 0 for a point that is not usable."""
     keys = np.empty(len(rows) // COLUMNS, np.int64)
-    usable, is_timed = np.empty(len(keys), np.bool_), len(stamps) > 0
-    mark_usable(rows, stamps, nearest_m, farthest_m, usable)
     for i in range(len(keys)):
         x, y, z = coordinates(rows, i)
-        slot = stamps[i] * SLOTS_PER_S if is_timed else 0.0
-        key = _key(x / edge_m, y / edge_m, z / edge_m, slot)
-        keys[i] = key if usable[i] else 0
+        stamp = stamps[i] if len(stamps) > 0 else 0.0
+        key = _key(x / edge_m, y / edge_m, z / edge_m, stamp * SLOTS_PER_S)
+        keys[i] = key if is_usable(x, y, z, stamp, nearest_m, farthest_m) else 0
     return keys
 
 

@@ -22,13 +22,13 @@ def to_map(rows, stamps, nearest_m, farthest_m, knots_per_s, first_knot, poses, 
     `rows` (4 n,) are the points as in the file; `stamps` (n,) s, or empty for a sweep with one pose; `poses` (k, 3, 8)
     are those of knots with the rate `knots_per_s`, numbered from stamp zero: the pose (3, 4), and its difference to the
     next, of which the time since the knot tells the part. Writes `valid` (n,), the mask of the usable points, see
-    `mark_usable`, and `p_map` (3 m,) m, their positions.
+    `is_usable`, and `p_map` (3 m,) m, their positions.
     """
     count = 0
     for i in range(len(valid)):
         x, y, z = coordinates(rows, i)
         stamp = stamps[i] if len(stamps) > 0 else 0.0
-        valid[i] = _is_in_range(x, y, z, nearest_m, farthest_m) & np.isfinite(stamp)
+        valid[i] = is_usable(x, y, z, stamp, nearest_m, farthest_m)
         if not valid[i]:
             continue
         knot = stamp * knots_per_s - first_knot
@@ -66,22 +66,21 @@ def coordinates(rows, i):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_usable(rows, stamps, nearest_m, farthest_m, valid):
-    """Mark the points (n,) that are finite and in range, and whose stamps are finite; `stamps` (n,) s, or empty.
-
-    A point at zero is no return, whatever the range: so some drivers write that nothing came back.
-    """
+    """Mark the usable points (n,), see `is_usable`; `stamps` (n,) s, or empty."""
     for i in range(len(valid)):
         x, y, z = coordinates(rows, i)
-        valid[i] = _is_in_range(x, y, z, nearest_m, farthest_m)
-    for i in range(len(stamps)):
-        valid[i] &= np.isfinite(stamps[i])
+        valid[i] = is_usable(x, y, z, stamps[i] if len(stamps) > 0 else 0.0, nearest_m, farthest_m)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _is_in_range(x, y, z, nearest_m, farthest_m):
-    """Whether a point is finite, not at zero, and in range."""
+def is_usable(x, y, z, stamp, nearest_m, farthest_m):
+    """Whether a point is finite and in range, and its stamp is finite.
+
+    A point at zero is no return, whatever the range: so some drivers write that nothing came back.
+    """
     square = x * x + y * y + z * z
-    return (square > 0) & (square >= nearest_m * nearest_m) & (square <= farthest_m * farthest_m)
+    in_range = (square >= nearest_m * nearest_m) & (square <= farthest_m * farthest_m)
+    return (square > 0) & in_range & np.isfinite(stamp)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")

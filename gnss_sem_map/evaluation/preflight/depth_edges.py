@@ -109,12 +109,15 @@ class Edges:
         T = camera.T_camera_lidar @ T_lidar_map
         if any(change.rotation_deg):
             T[:, :3] = Rotation.from_rotvec(change.rotation_deg, degrees=True).as_matrix() @ T[:, :3]
-        p_camera = np.einsum("nij,nj->ni", T[self._of, :3, :3], self._p_map) + T[self._of, :3, 3]
-        K = camera.K.copy()
-        K[:2, :2] *= change.focal * change.size
-        K[:2, 2] *= change.size
-        changed, found = replace(camera, K=K), np.empty_like(p_camera)
-        kernels.pixels(p_camera, changed.projection(np.eye(4)), changed.lens, NEAREST_DEPTH_M, found)
+        T = T[self._of, :3]
+        p_camera = np.einsum("nij,nj->ni", T[:, :, :3], self._p_map) + T[:, :, 3]
+        if (change.focal, change.size) != (1.0, 1.0):
+            K = camera.K.copy()
+            K[:2, :2] *= change.focal * change.size
+            K[:2, 2] *= change.size
+            camera = replace(camera, K=K)
+        found = np.empty_like(p_camera)
+        kernels.pixels(p_camera, camera.projection(np.eye(4)), camera.lens, NEAREST_DEPTH_M, found)
         u, v, depth = found.T
         return u, v, depth
 

@@ -49,19 +49,22 @@ SMOOTH_M = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Some points of a sweep as they were measured: (m) to match, with planes, and (d) more to see surfaces with."""
+    """Some points of a sweep as they were measured: (m) to match, and (d) more to see surfaces with."""
 
     stamp: float
     p_lidar: Array
     """(m, 3) m."""
-    normals: Array
-    """(m, 3); zero where there is no plane."""
     after_s: Array | None
     """(m,) s after the sweep's stamp, as given; None: said to be compensated."""
     dense: Array
     """(d, 3) m."""
     dense_after_s: Array | None
     """(d,) s."""
+
+    @cached_property
+    def normals(self) -> Array:
+        """Of the planes at the points to match (m, 3), zero where there is none; few sweeps need them."""
+        return normals_of(self.p_lidar)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +200,6 @@ def thinned(points: Points, stamp: float) -> Sweep | None:
     return Sweep(
         stamp,
         p,
-        normals_of(p),
         None if after is None else after[one],
         cloud[dense],
         None if after is None else after[dense],

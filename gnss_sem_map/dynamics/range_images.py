@@ -10,7 +10,7 @@ instructions.
 from __future__ import annotations
 
 import numpy as np
-from numba import int32, njit, uint16, uint64
+from numba import int32, njit, uint16
 from numpy.typing import NDArray
 
 from gnss_sem_map.dynamics.image_rows import CELL_DEG, CELLS, LOWEST_DEG, Rows
@@ -28,8 +28,7 @@ SLENDER = 0.7
 LEAST_FILLED = 3
 """A 3 x 3 window with fewer returns is no evidence: sky, glass, or the edge of the view."""
 BLOCK = 1024
-WORD = 64
-CLUSTER = 2 * WORD
+CLUSTER = 128
 """Positions in a row that are hidden together: they should be neighbours, see `visibility.spatial_order`."""
 
 
@@ -79,27 +78,6 @@ def draw(p_map, T_lidar_map, row_of, image):
             drawn[pixel] = min(drawn[pixel], depths[i] if row > 0 else EMPTY)
     for row in range(len(image)):
         image[row, 0], image[row, -1] = image[row, -2], image[row, 1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _test_visibility(drawn, around, column, low, high):
-    """Visibility test of a position at a range of `low` to `high` cm in one scan: 1 hit, -1 miss, 0 hidden or unknown.
-
-    `around` (3,) are the rows below, at and above the position; `column` is the first of its three.
-    """
-    filled, rows, hit, nearer = 0, 0, False, False
-    for row in range(3):
-        at = around[row] * WIDTH + column
-        a, b, c = drawn[at], drawn[at + 1], drawn[at + 2]
-        beams = (a != EMPTY) + (b != EMPTY) + (c != EMPTY)
-        hit |= ((low <= a) & (a <= high)) | ((low <= b) & (b <= high)) | ((low <= c) & (c <= high))
-        nearer |= (a < low) | (b < low) | (c < low)
-        filled += beams
-        rows |= (beams > 0) << row
-    if hit:
-        return 1
-    between = rows & 0b010 or rows == 0b101  # beams passed in its row, or in the rows above and below
-    return -1 if between and filled >= LEAST_FILLED and not nearer else 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -223,47 +201,78 @@ def count_hits_and_misses(
     (CELLS, 3) are the rows that tell of each cell of elevation. Only scans with the position in range count. A return
     is a hit within a margin that grows with range.
     """
-    p_lidar, index = np.empty((3, CLUSTER)), np.empty(CLUSTER, np.int32)
+    limits = nearest_m, farthest_m, margin_m, margin_ratio
     cells, columns = np.empty(CLUSTER, np.int32), np.empty(CLUSTER, np.int32)
     lows, highs = np.empty(CLUSTER, np.uint16), np.empty(CLUSTER, np.uint16)
+    windows, is_hidden = np.empty((9, CLUSTER), np.uint16), np.empty(CLUSTER, np.bool_)
     for start in range(0, len(positions), CLUSTER):
-        here = positions[start : start + CLUSTER]
+        here, hits_here = positions[start : start + CLUSTER], hits[start : start + CLUSTER]
         centre, radius = _sphere_around(here)
         for k in chosen:
             T, drawn = T_lidar_map[k], images[k].reshape(-1)
             if _is_hidden(centre, radius, T, around, drawn, farthest_m, margin_m, margin_ratio):
                 continue
-            count = _in_range(here, T, nearest_m, farthest_m, p_lidar, index)
-            xs, ys, zs = p_lidar[0], p_lidar[1], p_lidar[2]
-            for i in range(count):
-                x, y, z = xs[i], ys[i], zs[i]
-                r = np.sqrt(x * x + y * y + z * z)
-                cells[i], columns[i] = _cell(x, y, z), _column(x, y)
-                margin = margin_m + margin_ratio * r
-                lows[i] = uint16(max(np.ceil(UNITS_PER_M * (r - margin)), 0.0))
-                highs[i] = uint16(min(np.floor(UNITS_PER_M * (r + margin)), float(EMPTY - 1)))
-            for first in range(0, count, WORD):
-                last = min(first + WORD, count)
-                hit, seen_through = _tested(drawn, around, cells, columns, lows, highs, first, last)
-                for i in range(first, last):
-                    bit = uint64(i - first)
-                    hits[start + index[i]] += int32((hit >> bit) & uint64(1))
-                    misses[start + index[i]] += int32((seen_through >> bit) & uint64(1))
+            _project(here, T, limits, cells, columns, lows, highs)
+            _copy_windows(drawn, around, cells[: len(here)], columns, windows)
+            _test_visibility(windows, lows, highs, hits_here, is_hidden)
+            for i in range(len(here)):
+                if not is_hidden[i]:
+                    misses[start + i] += _is_seen_through(windows[:, i])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _tested(drawn, around, cells, columns, lows, highs, first, last):
-    """Bits of up to 64 positions: those that are hit, and those that are seen through.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(positions, T_lidar_map, limits, cells, columns, lows, highs):
+    """Pixels of positions (m, 3) in a scan, and between which ranges a return hits each, cm: none if out of range."""
+    nearest_m, farthest_m, margin_m, margin_ratio = limits
+    nearest, farthest, flat = nearest_m * nearest_m, farthest_m * farthest_m, positions.reshape(-1)
+    for i in range(len(positions)):
+        x, y, z = _in_lidar(T_lidar_map, flat, i)
+        square = x * x + y * y + z * z
+        in_range, r = (square >= nearest) & (square <= farthest), np.sqrt(square)
+        cells[i], columns[i] = _cell(x, y, z), _column(x, y)
+        margin = margin_m + margin_ratio * r
+        low = uint16(max(np.ceil(UNITS_PER_M * (r - margin)), 0.0))
+        high = uint16(min(np.floor(UNITS_PER_M * (r + margin)), float(EMPTY - 1)))
+        lows[i], highs[i] = low if in_range else EMPTY, high if in_range else uint16(0)
 
-    Nothing is stored meanwhile, so the compiler vectorises the loop: hits and misses of a scan take 4.0 ms, not 5.0.
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _copy_windows(drawn, around, cells, columns, windows):
+    """The 3 x 3 pixels (9, n) around positions: three columns in the rows below, at and above each."""
+    for i in range(len(cells)):
+        for row in range(3):
+            at = around[cells[i], row] * WIDTH + columns[i]
+            for column in range(3):
+                windows[3 * row + column, i] = drawn[at + column]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _test_visibility(windows, lows, highs, hits, is_hidden):
+    """Count which positions (n,) have a return at their range; those that have none are hidden behind any nearer one.
+
+    Without a branch, and over windows side by side, so that the compiler can use SIMD instructions.
     """
-    hit, seen_through = uint64(0), uint64(0)
-    for i in range(first, last):
-        visibility = _test_visibility(drawn, around[cells[i]], columns[i], lows[i], highs[i])
-        bit = uint64(i - first)
-        hit |= uint64(visibility == 1) << bit
-        seen_through |= uint64(visibility == -1) << bit
-    return hit, seen_through
+    for i in range(len(hits)):
+        hit, nearer = False, False
+        for k in range(9):
+            hit |= (lows[i] <= windows[k, i]) & (windows[k, i] <= highs[i])
+            nearer |= windows[k, i] < lows[i]
+        hits[i] += hit
+        is_hidden[i] = hit | nearer
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_seen_through(window):
+    """Whether beams passed a position beyond which all returns of its window (9,) lie."""
+    filled, rows = 0, 0
+    for row in range(3):
+        beams = 0
+        for pixel in window[3 * row : 3 * row + 3]:
+            beams += pixel != EMPTY
+        filled += beams
+        rows |= (beams > 0) << row
+    between = rows & 0b010 or rows == 0b101  # in its row, or in the rows above and below
+    return between and filled >= LEAST_FILLED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -286,20 +295,23 @@ def _is_hidden(centre, radius, T_lidar_map, around, drawn, farthest_m, margin_m,
     level, distance = np.sqrt(x * x + y * y), np.sqrt(x * x + y * y + z * z)
     if distance - radius > farthest_m:
         return True
-    if radius > SLENDER * level:
+    if radius >= SLENDER * level:
         return False  # it is around the scan, or nearly so
     half = np.degrees(np.arcsin(radius / level))
     cell = (atan2_deg(z, level) - LOWEST_DEG) / CELL_DEG
-    lowest, highest = len(drawn) // WIDTH, 0
-    for c in range(max(int(cell - half / CELL_DEG) - 1, 0), min(int(cell + half / CELL_DEG) + 2, CELLS)):
-        for row in around[c]:
-            if row > 0:
-                lowest, highest = min(lowest, row), max(highest, row)
+    first, last = max(int(cell - half / CELL_DEG) - 1, 0), min(int(cell + half / CELL_DEG) + 2, CELLS)
+    rows = around[first:last].reshape(-1)  # those that are not 0 do not descend
+    first, last = 0, len(rows) - 1
+    while first < last and rows[first] == 0:
+        first += 1
+    while first < last and rows[last] == 0:
+        last -= 1
+    lowest, count = rows[first], rows[last] - rows[first] + 1
     nearest = UNITS_PER_M * ((1 - margin_ratio) * (distance - radius) - margin_m) - 1
     column = (atan2_deg(y, x) + 180.0) / COLUMN_DEG
     first, last = int(column - half / COLUMN_DEG) - 2, int(column + half / COLUMN_DEG) + 3
-    for r in range(lowest, highest + 1):
-        at = r * WIDTH + 1
+    for i in range(count):
+        at = (lowest + (i + count // 2) % count) * WIDTH + 1  # from the middle: there it is seen, if anywhere
         if first < 0 or last > COLUMNS:  # across the seam
             seen = max(
                 _farthest(drawn, at, at + last % COLUMNS),
@@ -319,20 +331,6 @@ def _farthest(drawn, start, end):
     for i in range(start, end):
         largest = max(largest, uint16(drawn[i] + uint16(1)))  # EMPTY becomes 0
     return int32(largest) - 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _in_range(positions, T_lidar_map, nearest_m, farthest_m, p_lidar, index):
-    """Collect the positions (m, 3) in range of a scan, in its frame, and their indices; returns how many."""
-    count, flat = 0, positions.reshape(-1)
-    xs, ys, zs = p_lidar[0], p_lidar[1], p_lidar[2]
-    nearest, farthest = nearest_m * nearest_m, farthest_m * farthest_m
-    for i in range(len(positions)):
-        x, y, z = _in_lidar(T_lidar_map, flat, i)
-        square = x * x + y * y + z * z
-        xs[count], ys[count], zs[count], index[count] = x, y, z, i  # kept only if it counts: no branch
-        count += (square >= nearest) & (square <= farthest)
-    return count
 
 
 def gaps_at(

@@ -14,6 +14,7 @@ from gnss_sem_map.dynamics.image_rows import Rows
 from gnss_sem_map.machine import threads
 from gnss_sem_map.scans.own_vehicle import returns_of
 from gnss_sem_map.scans.prefetch import prefetch
+from gnss_sem_map.voxels.voxel_map import limits_of
 
 THREADS = min(threads(), 4)
 """More threads would wait for the one that reads, each with two scans in memory."""
@@ -103,8 +104,8 @@ def are_near(
     T_lidar_map: NDArray[np.float64], positions: NDArray[np.float64], reach_m: float
 ) -> NDArray[np.bool_]:
     """Which poses (k, 4, 4) are at most `reach_m` from the bounding box of positions (m, 3) m: (k,)."""
-    origins = origins_of(T_lidar_map)
-    outside = np.maximum(positions.min(axis=0) - origins, origins - positions.max(axis=0)).max(axis=1)
+    origins, (low, high) = origins_of(T_lidar_map), limits_of(positions)
+    outside = np.maximum(low - origins, origins - high).max(axis=1)
     return np.asarray(outside <= reach_m)
 
 

@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from gnss_sem_map.dynamics.clusters import HIGHEST_M
 from gnss_sem_map.dynamics.standing import is_occupied
 from gnss_sem_map.refinement.state import MapState
-from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND
+from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, points_around
 
 HIGH_M = 1.8
 """What passed is as high as a person: so far over and under a voxel, what moved and the ground are sought. It is no
 higher than the LiDAR, which sees it from all places that show the ground under it."""
+
+OWN_COLUMN = COLUMNS_AROUND[4:5]
 
 
 def passed_over_ground(
@@ -54,10 +56,10 @@ def seldom_there(
     places, stands, ground = np.flatnonzero(asked), over & ~going, ~(over | going)
     under = points_between(keys[places], keys[ground], hits[ground], -lorry - 1, -1)
     places = places[is_occupied(under, hits[places])]  # few are left, whose surroundings are worth a look
-    stand = _points_in_columns(keys[places], keys[stands], hits[stands], person)
-    goes = _points_in_columns(keys[places], keys[going], hits[going], person)
+    stand = points_around(keys[places], keys[stands], hits[stands], -person, person)
+    goes = points_around(keys[places], keys[going], hits[going], -person, person)
     if moved is not None:
-        goes += _points_in_columns(keys[places], moved.keys, moved.hits, person)
+        goes += points_around(keys[places], moved.keys, moved.hits, -person, person)
     low, deep = (
         is_occupied(points_between(keys[places], keys[ground], hits[ground], -depth - 1, -1), stand)
         for depth in (person, lorry)
@@ -67,22 +69,8 @@ def seldom_there(
     return found
 
 
-def _points_in_columns(
-    asked: NDArray[np.int64], keys: NDArray[np.int64], hits: NDArray[np.uint32], reach: int
-) -> NDArray[np.int64]:
-    """Points (a,) in 3 x 3 columns around packed voxels, up to `reach` voxels over and under each."""
-    return np.asarray(
-        sum(points_between(asked + column, keys, hits, -reach, reach) for column in COLUMNS_AROUND)
-    )
-
-
 def points_between(
     asked: NDArray[np.int64], keys: NDArray[np.int64], hits: NDArray[np.uint32], low: int, high: int
 ) -> NDArray[np.int64]:
-    """Points (a,) in the columns of packed voxels, from `low` to `high` voxels over each, both included.
-
-    `hits` (v,) are the points in the sorted packed voxels `keys` (v,).
-    """
-    sums = np.append(0, np.cumsum(hits, dtype=np.int64))
-    ends = np.searchsorted(keys, asked + high, side="right")
-    return np.asarray(sums[ends] - sums[np.searchsorted(keys, asked + low)])
+    """As `points_around`, in the columns of the voxels alone."""
+    return points_around(asked, keys, hits, low, high, OWN_COLUMN)

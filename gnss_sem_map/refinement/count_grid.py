@@ -257,8 +257,8 @@ def decide(
     log_odds: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """Log scores (v, c) where the candidates' two classes differ by the log odds; the better keeps its score."""
-    refined = scores.copy()
-    best = scores[:, classes].max(axis=1)
-    refined[candidates, classes[0]] = (best + np.minimum(log_odds, 0))[candidates]
-    refined[candidates, classes[1]] = (best - np.maximum(log_odds, 0))[candidates]
+    refined, rows, (first, second) = scores.copy(), np.flatnonzero(candidates), classes
+    best, odds = np.maximum(scores[rows, first], scores[rows, second]), log_odds[rows]
+    refined[rows, first] = best + np.minimum(odds, 0)
+    refined[rows, second] = best - np.maximum(odds, 0)
     return refined

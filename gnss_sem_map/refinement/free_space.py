@@ -71,6 +71,7 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
     places = voxels.centres[undecided]
     order = spatial_order(places)
     undecided, places = undecided[order], places[order]
+    points = voxels.hits[undecided]
     group, in_range = _scans_in_range(places, keyframes.T_lidar_map, settings.farthest_m)
     left, counts = in_range.sum(axis=1), np.zeros((2, len(undecided)), np.int32)
     for part in chain([None], keyframes.parts()):
@@ -81,9 +82,10 @@ def traversed(voxels: VoxelMap, keyframes: Keyframes, settings: FreeSpaceSetting
         hits, most_misses = counts[0], counts[1] + left[group]
         may_be_free = most_misses >= settings.least_misses
         too_many = most_misses - settings.misses_per_hit * hits
-        may_be_free &= voxels.hits[undecided] < POINTS_PER_MISS * too_many
-        undecided, places, group = undecided[may_be_free], places[may_be_free], group[may_be_free]
-        counts = counts[:, may_be_free]
+        may_be_free &= points < POINTS_PER_MISS * too_many
+        stays = np.flatnonzero(may_be_free)
+        undecided, points, group = undecided[stays], points[stays], group[stays]
+        places, counts = places.take(stays, axis=0), counts.take(stays, axis=1)
         if not len(undecided):
             break
     free = np.zeros(len(voxels), np.bool_)

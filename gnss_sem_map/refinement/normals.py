@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.refinement.neighbours import HALF_COLUMNS, HALF_STENCIL
+from gnss_sem_map.voxels.hash_unique import distinct
 
 LEAST_VOXELS = 5
 LEAST_SPREAD = 0.01
@@ -25,7 +26,12 @@ def flatness(keys: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None) -
     wanted = np.ones(len(keys), np.bool_) if wanted is None else wanted
     occupied = np.zeros((len(keys), 2), np.uint16)
     _mark(keys, HALF_COLUMNS, occupied)
-    _upright(occupied, MOMENTS, wanted, result)
+    patterns, numbers = distinct(
+        occupied.view(np.uint32)[wanted, 0].astype(np.int64)
+    )  # of streets few differ
+    upright = np.full(len(patterns), np.nan, np.float32)
+    _upright(patterns.astype(np.uint32).view(np.uint16).reshape(-1, 2), MOMENTS, upright)
+    result[wanted] = upright[numbers]
     return result
 
 
@@ -58,12 +64,12 @@ def _mark(keys, columns, occupied):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _upright(occupied, moments, wanted, result):
+def _upright(occupied, moments, result):
     """|z| of the eigenvector of the smallest eigenvalue, from the characteristic polynomial's roots."""
     for i in range(len(occupied)):
         one, other = moments[occupied[i, 0]], moments[occupied[i, 1]]  # the voxel itself is at d = 0
         n = 1.0 + one[0] + other[0]
-        if not wanted[i] or n < LEAST_VOXELS:
+        if n < LEAST_VOXELS:
             continue
         x, y, z = (one[1] - other[1]) / n, (one[2] - other[2]) / n, (one[3] - other[3]) / n
         xx, xy, xz = (one[4] + other[4]) / n, (one[5] + other[5]) / n, (one[6] + other[6]) / n

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import int64, njit
 from numpy.typing import NDArray
 
 from gnss_sem_map.refinement.state import MapState
@@ -53,26 +53,32 @@ def more_goes_than_stands(
 
 
 def points_around(
-    asked: NDArray[np.int64], keys: NDArray[np.int64], hits: NDArray[np.uint32]
+    asked: NDArray[np.int64],
+    keys: NDArray[np.int64],
+    hits: NDArray[np.uint32],
+    low: int = -1,
+    high: int = 1,
+    columns: NDArray[np.int64] = COLUMNS_AROUND,
 ) -> NDArray[np.int64]:
-    """Points (a,) in and around sorted packed voxels: of themselves and their 26 neighbours.
+    """Points (a,) around sorted packed voxels, from `low` to `high` voxels over each: themselves and 26 by default.
 
     `hits` (v,) are the points in the sorted packed voxels `keys` (v,).
     """
     total = np.zeros(len(asked), np.int64)
-    _add_around(asked, keys, hits, COLUMNS_AROUND, total)
+    _add_around(asked, keys, hits, columns, low, high, total)
     return total
 
 
 @njit(cache=True, nogil=True)
-def _add_around(asked, keys, hits, beside, total):
-    for column in beside:
-        low = 0  # the first voxel that is not lower
+def _add_around(asked, keys, hits, columns, low, high, total):
+    for column in columns:
+        first, end, inside = 0, 0, int64(0)  # a window over the voxels, and the points in it
         for i in range(len(asked)):
             centre = asked[i] + column
-            while low < len(keys) and keys[low] < centre - 1:
-                low += 1
-            k = low
-            while k < len(keys) and keys[k] <= centre + 1:
-                total[i] += hits[k]
-                k += 1
+            while end < len(keys) and keys[end] <= centre + high:
+                inside += hits[end]
+                end += 1
+            while first < end and keys[first] < centre + low:
+                inside -= hits[first]
+                first += 1
+            total[i] += inside

@@ -161,8 +161,9 @@ def _describe(
     voxel_size_m: float,
 ) -> VehicleObject:
     centre = (indices.mean(axis=0) + 0.5) * voxel_size_m
-    x, y = np.unique(indices[:, :2] >> TILE_BITS, axis=0)[0].tolist()
-    return VehicleObject(number, motion, reason, len(indices), centre, float(length_m), (x, y))
+    x, y = indices[:, :2].T >> TILE_BITS
+    first = int(x.min()), int(y[x == x.min()].min())
+    return VehicleObject(number, motion, reason, len(indices), centre, float(length_m), first)
 
 
 def groups(clusters: NDArray[np.int32]) -> list[NDArray[np.int64]]:

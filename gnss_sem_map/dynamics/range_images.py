@@ -300,7 +300,8 @@ def _is_hidden(centre, radius, T_lidar_map, around, drawn, farthest_m, margin_m,
     half = np.degrees(np.arcsin(radius / level))
     cell = (atan2_deg(z, level) - LOWEST_DEG) / CELL_DEG
     first, last = max(int(cell - half / CELL_DEG) - 1, 0), min(int(cell + half / CELL_DEG) + 2, CELLS)
-    rows = around[first:last].reshape(-1)  # those that are not 0 do not descend
+    # from cell to cell no row falls: the first is the lowest and the last the highest; 0 is none
+    rows = around[first:last].reshape(-1)
     first, last = 0, len(rows) - 1
     while first < last and rows[first] == 0:
         first += 1

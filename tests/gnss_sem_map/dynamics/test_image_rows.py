@@ -130,3 +130,14 @@ def test_points_that_are_too_far_apart_see_through_nothing(points, low, high):
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     cloud = 20.0 * directions[abs(directions[:, 2]) < np.sin(np.radians(22.5))][:points]
     assert low <= share_seen_through([cloud], Rows.of([cloud])) <= high
+
+
+def test_of_the_rows_around_some_cells_the_first_is_the_lowest_and_the_last_the_highest():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        around = Rows(rng.random(CELLS) < rng.random()).around
+        first = rng.integers(CELLS)
+        rows = around[first : first + 1 + rng.integers(30)].reshape(-1)
+        rows = rows[rows > 0]
+        if len(rows):
+            assert (rows[0], rows[-1]) == (rows.min(), rows.max())

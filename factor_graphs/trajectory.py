@@ -238,6 +238,10 @@ def _columns(path: Path) -> dict[str, Array]:
                 " trajectory"
             )
         table = table_file.read()
+        if gaps := [name for name in table.column_names if table[name].null_count]:
+            raise MeasurementError(
+                f"{path}: found gaps in the columns {gaps[:5]}; expected a saved trajectory"
+            )
         # `to_numpy` imports pandas, which takes 0.3 s
         return {
             name: np.array(np.from_dlpack(table[name].combine_chunks()), np.float64)

@@ -204,9 +204,10 @@ def count_hits_and_misses(
     limits = nearest_m, farthest_m, margin_m, margin_ratio
     cells, columns = np.empty(CLUSTER, np.int32), np.empty(CLUSTER, np.int32)
     lows, highs = np.empty(CLUSTER, np.uint16), np.empty(CLUSTER, np.uint16)
-    windows, is_hidden = np.empty((9, CLUSTER), np.uint16), np.empty(CLUSTER, np.bool_)
+    windows, is_before = np.empty((9, CLUSTER), np.uint16), np.empty(CLUSTER, np.bool_)
     for start in range(0, len(positions), CLUSTER):
-        here, hits_here = positions[start : start + CLUSTER], hits[start : start + CLUSTER]
+        of_cluster = slice(start, start + CLUSTER)
+        here, hits_here, misses_here = positions[of_cluster], hits[of_cluster], misses[of_cluster]
         centre, radius = _sphere_around(here)
         for k in chosen:
             T, drawn = T_lidar_map[k], images[k].reshape(-1)
@@ -214,10 +215,10 @@ def count_hits_and_misses(
                 continue
             _project(here, T, limits, cells, columns, lows, highs)
             _copy_windows(drawn, around, cells[: len(here)], columns, windows)
-            _test_visibility(windows, lows, highs, hits_here, is_hidden)
+            _test_visibility(windows, lows, highs, hits_here, is_before)
             for i in range(len(here)):
-                if not is_hidden[i]:
-                    misses[start + i] += _is_seen_through(windows[:, i])
+                if is_before[i]:
+                    misses_here[i] += _is_seen_through(windows[:, i])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -247,8 +248,8 @@ def _copy_windows(drawn, around, cells, columns, windows):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _test_visibility(windows, lows, highs, hits, is_hidden):
-    """Count which positions (n,) have a return at their range; those that have none are hidden behind any nearer one.
+def _test_visibility(windows, lows, highs, hits, is_before):
+    """Count which positions (n,) have a return at their range, and mark those that lie before all their returns.
 
     Without a branch, and over windows side by side, so that the compiler can use SIMD instructions.
     """
@@ -258,12 +259,12 @@ def _test_visibility(windows, lows, highs, hits, is_hidden):
             hit |= (lows[i] <= windows[k, i]) & (windows[k, i] <= highs[i])
             nearer |= windows[k, i] < lows[i]
         hits[i] += hit
-        is_hidden[i] = hit | nearer
+        is_before[i] = not (hit | nearer)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_seen_through(window):
-    """Whether beams passed a position beyond which all returns of its window (9,) lie."""
+    """Whether beams passed a position that lies before all returns of its window (9,)."""
     filled, rows = 0, 0
     for row in range(3):
         beams = 0

@@ -109,13 +109,13 @@ def _half_heights(eps_voxels: float) -> NDArray[np.int64]:
 @cache
 def _stencil(eps_voxels: float) -> NDArray[np.int64]:
     """Columns within the radius: (k, 2) packed offset, ascending, and half height in voxels."""
-    upper = _half_heights(eps_voxels)
-    reach = len(upper) - 1
+    half_heights = _half_heights(eps_voxels)
+    reach = len(half_heights) - 1
     rows = [
-        ((dx << _Y_BITS) + dy << _BLOCK_BITS, int(upper[abs(dx), dy + reach]))
+        ((dx << _Y_BITS) + dy << _BLOCK_BITS, int(half_heights[abs(dx), dy + reach]))
         for dx in range(-reach, reach + 1)
         for dy in range(-reach, reach + 1)
-        if upper[abs(dx), dy + reach] >= 0
+        if half_heights[abs(dx), dy + reach] >= 0
     ]
     return np.array(rows, np.int64)
 

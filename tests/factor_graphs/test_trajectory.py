@@ -111,6 +111,9 @@ def test_a_file_that_is_no_trajectory_is_refused(tmp_path):
     pq.write_table(pa.table({"stamp_s": [0.0]}), tmp_path / "other.parquet")
     with pytest.raises(MeasurementError, match="no column x, y"):
         Trajectory.load(tmp_path / "other.parquet")
+    pq.write_table(pa.table({"stamp_s": [0.0, 1.0], "x": [0.0, None]}), tmp_path / "gap.parquet")
+    with pytest.raises(MeasurementError, match=r"found gaps in the columns \['x'\]"):
+        Trajectory.load(tmp_path / "gap.parquet")
 
 
 def test_position_stddevs_are_along_the_axes_of_the_map():

@@ -52,6 +52,7 @@ LAT, LON, ALT, ROLL, PITCH, YAW = range(6)
 SPECIFIC_FORCE = slice(11, 14)
 """ax ay az: in the body frame; af al au are levelled with the unit's own attitude, which would influence the result."""
 ANGULAR_RATE = slice(17, 20)
+OF_IMU = np.r_[SPECIFIC_FORCE, ANGULAR_RATE]
 POSITION_ACCURACY = 23
 LEAST_ACCURACY_M = 1e-4
 """Standard deviations must be positive; too small ones are a matter of the pre-flight check."""
@@ -257,8 +258,7 @@ def _measured(
     drive: Path, stamps: NDArray[np.int64], rows: Array, skips: list[Skip]
 ) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Stamps and rows without those that fill gaps, and the skipped ones with them."""
-    said = np.hstack([rows[:, SPECIFIC_FORCE], rows[:, ANGULAR_RATE]])
-    filled = filled_in(_seconds(stamps, int(stamps[0])), said)
+    filled = filled_in(_seconds(stamps, int(stamps[0])), rows[:, OF_IMU])
     if count := int(np.count_nonzero(filled)):
         reason = f"{count} rows on straight lines that fill gaps"
         skips = [*skips, Skip("oxts", shown(drive / "oxts"), reason, count)]
@@ -268,17 +268,19 @@ def _measured(
 def _oxts_row(path: Path) -> tuple[str, Array]:
     """Error of a row of the navigation unit, if any, and its numbers; the accuracy may be missing."""
     try:
-        row = np.array(read_text(path, MOST_ROW_BYTES).split(), np.float64)
+        row = np.array([float(number) for number in read_text(path, MOST_ROW_BYTES).split()])
     except DataError as error:
         return str(error), np.empty(0)
     except ValueError:
         row = np.empty(0)
     if row.shape != (OXTS_COLUMNS,):
         return f"found {row.size} numbers, expected {OXTS_COLUMNS} finite ones", row
-    bad = np.setdiff1d(np.flatnonzero(~np.isfinite(row)), POSITION_ACCURACY)
-    if len(bad):
-        return f"number {bad[0] + 1} of {OXTS_COLUMNS} is {row[bad[0]]}, expected a finite one", row
-    if not (np.abs(row[[*range(11, 14), *range(17, 20)]]) <= LARGEST_OF_IMU).all():
+    is_finite = np.isfinite(row)
+    is_finite[POSITION_ACCURACY] = True
+    if not is_finite.all():
+        bad = int(is_finite.argmin())
+        return f"number {bad + 1} of {OXTS_COLUMNS} is {row[bad]}, expected a finite one", row
+    if np.abs(row[OF_IMU]).max() > LARGEST_OF_IMU:
         return "found a force or a rate beyond the range of any sensor", row
     return "", row
 

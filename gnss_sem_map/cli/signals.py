@@ -5,10 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 from types import FrameType
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:  # signals are taken before anything else is imported
-    from gnss_sem_map.errors import SemMapError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
@@ -62,8 +58,8 @@ def stop_on_signals() -> None:
             signal.signal(number, _stop)
 
 
-def caused_by_signal(error: SemMapError) -> Stopped | None:
-    """The signal that made a reader fail, if one arrived: compiled readers turn Stopped into an error of their own."""
+def caused_by_signal(error: Exception) -> Stopped | None:
+    """The signal that made a program fail, if one arrived: compiled code turns Stopped into an error of its own."""
     if not _arrived:
         return None
     stopped = Stopped(_arrived[0])

@@ -191,7 +191,7 @@ def compiled(**words):
         for _ in range(1_000_000):
             pass
     except BaseException:  # as compiled code does that knows no exceptions of Python
-        error = DataError("tensors: cannot be read")
+        error = ERROR("tensors: cannot be read")
         error.add_note("what was done is kept")
         raise error from None
 
@@ -201,8 +201,10 @@ main()
 """
 
 
-def test_an_error_that_a_signal_caused_is_that_signal() -> None:
-    program = [sys.executable, "-c", SWALLOWED]
+@pytest.mark.parametrize("error", ["DataError", "ValueError"])
+def test_an_error_that_a_signal_caused_is_that_signal(error: str) -> None:
+    """A reader refuses its file then; matplotlib says ValueError where it reads a matrix of Python."""
+    program = [sys.executable, "-c", SWALLOWED.replace("ERROR", error)]
     ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=60)
     assert ended.returncode == 128 + signal.SIGTERM
     assert ended.stderr == "gnss-sem-map: stopped by SIGTERM; what was done is kept\n"

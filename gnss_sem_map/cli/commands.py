@@ -146,7 +146,7 @@ def main() -> None:
 def _called() -> int | None:
     try:
         return cast("int | None", app(prog_name="gnss-sem-map", standalone_mode=False))
-    except Exception as error:
+    except SemMapError as error:
         if stopped := caused_by_signal(error):
             raise stopped from error
         raise

@@ -5,6 +5,10 @@ from __future__ import annotations
 import signal
 import sys
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # signals are taken before anything else is imported
+    from gnss_sem_map.errors import SemMapError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 TRY_AGAIN_S = 0.01
@@ -24,13 +28,14 @@ WHOLE = (
     "importlib._bootstrap",
     "_frozen_importlib",
     "llvmlite",
+    "matplotlib.backends.backend_agg",
     "tempfile",
     "gnss_sem_map.files.output_folder",
     "gnss_sem_map.files.work_folder",
     "gnss_sem_map.files.atomic",
 )
-"""Modules whose functions are finished with all that they call: an import, compiling or loading a function, and what
-makes, replaces or removes results. A block in which such a folder is claimed is not below them."""
+"""Modules whose functions are finished with all that they call: an import, compiling or loading a function, drawing a
+plot, and what makes, replaces or removes results. A block in which such a folder is claimed is not below them."""
 WAITING = ("wait", "_wait_for_tstate_lock")
 """Their functions that wait for other threads: they may be left while they do."""
 
@@ -58,8 +63,8 @@ def stop_on_signals() -> None:
             signal.signal(number, _stop)
 
 
-def caused_by_signal(error: Exception) -> Stopped | None:
-    """The signal that made a program fail, if one arrived: compiled code turns Stopped into an error of its own."""
+def caused_by_signal(error: SemMapError) -> Stopped | None:
+    """The signal that made a reader fail, if one arrived: compiled readers turn Stopped into an error of their own."""
     if not _arrived:
         return None
     stopped = Stopped(_arrived[0])
@@ -99,8 +104,9 @@ def _must_go_on(frame: FrameType | None) -> bool:
     """Whether a function that takes locks is on top, or one that must be finished is below.
 
     An import that is left may crash in compiled code, and some modules drop every exception of what they import. LLVM
-    calls Python to load a function, drops what is raised there, and the function is missing when it is called. A folder
-    that is claimed or given back is otherwise left with its lock, or half removed.
+    calls Python to load a function, drops what is raised there, and the function is missing when it is called.
+    matplotlib calls it to read a matrix, and says ValueError in place of what is raised there. A folder that is claimed
+    or given back is otherwise left with its lock, or half removed.
     """
     if frame is not None and _module_of(frame).startswith(LOCKING):
         return True

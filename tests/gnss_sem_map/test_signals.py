@@ -17,6 +17,7 @@ import ctypes, io, os, signal, threading, time, zipfile
 from functools import partial
 from operator import methodcaller
 from types import SimpleNamespace
+import numpy
 from gnss_sem_map.cli.signals import Stopped, stop_on_signals
 
 interrupt = partial(os.kill, os.getpid(), signal.SIGTERM)
@@ -43,6 +44,18 @@ def while_a_member_is_opened():
         with archive.open(Opened("array.npy"), "w") as member:
             member.write(b"numbers")
 
+def while_a_plot_is_drawn():
+    from matplotlib.backends.backend_agg import RendererAgg
+    from matplotlib.path import Path
+
+    class Matrix:
+        def __array__(self, *_, **__):
+            interrupt()
+            return numpy.eye(3)
+
+    renderer = RendererAgg(8, 8, 72)
+    renderer.draw_path(renderer.new_gc(), Path([[0.0, 0.0], [8.0, 8.0]]), Matrix())
+
 def while_it_waits():
     threading.Timer(0.2, interrupt).start()
     threading.Event().wait(20.0)
@@ -64,6 +77,7 @@ except Stopped as stopped:
         ("in_a_callback", "15"),
         ("while_a_lock_is_taken", "given back 15"),
         ("while_a_member_is_opened", "15"),
+        ("while_a_plot_is_drawn", "15"),
         ("while_it_waits", "15"),
     ],
 )
@@ -191,7 +205,7 @@ def compiled(**words):
         for _ in range(1_000_000):
             pass
     except BaseException:  # as compiled code does that knows no exceptions of Python
-        error = ERROR("tensors: cannot be read")
+        error = DataError("tensors: cannot be read")
         error.add_note("what was done is kept")
         raise error from None
 
@@ -201,10 +215,8 @@ main()
 """
 
 
-@pytest.mark.parametrize("error", ["DataError", "ValueError"])
-def test_an_error_that_a_signal_caused_is_that_signal(error: str) -> None:
-    """A reader refuses its file then; matplotlib says ValueError where it reads a matrix of Python."""
-    program = [sys.executable, "-c", SWALLOWED.replace("ERROR", error)]
+def test_an_error_that_a_signal_caused_is_that_signal() -> None:
+    program = [sys.executable, "-c", SWALLOWED]
     ended = subprocess.run(program, capture_output=True, text=True, check=False, timeout=60)
     assert ended.returncode == 128 + signal.SIGTERM
     assert ended.stderr == "gnss-sem-map: stopped by SIGTERM; what was done is kept\n"

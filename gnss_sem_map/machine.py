@@ -5,7 +5,12 @@ from __future__ import annotations
 import os
 import resource
 import sys
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import psutil
 
 THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
 """Environment variable: threads of one process. Several processes of one machine share its cores by it."""
@@ -40,9 +45,17 @@ def held_bytes(pid: int | None = None) -> int:
     import psutil
 
     try:
-        return int(psutil.Process(pid).memory_info().rss)
+        return int(_process(os.getpid() if pid is None else pid).memory_info().rss)
     except psutil.NoSuchProcess:
         return 0
+
+
+@lru_cache(64)
+def _process(pid: int) -> psutil.Process:
+    """A process, made once: memory is asked for after every scan, and a new one would read when it was started, too."""
+    import psutil
+
+    return psutil.Process(pid)
 
 
 def most_held_bytes() -> int:

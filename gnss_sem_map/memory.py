@@ -18,8 +18,8 @@ LARGE_BYTES, FREE_BYTES = 4 << 20, 64 << 20
 leave no holes: 30 MB less at the peak, at no cost in time. With 1 MB it costs 5 ms per scan. By default glibc raises
 that size to 32 MB."""
 GROWN_BYTES = 64 << 20
-"""Memory is released when the process holds so much more than after the last time. With the peak as the measure in its
-place, holes fill up to the peak, and then it rises from chunk to chunk though no more memory is in use."""
+"""Memory is released when the process holds so much more than the least since the last time. With the peak as the
+measure in its place, holes fill up to the peak, and then it rises from chunk to chunk though no more is in use."""
 NEW_OBJECTS = 20_000
 """So many more objects than before let Python look for reference cycles; its own default is 700."""
 
@@ -77,18 +77,21 @@ def collect_seldom() -> None:
     atexit.register(gc.freeze)
 
 
-_held_before = 0
-"""Bytes that were held after memory was last released."""
+_least_held = 0
+"""The fewest bytes that were held since memory was last released."""
 
 
 def release_memory(always: bool = False) -> None:
     """Return freed memory to the system: glibc keeps what many small objects, such as those of a graph, have used.
 
-    Unless `always`, only where the process holds much more than after the last time: what is returned and used again
-    takes 1.5 us per page.
+    Unless `always`, only where the process holds much more than the least since the last time: what is returned and
+    used again takes 1.5 us per page.
     """
-    global _held_before
+    global _least_held
     with suppress(OSError, AttributeError):
-        if always or held_bytes() > _held_before + GROWN_BYTES:
+        held = held_bytes()
+        if always or held > _least_held + GROWN_BYTES:
             ctypes.CDLL(None).malloc_trim(0)
-            _held_before = held_bytes()
+            _least_held = held_bytes()
+        else:
+            _least_held = min(_least_held, held)

@@ -41,10 +41,6 @@ WINDOWS = 2
 """Windows of scans in a chunk: with more, fewer scans are processed twice at its ends, and more memory is needed. With
 one, tracks are cut so often that 97.0 % of the moving points of the demo are removed, not 98.6 %."""
 
-RELEASED_EVERY = 10
-"""Scans after which freed memory goes back to the system: what lasts lies among what scans have used, and ten scans
-leave 70 MB of holes."""
-
 
 @dataclass(frozen=True, eq=False)
 class MappedChunk:
@@ -130,8 +126,7 @@ def _map_chunks(
                     edge_windows.save(chunk.observations, work, first + number)
             done += 1
             progress("mapping", done, total)
-            if done % RELEASED_EVERY == 0:
-                release_memory()
+            release_memory()  # what lasts lies among what scans have used, and ten scans leave 70 MB of holes
         chunk.put_table_aside()
         undecided = chunk
     if undecided is not None:

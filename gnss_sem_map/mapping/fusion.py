@@ -20,6 +20,7 @@ from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, shifted, silent
 from gnss_sem_map.sensor_log import Skip
 
@@ -90,7 +91,8 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
     try:
         for chunk in map_chunks(drive, numbers, waiting, store.folder, progress):
             store.write(chunk)
-            del chunk  # the next one needs its memory
+            del chunk
+            release_memory(always=True)  # the next one needs what it has used
     finally:
         shutil.rmtree(waiting, ignore_errors=True)
 

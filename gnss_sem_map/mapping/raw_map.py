@@ -19,6 +19,7 @@ from gnss_sem_map.mapping.checkpoints import KEYFRAMES, MOVING_POINTS, REMOVED, 
 from gnss_sem_map.mapping.evidence import RunEvidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import attributes, tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
 from gnss_sem_map.voxels.map_json import files_of, tile_of
@@ -51,6 +52,7 @@ class RawMap:
         moved = self.evidence.moved
 
         def read(tile: Tile) -> VoxelMap:
+            release_memory()  # a tile and those around it are read in a row
             everything = self.fused.read_voxels(tile)
             try:
                 return everything - moved.around(tile, 0)
@@ -72,12 +74,17 @@ def open_raw(run: Path, label_set: LabelSet) -> RawMap:
 def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:
     """Write `map/`, `attributes/` and `evidence/` of a run folder of chunks of a drive; raises DataError, OSError."""
 
-    def fused() -> Iterator[tuple[Tile, SemanticMap]]:
+    def one_by_one() -> Iterator[Tile]:
         for tile in store.tiles():
+            release_memory()  # of the tiles before: 100 MB in pieces
+            yield tile
+
+    def fused() -> Iterator[tuple[Tile, SemanticMap]]:
+        for tile in one_by_one():
             yield tile, SemanticMap.of(store.tile(STATIC, tile) + store.tile(REMOVED, tile))
 
     def moved() -> Iterator[tuple[Tile, SemanticMap]]:
-        for tile in store.tiles():
+        for tile in one_by_one():
             removed = store.tile(REMOVED, tile)
             if len(removed):
                 yield tile, SemanticMap.of(removed)
@@ -86,7 +93,7 @@ def write_raw(store: ChunkStore, run: Path, frame: LocalFrame | None) -> None:
     (run / evidence.FOLDER).mkdir()
     moved_to = run / evidence.FOLDER / evidence.MOVED
     tiles.write_tiles(moved(), moved_to, frame, store.voxel_size_m, store.label_set)
-    attributes.write(((tile, store.attributes(tile)) for tile in store.tiles()), run / ATTRIBUTES)
+    attributes.write(((tile, store.attributes(tile)) for tile in one_by_one()), run / ATTRIBUTES)
     evidence.write(store.contents(MOVING_POINTS), store.contents(KEYFRAMES), run)
 
 
@@ -136,6 +143,7 @@ def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[st
     """Save the sums of tiles, each with the digest of what it is made from: a task."""
     opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), voxels_held=0))
     for x, y, of_tile in of_tiles:
+        release_memory()
         parts = [opened(folder).read_voxels((x, y)) for folder in of_tile["folders"]]
         about = {"made_from": of_tile["made_from"]}
         save((x, y), SemanticMap.of(reduce(add, parts)), about, None, Path(made_in))

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gnss_sem_map.memory import release_memory
 from gnss_sem_map.refinement import (
     count_grid,
     geometric_prior,
@@ -100,6 +101,7 @@ def refine_tile(
     del around  # 50 MB: the steps see less and less of it
     own = _inside(state.voxels, tile)
     for i, step in enumerate(STEPS):
+        release_memory()  # of the steps before
         needed = _reach_from(i, settings, size)
         if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
             state, halo = _cut(state, tile, needed), needed

@@ -247,8 +247,7 @@ def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | None) -
     if after.scores is before.scores and after.decided is before.decided and after.removed is before.removed:
         return {}
     names = [*after.voxels.label_set.names, "removed", "unlabelled"]  # -1, unlabelled, is the last
-    removed = np.int8(len(names) - 2)
-    source, target = (np.where(one.is_removed, removed, one.labels) for one in (before, after))
+    source, target = before.told, after.told
     if len(source) < len(target):
         assert after.decided is not None
         known = after.decided.voxels.labels.copy()

@@ -143,7 +143,7 @@ def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[st
     """Save the sums of tiles, each with the digest of what it is made from: a task."""
     opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), voxels_held=0))
     for x, y, of_tile in of_tiles:
-        release_memory()
+        release_memory()  # of the tiles before
         parts = [opened(folder).read_voxels((x, y)) for folder in of_tile["folders"]]
         about = {"made_from": of_tile["made_from"]}
         save((x, y), SemanticMap.of(reduce(add, parts)), about, None, Path(made_in))

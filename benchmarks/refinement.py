@@ -31,7 +31,7 @@ import numpy as np
 import tracklets
 from chunks import build_maps
 from numpy.typing import NDArray
-from refinement_kernels import clocked, count_grid_beside_bincount, dbscan_beside_sklearn, tile_by_tile
+from refinement_kernels import block_by_block, clocked, count_grid_beside_bincount, dbscan_beside_sklearn
 from results_file import keep
 
 from gnss_sem_map.config import Settings
@@ -42,7 +42,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.pipeline import estimate_trajectory
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.run_stats import RunStats
@@ -91,7 +91,7 @@ def main() -> None:
     if unknown := set(parts) - set(PARTS):
         parser.error(f"found parts {sorted(unknown)}, expected some of {PARTS}")
     if options.run is not None:
-        report(f"tiles, {options.run.name}", tile_by_tile(options.run))
+        report(f"blocks, {options.run.name}", block_by_block(options.run))
     if "kernels" in parts:
         report("dbscan", dbscan_beside_sklearn(options.large))
         report("count_grid", count_grid_beside_bincount(options.large))

@@ -14,10 +14,11 @@ from gnss_sem_map import config
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.raw_map import open_raw
-from gnss_sem_map.refinement import by_tile
+from gnss_sem_map.refinement import by_block
 from gnss_sem_map.refinement.count_grid import count_grid
 from gnss_sem_map.refinement.figures import Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence
+from gnss_sem_map.voxels.blocks import blocks_of
 from gnss_sem_map.voxels.dbscan import dbscan
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
 from gnss_sem_map.voxels.voxel_map import pack
@@ -43,7 +44,7 @@ def clocked(work: Callable[[], Any]) -> tuple[float, float]:
     return time.process_time() - start[0], time.perf_counter() - start[1]
 
 
-def tile_by_tile(run: Path) -> Figures:
+def block_by_block(run: Path) -> Figures:
     """CPU time of the refinement per voxel of the map, halo included."""
     settings = config.load(run / "config.yaml")
     label_set = open_label_set(settings.classes)
@@ -54,19 +55,20 @@ def tile_by_tile(run: Path) -> Figures:
         sensor_model.opened(settings.calibration, label_set),
         raw.evidence.keyframes_near(voxels.centres, steps.free_space.farthest_m),
     )
-    halo = by_tile.halo_m(steps, voxels.voxel_size_m)
-    tiles = {tile: raw.around(tile, halo) for tile in raw.fused.tiles}
-    of_sums, sums = cpu(lambda: [by_tile.sums_of(*part, beside, steps) for part in tiles.items()], REPEATS)
+    halo = by_block.halo_m(steps, voxels.voxel_size_m)
+    blocks = {block: raw.around(block, halo) for block in blocks_of(by_block.tiles_of(voxels))}
+    of_sums, sums = cpu(lambda: [by_block.sums_of(*part, beside, steps) for part in blocks.items()], REPEATS)
     figures = figures_of(sum(sums, Sums()))
-    of_tiles, _ = cpu(
-        lambda: [by_tile.refine_tile(*part, beside, steps, figures) for part in tiles.items()], REPEATS
+    of_blocks, _ = cpu(
+        lambda: [by_block.refine_block(*part, beside, steps, figures) for part in blocks.items()], REPEATS
     )
     return {
         "voxels": len(voxels),
-        "tiles": len(tiles),
+        "tiles": len(raw.fused.tiles),
+        "blocks": len(blocks),
         "halo_m": halo,
         "sums_us_per_voxel": 1e6 * of_sums / len(voxels),
-        "tiles_us_per_voxel": 1e6 * of_tiles / len(voxels),
+        "blocks_us_per_voxel": 1e6 * of_blocks / len(voxels),
     }
 
 

@@ -101,7 +101,7 @@ def _inside(points: Array, box: Figures, centre: Array, margin_m: float) -> NDAr
 
 def _seen_through(stands: RawMap, gone: RawMap, box: Figures, centre: Array) -> int:
     """How many voxels of an object one session has, and the other one looks through; 0 where that is not most of it."""
-    centres = np.concatenate([stands.around(tile, 0.0).centres for tile in stands.fused.tiles])
+    centres = np.concatenate([stands.around((tile,), 0.0).centres for tile in stands.fused.tiles])
     places = centres[_inside(centres, box, centre, SEEN_M)]
     places = places[places[:, 2] > centre[2] - box["height_m"] / 2 + SETTINGS.over_ground_m]
     if len(places) < SETTINGS.least_voxels:

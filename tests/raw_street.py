@@ -12,6 +12,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import Settings
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
@@ -20,6 +21,8 @@ VOXELS = street()
 MOVED = VOXELS[np.flatnonzero(VOXELS.centres[:, 0] > 350.0)[::9]]
 """Of the fourth tile and those after it."""
 EVERY = [(x, 0) for x in range(7)]
+BLOCKS: list[Block] = [((0, 0),), ((1, 0), (2, 0)), ((3, 0), (4, 0)), ((5, 0), (6, 0))]
+"""The tiles that are refined together."""
 SETTINGS = Settings()
 
 

@@ -110,10 +110,10 @@ def _changed(
     here: RawMap, there: RawMap, tile: tuple[int, int], settings: ChangeSettings
 ) -> Iterator[tuple[VoxelMap, NDArray[np.int32]]]:
     """The voxels of a tile that changed, and how often the other session hit and missed them (2, v)."""
-    voxels = here.around(tile, 0.0)
+    voxels = here.around((tile,), 0.0)
     some = np.flatnonzero(_over_ground(voxels, settings))
     margin_m = here.fused.voxel_size_m
-    some = some[~_is_beside(voxels.keys[some], there.around(tile, margin_m).keys)]
+    some = some[~_is_beside(voxels.keys[some], there.around((tile,), margin_m).keys)]
     counts = _counted(voxels.centres[some], there, settings)
     free = (counts[1] >= settings.least_misses) & (counts[1] > settings.misses_per_hit * counts[0])
     some, counts = some[free], counts[:, free]

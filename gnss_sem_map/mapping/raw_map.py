@@ -22,6 +22,7 @@ from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import attributes, tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES
+from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest, of_map, of_work, save
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -40,9 +41,9 @@ class RawMap:
     """All points."""
     evidence: RunEvidence
 
-    def around(self, tile: Tile, margin_m: float) -> VoxelMap:
-        """The voxels of a tile and of a margin around it, without the points that moved; raises DataError."""
-        found = replace(self.fused, read_voxels=self._static).around(tile, margin_m)
+    def around(self, block: Block, margin_m: float) -> VoxelMap:
+        """The voxels of a block and of a margin around it, without the points that moved; raises DataError."""
+        found = replace(self.fused, read_voxels=self._static).around(block, margin_m)
         self._static.leave_room(len(found))
         return found
 
@@ -55,7 +56,7 @@ class RawMap:
             release_memory()  # a tile and those around it are read in a row
             everything = self.fused.read_voxels(tile)
             try:
-                return everything - moved.around(tile, 0)
+                return everything - moved.around((tile,), 0)
             except DataError:
                 raise DataError("map/ and evidence/ are not of one run; make the run again") from None
 
@@ -129,8 +130,8 @@ def write_sum(
         voxels = {tile: sum(about["voxels"] for about in parts[tile].values()) for tile in parts}
         with folder_of_tiles(work, run, place.name) as made_in:
             made = of_map(earlier and earlier / place, made_from) | of_work(made_in, made_from)
-            new = {
-                tile: {"made_from": made_from[tile], "folders": list(parts[tile])}
+            new: dict[Block, dict[str, Any]] = {
+                (tile,): {"made_from": made_from[tile], "folders": list(parts[tile])}
                 for tile in parts
                 if tile not in made
             }
@@ -139,10 +140,12 @@ def write_sum(
             tiles.write_tiles(sorted(made.items()), run / place, frame, maps[0].voxel_size_m, label_set)
 
 
-def sum_tiles(classes: str, made_in: str, of_tiles: list[tuple[int, int, dict[str, Any]]]) -> list[None]:
+def sum_tiles(
+    classes: str, made_in: str, of_tiles: list[tuple[list[list[int]], dict[str, Any]]]
+) -> list[None]:
     """Save the sums of tiles, each with the digest of what it is made from: a task."""
     opened = cache(lambda folder: tiles.open_map(Path(folder), open_label_set(classes), voxels_held=0))
-    for x, y, of_tile in of_tiles:
+    for ((x, y),), of_tile in of_tiles:
         release_memory()  # of the tiles before
         parts = [opened(folder).read_voxels((x, y)) for folder in of_tile["folders"]]
         about = {"made_from": of_tile["made_from"]}

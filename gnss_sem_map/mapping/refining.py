@@ -1,8 +1,9 @@
-"""Refinement of a map on disk, tile by tile: figures of the whole map first, then every tile with its halo.
+"""Refinement of a map on disk, block by block: figures of the whole map first, then every block with its halo.
 
-Both are tasks: they read the raw map, and save what they find in a folder, tile by tile. What a tile is refined from
-has a digest. A tile that was refined from the same is taken over, from an earlier map or from an interrupted call: so a
-drive that is added to a large map touches the tiles around it only.
+Both are tasks: they read the raw map, and save what they find in a folder, tile by tile. What a block is refined from
+has a digest. A block that was refined from the same is taken over, from an earlier map or from an interrupted call: so
+a drive that is added to a large map touches the blocks around it only. The first tile of a block says what was found of
+the block.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import io
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache, partial, reduce
+from functools import cached_property, lru_cache, partial, reduce
 from operator import add
 from pathlib import Path
 from typing import Any
@@ -29,16 +30,17 @@ from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
-from gnss_sem_map.mapping.tile_tasks import folder_of_tiles, make_tiles, on_tiles
+from gnss_sem_map.mapping.tile_tasks import block_of, folder_of_tiles, make_tiles, on_blocks
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.refinement import crumbs, free_space, kerb_points
-from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, sums_halo_m, sums_of
+from gnss_sem_map.refinement.by_block import halo_m, refine_block, sums_halo_m, sums_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels.blocks import Block, blocks_of, bounds_of, tiles_around
 from gnss_sem_map.voxels.map_json import files_of, name_of
 from gnss_sem_map.voxels.reuse import Made, digest, of_map, of_work, read_record, save, write_record
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
@@ -67,10 +69,10 @@ def refine_map(
     executor: Executor | None = None,
     work: Path | None = None,
 ) -> Refined:
-    """Write `refined/` of a run folder from its raw map; one tile and its halo are in memory at a time.
+    """Write `refined/` of a run folder from its raw map; one block and its halo are in memory at a time.
 
-    Tiles are tasks of `executor`, by default in this process. Of an `earlier` run, which may be the same before a
-    change, tiles that were refined from the same are taken, and so are those that an interrupted call left in the
+    Blocks are tasks of `executor`, by default in this process. Of an `earlier` run, which may be the same before a
+    change, blocks that were refined from the same are taken, and so are those that an interrupted call left in the
     folder `work`. Raises DataError.
     """
     try:
@@ -102,17 +104,22 @@ class _Refinement:
         sums = self._sums(around)
         figures = figures_of(reduce(add, sums.values()))
         made_from = self._made_from(around, figures)
-        said = {tile: {"around": around[tile], "sums": sums[tile].to_json()} for tile in sums}
+        said = {block: {"around": around[block], "sums": sums[block].to_json()} for block in sums}
         made = self._made(made_from, said)
-        new = {tile: {"made_from": made_from[tile], "said": said[tile]} for tile in sums if tile not in made}
+        new = {
+            block: {"made_from": made_from[block], "said": said[block]}
+            for block in self.blocks
+            if block[0] not in made
+        }
         made |= make_tiles(
-            REFINE_TILES, (*self._shared, asdict(figures)), new, self._voxels, self.executor, self.made_in,
+            REFINE_BLOCKS, (*self._shared, asdict(figures)), new, self._voxels, self.executor, self.made_in,
             partial(self.progress, "refinement"),
         )  # fmt: skip
         pieces = [(tile, made[tile]) for tile in fused.tiles]
         tiles.write_tiles(pieces, self.run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set)
-        reports = [RefinementReport.from_json(made[tile].about["said"]["report"]) for tile in sums]
-        kerbs = [_kerbs(made[tile].beside) for tile in sums if made[tile].beside is not None]
+        of_blocks = [made[block[0]] for block in self.blocks]
+        reports = [RefinementReport.from_json(one.about["said"]["report"]) for one in of_blocks]
+        kerbs = [_kerbs(one.beside) for one in of_blocks if one.beside is not None]
         return Refined(RefinementReport.joined(reports), kerb_points.joined(kerbs) if kerbs else None)
 
     @property
@@ -120,17 +127,18 @@ class _Refinement:
         """What all tasks are told."""
         return str(self.run), self.settings.model_dump_json(), self.call, str(self.made_in)
 
-    @property
-    def _tiles(self) -> list[Tile]:
-        return list(self.raw.fused.tiles) or [(0, 0)]
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Those of the map; of an empty one, a block without voxels."""
+        return blocks_of(self._voxels) or [((0, 0),)]
 
-    @property
+    @cached_property
     def _voxels(self) -> dict[Tile, int]:
         files = files_of(self.run / MAP)
         return {tile: files[name_of(tile)]["voxels"] for tile in self.raw.fused.tiles}
 
-    def _digests(self) -> dict[Tile, str]:
-        """Digest of the settings, and of the raw map in and around each tile."""
+    def _digests(self) -> dict[Block, str]:
+        """Digest of the settings, and of the raw map in and around each block."""
         moved = self.run / evidence.FOLDER / evidence.MOVED
         files = files_of(self.run / MAP), files_of(moved)
         sums = [{name: about["sha256"] for name, about in of_layer.items()} for of_layer in files]
@@ -141,60 +149,68 @@ class _Refinement:
         model = opened_sensor_model(self.settings)
         of_all = [said, None if model is None else repr(model.to_yaml())]
         tiles_in_halo = math.ceil(halo / (voxel_size_m * (1 << TILE_BITS)))
-        reach = range(-tiles_in_halo, tiles_in_halo + 1)
         found = {}
-        for x, y in self._tiles:
-            near = [name_of((x + i, y + j)) for i in reach for j in reach]
-            found[x, y] = digest([*of_all, [[of_layer.get(name) for name in near] for of_layer in sums]])
+        for block in self.blocks:
+            near = [name_of(tile) for tile in tiles_around(block, tiles_in_halo)]
+            found[block] = digest(
+                [*of_all, block, [[of_layer.get(name) for name in near] for of_layer in sums]]
+            )
         return found
 
-    def _sums(self, around: Mapping[Tile, str]) -> dict[Tile, Sums]:
-        """What every tile adds to the figures of the map."""
+    def _sums(self, around: Mapping[Block, str]) -> dict[Block, Sums]:
+        """What every block adds to the figures of the map."""
         earlier = files_of(None if self.earlier is None else self.earlier / REFINED)
         known = {}
-        for tile in self._tiles:
-            in_map = earlier.get(name_of(tile), {}).get("said")
-            for said in (in_map, read_record(_sums_file(tile, self.made_in))):
+        for block in self.blocks:
+            in_map = earlier.get(name_of(block[0]), {}).get("said")
+            for said in (in_map, read_record(_sums_file(block, self.made_in))):
                 try:
-                    if isinstance(said, dict) and said["around"] == around[tile]:
-                        known[tile] = Sums.from_json(said["sums"])
+                    if isinstance(said, dict) and said["around"] == around[block]:
+                        known[block] = Sums.from_json(said["sums"])
                 except (KeyError, TypeError, ValueError):
                     continue  # there is none that can be read
-        new = {tile: around[tile] for tile in self._tiles if tile not in known}
-        found = on_tiles(
-            MEASURE_TILES, self._shared, new, self._voxels, self.executor, partial(self.progress, "figures")
+        new = {block: around[block] for block in self.blocks if block not in known}
+        found = on_blocks(
+            MEASURE_BLOCKS, self._shared, new, self._voxels, self.executor, partial(self.progress, "figures")
         )
-        for tile, sums in found:
-            known[tile] = Sums.from_json(sums)
-        return {tile: known[tile] for tile in self._tiles}
+        for block, sums in found:
+            known[block] = Sums.from_json(sums)
+        return {block: known[block] for block in self.blocks}
 
-    def _made_from(self, around: Mapping[Tile, str], figures: Figures) -> dict[Tile, str]:
-        """Digest of all that decides each tile."""
+    def _made_from(self, around: Mapping[Block, str], figures: Figures) -> dict[Block, str]:
+        """Digest of all that decides each block."""
         poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
         at = origins_of(poses)[:, :2]
         edge = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
         steps = self.settings.refinement
         reach = steps.free_space.farthest_m + _moved_reach_m(steps, self.raw.fused.voxel_size_m)
         found = {}
-        for tile in self._tiles:
-            low = np.array(tile) * edge
-            near = poses[((at > low - reach) & (at < low + edge + reach)).all(axis=1)]
+        for block in self.blocks:
+            first, last = bounds_of(block)
+            low, high = np.array(first) * edge, (np.array(last) + 1) * edge
+            near = poses[((at > low - reach) & (at < high + reach)).all(axis=1)]
             # to 1 um: poses that were saved as quaternions come back with other last bits; + 0.0 makes -0.0 a 0.0
             keyframes = hashlib.sha256((near.round(6) + 0.0).tobytes()).hexdigest()
-            found[tile] = digest([around[tile], asdict(figures), keyframes])
+            found[block] = digest([around[block], asdict(figures), keyframes])
         return found
 
-    def _made(self, made_from: Mapping[Tile, str], said: Mapping[Tile, Any]) -> dict[Tile, Made]:
-        """The tiles that stay; one without a report that can be read is refined again."""
-        earlier = of_map(None if self.earlier is None else self.earlier / REFINED, made_from)
-        found = {}
-        for tile, made in (earlier | of_work(self.made_in, made_from)).items():
+    def _made(self, made_from: Mapping[Block, str], said: Mapping[Block, Any]) -> dict[Tile, Made]:
+        """The tiles of blocks that stay; one that is not whole, or without a report to be read, is refined again."""
+        of_tiles = {tile: made_from[block] for block in self.blocks for tile in block}
+        earlier = of_map(None if self.earlier is None else self.earlier / REFINED, of_tiles)
+        there = earlier | of_work(self.made_in, of_tiles)
+        found: dict[Tile, Made] = {}
+        for block in self.blocks:
+            if not all(tile in there for tile in block):
+                continue
+            of_block = {tile: there[tile] for tile in block}
+            first = of_block[block[0]]
             try:
-                report = RefinementReport.from_json(made.about["said"]["report"])
+                report = RefinementReport.from_json(first.about["said"]["report"])
             except (KeyError, TypeError, ValueError):
                 continue
-            about = made.about | {"said": said[tile] | {"report": report.to_json()}}
-            found[tile] = replace(made, about=about)
+            about = first.about | {"said": said[block] | {"report": report.to_json()}}
+            found |= of_block | {block[0]: replace(first, about=about)}
         return found
 
 
@@ -208,11 +224,11 @@ class _Inputs:
         self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
 
-    def beside(self, tile: Tile, around: VoxelMap) -> Evidence:
-        """What is known beside the voxels `around` a tile, those of its halo and maybe more."""
+    def beside(self, block: Block, around: VoxelMap) -> Evidence:
+        """What is known beside the voxels `around` a block, those of its halo and maybe more."""
         margin = _moved_reach_m(self.steps, around.voxel_size_m)
-        moved, keyframes = self.raw.evidence.moved.around(tile, margin), None
-        indices = np.concatenate([around.indices[places_around(around, tile, margin)], moved.indices])
+        moved, keyframes = self.raw.evidence.moved.around(block, margin), None
+        indices = np.concatenate([around.indices[places_around(around, block, margin)], moved.indices])
         if len(indices) and self.steps.free_space.enabled:
             box = (np.stack(limits_of(indices)) + 0.5) * moved.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
@@ -224,48 +240,50 @@ def _inputs(run: str, settings: str, call: str) -> _Inputs:
     return _Inputs(run, settings)
 
 
-def measure_tiles(
-    run: str, settings: str, call: str, made_in: str, of_tiles: list[tuple[int, int, str]]
+OfBlocks = list[tuple[list[list[int]], Any]]
+"""Blocks with what a task is told of each, JSON."""
+
+
+def measure_blocks(
+    run: str, settings: str, call: str, made_in: str, of_blocks: OfBlocks
 ) -> list[dict[str, int]]:
-    """Sums of tiles, saved with the digest of what is around each: a task."""
+    """Sums of blocks, saved with the digest of what is around each: a task."""
     inputs = _inputs(run, settings, call)
-    return [_measure((x, y), inputs, around, Path(made_in)) for x, y, around in of_tiles]
+    return [_measure(block_of(block), inputs, around, Path(made_in)) for block, around in of_blocks]
 
 
-def _measure(tile: Tile, inputs: _Inputs, around: str, made_in: Path) -> dict[str, int]:
-    around_tile = inputs.raw.around(tile, inputs.sums_halo)
-    beside = Evidence(inputs.raw.evidence.moved.around(tile, 0), inputs.model)
-    sums = sums_of(tile, around_tile, beside, inputs.steps).to_json()
-    write_record({"around": around, "sums": sums}, _sums_file(tile, made_in))
+def _measure(block: Block, inputs: _Inputs, around: str, made_in: Path) -> dict[str, int]:
+    around_block = inputs.raw.around(block, inputs.sums_halo)
+    beside = Evidence(inputs.raw.evidence.moved.around(block, 0), inputs.model)
+    sums = sums_of(block, around_block, beside, inputs.steps).to_json()
+    write_record({"around": around, "sums": sums}, _sums_file(block, made_in))
     return sums
 
 
-def refine_tiles(
-    run: str,
-    settings: str,
-    call: str,
-    made_in: str,
-    figures: dict[str, Any],
-    of_tiles: list[tuple[int, int, Any]],
+def refine_blocks(
+    run: str, settings: str, call: str, made_in: str, figures: dict[str, Any], of_blocks: OfBlocks
 ) -> list[None]:
-    """Refine tiles, and save each with what `map.json` is to say of it and its report: a task."""
+    """Refine blocks, and save their tiles with what `map.json` is to say of them and their report: a task."""
     inputs = _inputs(run, settings, call)
-    for x, y, about in of_tiles:
-        _refine((x, y), inputs, Figures(**figures), about, Path(made_in))
-        release_memory()  # a large tile leaves 300 MB in pieces
-    return [None] * len(of_tiles)
+    for block, about in of_blocks:
+        _refine(block_of(block), inputs, Figures(**figures), about, Path(made_in))
+        release_memory()  # a large block leaves 300 MB in pieces
+    return [None] * len(of_blocks)
 
 
-def _refine(tile: Tile, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
-    around = [inputs.raw.around(tile, inputs.halo)]
-    beside = inputs.beside(tile, around[0])
+def _refine(block: Block, inputs: _Inputs, figures: Figures, about: dict[str, Any], made_in: Path) -> None:
+    around = [inputs.raw.around(block, inputs.halo)]
+    beside = inputs.beside(block, around[0])
     release_memory()  # 110 MB of tiles that were read and cut
-    state, report = refine_tile(tile, around.pop(), beside, inputs.steps, figures)
+    state, report = refine_block(block, around.pop(), beside, inputs.steps, figures)
     about["said"]["report"] = report.to_json()
     assert state.decided is not None
     # heights are in the raw map: here they would take a sixth of the bytes
-    voxels_only = replace(state.decided.voxels, heights=None)
-    save(tile, replace(state.decided, voxels=voxels_only), about, _packed(state.kerbs), made_in)
+    decided = replace(state.decided, voxels=replace(state.decided.voxels, heights=None))
+    kerbs, of_block = _packed(state.kerbs), about.pop("said")
+    for tile in block:
+        of_tile = (about | {"said": of_block}, kerbs) if tile == block[0] else (about, None)
+        save(tile, decided[places_around(decided.voxels, (tile,), 0)], *of_tile, made_in)
 
 
 def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:
@@ -273,11 +291,11 @@ def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:
     return free_space.reach_m(steps.free_space, voxel_size_m) + crumbs.reach_m(steps.crumbs, voxel_size_m)
 
 
-MEASURE_TILES, REFINE_TILES = path_of(measure_tiles), path_of(refine_tiles)
+MEASURE_BLOCKS, REFINE_BLOCKS = path_of(measure_blocks), path_of(refine_blocks)
 
 
-def _sums_file(tile: Tile, made_in: Path) -> Path:
-    return made_in / f"{tile[0]}_{tile[1]}.sums.json"
+def _sums_file(block: Block, made_in: Path) -> Path:
+    return (made_in / name_of(block[0])).with_suffix(".sums.json")
 
 
 def _packed(kerbs: Kerbs | None) -> dict[str, Any] | None:

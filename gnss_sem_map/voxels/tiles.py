@@ -23,6 +23,7 @@ from gnss_sem_map.files.untrusted import is_file, shown
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import tile_files
+from gnss_sem_map.voxels.blocks import Block, bounds_of, tiles_around
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
 from gnss_sem_map.voxels.map_json import MAP_JSON, describe, name_of, read_description, read_frame, tile_of
 from gnss_sem_map.voxels.reuse import Made
@@ -102,14 +103,13 @@ class TiledMap:
     def __iter__(self) -> Iterator[SemanticMap]:
         return map(self.read_tile, self.tiles)
 
-    def around(self, tile: Tile, margin_m: float) -> VoxelMap:
-        """The voxels of a tile and those within a margin around it; empty where the map has none."""
-        tiles = math.ceil(margin_m / (self.voxel_size_m * (1 << TILE_BITS)))
-        reach, parts = range(-tiles, tiles + 1), []
-        for near in ((tile[0] + i, tile[1] + j) for i in reach for j in reach):
-            if near in self._known:
-                part = self.read_voxels(near)
-                parts.append(part if near == tile else part[places_around(part, tile, margin_m)])
+    def around(self, block: Block, margin_m: float) -> VoxelMap:
+        """The voxels of a block and those within a margin around it; empty where the map has none."""
+        tiles, parts = math.ceil(margin_m / (self.voxel_size_m * (1 << TILE_BITS))), []
+        for tile in tiles_around(block, tiles):
+            if tile in self._known:
+                part = self.read_voxels(tile)
+                parts.append(part if tile in block else part[places_around(part, block, margin_m)])
         return parts[0] if len(parts) == 1 else joined_voxels(parts, self.voxel_size_m, self.label_set)
 
     @cached_property
@@ -272,11 +272,11 @@ def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSe
     )
 
 
-def places_around(voxels: VoxelMap, tile: Tile, margin_m: float) -> NDArray[np.int64]:
-    """The places of the voxels of a tile and of a margin around it."""
-    margin, edge = math.ceil(margin_m / voxels.voxel_size_m), 1 << TILE_BITS
-    low_x, low_y = (AXIS_OFFSET + axis * edge - margin for axis in tile)
-    high_x, high_y = low_x + edge + 2 * margin, low_y + edge + 2 * margin
+def places_around(voxels: VoxelMap, block: Block, margin_m: float) -> NDArray[np.int64]:
+    """The places of the voxels of the rectangle that holds a block, and of a margin around it."""
+    margin, (first, last) = math.ceil(margin_m / voxels.voxel_size_m), bounds_of(block)
+    low_x, low_y = (AXIS_OFFSET + (axis << TILE_BITS) - margin for axis in first)
+    high_x, high_y = (AXIS_OFFSET + (axis + 1 << TILE_BITS) + margin for axis in last)
     start, end = np.searchsorted(voxels.keys, [low_x << 2 * AXIS_BITS, high_x << 2 * AXIS_BITS])
     y = voxels.keys[start:end] >> AXIS_BITS & AXIS_MASK
     return np.asarray(np.flatnonzero((y >= low_y) & (y < high_y)) + start, np.int64)

@@ -195,7 +195,7 @@ def test_a_run_folder_holds_what_the_chunks_say(
     )
     assert_same(raw.fused.whole().voxels, static + removed)
     assert_same(raw.evidence.moved.whole().voxels, removed)
-    assert_same(sum_of([raw.around(tile, 0.0) for tile in raw.fused.tiles]), static)
+    assert_same(sum_of([raw.around((tile,), 0.0) for tile in raw.fused.tiles]), static)
     for chunk, path in zip(together, raw.evidence.moving_points, strict=True):
         for number, indices in read_moving_points(path).items():
             np.testing.assert_array_equal(indices, chunk.moving[number])

@@ -18,7 +18,7 @@ from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.merging import align, into_frame, merge, merge_runs
 from gnss_sem_map.mapping.raw_map import MAP, open_raw
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.crumbs import CrumbSettings
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings

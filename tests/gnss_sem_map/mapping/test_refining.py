@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raw_street import EVERY, FRAME, MOVED, SETTINGS, VOXELS, content, write_raw
+from raw_street import BLOCKS, EVERY, FRAME, MOVED, SETTINGS, VOXELS, content, write_raw
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import Settings
@@ -20,6 +20,7 @@ from gnss_sem_map.mapping import refining
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.voxels import reuse, tiles
+from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap
@@ -38,20 +39,20 @@ def seen_again(voxels: VoxelMap, tile: Tile) -> VoxelMap:
 
 
 @pytest.fixture
-def refine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Refined, list[Tile]]]:
-    """Refine a run folder; also says which tiles were refined for it, in order."""
+def refine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Refined, list[Block]]]:
+    """Refine a run folder; also says which blocks were refined for it, in order."""
 
     def refined(
         run: Path, earlier: Path | None = None, settings: Settings = SETTINGS
-    ) -> tuple[Refined, list[Tile]]:
-        called, original = [], refining.refine_tile
+    ) -> tuple[Refined, list[Block]]:
+        called, original = [], refining.refine_block
 
-        def watched(tile: Tile, *rest: Any) -> Any:
-            called.append(tile)
-            return original(tile, *rest)
+        def watched(block: Block, *rest: Any) -> Any:
+            called.append(block)
+            return original(block, *rest)
 
         with monkeypatch.context() as patch:
-            patch.setattr(refining, "refine_tile", watched)
+            patch.setattr(refining, "refine_block", watched)
             found = refine_map(open_raw(run, open_label_set()), run, settings, earlier=earlier)
         return found, sorted(called)
 
@@ -73,32 +74,36 @@ def linked(run: Path, earlier: Path, layer: str = "refined") -> list[Tile]:
 
 
 def assert_as_from_scratch(
-    run: Path, found: Refined, scratch: Path, refine: Callable[..., tuple[Refined, list[Tile]]]
+    run: Path, found: Refined, scratch: Path, refine: Callable[..., tuple[Refined, list[Block]]]
 ) -> None:
     """`scratch` holds the same raw map."""
     whole, called = refine(scratch)
-    assert called == EVERY
+    assert called == BLOCKS
     assert content(run / "refined") == content(scratch / "refined")
     assert found.report.to_json() == whole.report.to_json()
 
 
-@pytest.mark.parametrize(("changed", "near"), [((0, 0), EVERY[:2]), ((5, 0), EVERY[4:])])
-def test_only_tiles_within_the_halo_of_a_change_are_refined_again(
-    changed: Tile, near: list[Tile], before: Path, tmp_path: Path, refine: Any
+def tiles_in(blocks: list[Block]) -> list[Tile]:
+    return [tile for block in blocks for tile in block]
+
+
+@pytest.mark.parametrize(("changed", "near"), [((0, 0), BLOCKS[:2]), ((6, 0), BLOCKS[3:])])
+def test_only_blocks_within_the_halo_of_a_change_are_refined_again(
+    changed: Tile, near: list[Block], before: Path, tmp_path: Path, refine: Any
 ) -> None:
     voxels = seen_again(VOXELS, changed)
     found, called = refine(write_raw(tmp_path / "run", voxels), before)
     assert called == near
-    assert linked(tmp_path / "run", before) == [tile for tile in EVERY if tile not in near]
+    assert linked(tmp_path / "run", before) == [tile for tile in EVERY if tile not in tiles_in(near)]
     assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch", voxels), refine)
 
 
-def test_only_tiles_near_a_new_keyframe_scan_are_refined_again(
+def test_only_blocks_near_a_new_keyframe_scan_are_refined_again(
     before: Path, tmp_path: Path, refine: Any
 ) -> None:
     found, called = refine(write_raw(tmp_path / "run", scans=True), before)
-    assert called == EVERY[2:5]
-    assert linked(tmp_path / "run", before) == [*EVERY[:2], *EVERY[5:]]
+    assert called == BLOCKS[1:3]
+    assert linked(tmp_path / "run", before) == [*EVERY[:1], *EVERY[5:]]
     assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch", scans=True), refine)
 
 
@@ -111,9 +116,9 @@ def test_a_map_that_stays_is_not_refined_again(before: Path, tmp_path: Path, ref
     assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch"), refine)
 
 
-def test_other_settings_refine_every_tile_again(before: Path, tmp_path: Path, refine: Any) -> None:
+def test_other_settings_refine_every_block_again(before: Path, tmp_path: Path, refine: Any) -> None:
     _, called = refine(write_raw(tmp_path / "run"), before, WITHOUT_FREE_SPACE)
-    assert called == EVERY
+    assert called == BLOCKS
     assert linked(tmp_path / "run", before) == []
 
 
@@ -130,18 +135,21 @@ def test_tiles_of_another_version_are_made_again(
 ) -> None:
     monkeypatch.setattr(reuse, "VERSION", "0.0.1")
     _, called = refine(write_raw(tmp_path / "run"), before)
-    assert called == EVERY
+    assert called == BLOCKS
     assert linked(tmp_path / "run", before) == []
 
 
-def test_a_damaged_tile_is_made_again(before: Path, tmp_path: Path, refine: Any) -> None:
+@pytest.mark.parametrize("damaged", BLOCKS[2])
+def test_a_block_with_a_damaged_tile_is_made_again(
+    damaged: Tile, before: Path, tmp_path: Path, refine: Any
+) -> None:
     earlier = copied(before, tmp_path / "earlier")
-    tile = earlier / "refined" / name_of((3, 0))
+    tile = earlier / "refined" / name_of(damaged)
     content_of_tile = bytearray(tile.read_bytes())
     content_of_tile[1000] ^= 1
     tile.write_bytes(content_of_tile)
     _, called = refine(write_raw(tmp_path / "run"), earlier)
-    assert called == [(3, 0)]
+    assert called == [BLOCKS[2]]
     assert content(tmp_path / "run/refined") == content(before / "refined")
 
 
@@ -171,14 +179,14 @@ def without(said: dict[str, Any], name: str) -> dict[str, Any]:
 def test_what_an_earlier_map_says_is_made_anew_where_it_cannot_be_read(
     damage: Callable[[dict[str, Any]], Any], again: bool, before: Path, tmp_path: Path, refine: Any
 ) -> None:
-    """Without a report the tile is refined again; without sums these are added up again."""
+    """Without a report the block is refined again; without sums these are added up again."""
     earlier, damaged = copied(before, tmp_path / "earlier"), (3, 0)
     about = json.loads((earlier / "refined/map.json").read_text())
     of_tile = about["files"][name_of(damaged)]
     of_tile["said"] = damage(of_tile["said"])
     (earlier / "refined/map.json").write_text(json.dumps(about))
     _, called = refine(write_raw(tmp_path / "run"), earlier)
-    assert called == ([damaged] if again else [])
+    assert called == ([BLOCKS[2]] if again else [])
     assert content(tmp_path / "run/refined") == content(before / "refined")
 
 
@@ -189,7 +197,7 @@ def test_an_earlier_map_that_cannot_be_read_is_as_none(
     (tmp_path / "earlier/refined").mkdir(parents=True)
     (tmp_path / "earlier/refined/map.json").write_text(text)
     _, called = refine(write_raw(tmp_path / "run"), tmp_path / "earlier")
-    assert called == EVERY
+    assert called == BLOCKS
     assert content(tmp_path / "run/refined") == content(before / "refined")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raw_street import EVERY, FRAME, SETTINGS, VOXELS, content, write_raw
+from raw_street import BLOCKS, FRAME, SETTINGS, VOXELS, content, write_raw
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
@@ -22,8 +22,9 @@ from gnss_sem_map.mapping import refining, tile_tasks
 from gnss_sem_map.mapping.execution import InProcess, Task
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
-from gnss_sem_map.mapping.tile_tasks import on_tiles
+from gnss_sem_map.mapping.tile_tasks import on_blocks
 from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.tile_files import Tile
 
 integration = pytest.mark.integration
@@ -79,18 +80,18 @@ def test_processes_sum_drives_to_the_same_bytes(tmp_path: Path, small_tasks: Non
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Tile]]:
-    """What was computed in this process, for which tile."""
-    made: list[tuple[str, Tile]] = []
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Block]]:
+    """What was computed in this process, for which block."""
+    made: list[tuple[str, Block]] = []
 
     def watch(name: str, original: Callable[..., object]) -> Callable[..., object]:
-        def watched(tile: Tile, *rest: object) -> object:
-            made.append((name, tile))
-            return original(tile, *rest)
+        def watched(block: Block, *rest: object) -> object:
+            made.append((name, block))
+            return original(block, *rest)
 
         return watched
 
-    for name in ("sums_of", "refine_tile"):
+    for name in ("sums_of", "refine_block"):
         monkeypatch.setattr(refining, name, watch(name, getattr(refining, name)))
     return made
 
@@ -98,7 +99,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Tile]]:
 def test_what_an_interrupted_refinement_made_is_taken_over(
     before: tuple[Path, Refined],
     tmp_path: Path,
-    calls: list[tuple[str, Tile]],
+    calls: list[tuple[str, Block]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     run, work = write_raw(tmp_path / "run", scans=True), tmp_path / "work"
@@ -116,20 +117,19 @@ def test_what_an_interrupted_refinement_made_is_taken_over(
     calls.clear()
     tile = work / TILES / "refined/1_0.parquet"
     tile.write_bytes(tile.read_bytes()[:-1])
-    (work / TILES / "refined/2_0.json").write_text('{"about": {"made_from"')
     found = refined(run, work=work)
-    assert calls == [("refine_tile", (x, 0)) for x in (1, 2, 4, 5, 6)]
+    assert calls == [("refine_block", block) for block in BLOCKS[1:]]
     assert_same(run, found, before)
 
 
-def test_other_settings_take_nothing_over(tmp_path: Path, calls: list[tuple[str, Tile]]) -> None:
+def test_other_settings_take_nothing_over(tmp_path: Path, calls: list[tuple[str, Block]]) -> None:
     run, work = write_raw(tmp_path / "run"), tmp_path / "work"
     others = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
     refine_map(open_raw(run, open_label_set()), run, others, work=work)
     calls.clear()
     (run / "refined").rename(run / "earlier")
     refined(run, work=work)
-    assert [name for name, _ in calls] == ["sums_of"] * 7 + ["refine_tile"] * 7
+    assert [name for name, _ in calls] == ["sums_of"] * len(BLOCKS) + ["refine_block"] * len(BLOCKS)
 
 
 REFINE = """
@@ -148,8 +148,8 @@ if __name__ == "__main__":
 
 
 @integration
-def test_after_a_kill_finished_tiles_are_not_refined_again(
-    before: tuple[Path, Refined], tmp_path: Path, calls: list[tuple[str, Tile]]
+def test_after_a_kill_finished_blocks_are_not_refined_again(
+    before: tuple[Path, Refined], tmp_path: Path, calls: list[tuple[str, Block]]
 ) -> None:
     run, work = write_raw(tmp_path / "run", scans=True), tmp_path / "work"
     tests = str(Path(__file__).parents[2])
@@ -160,21 +160,22 @@ def test_after_a_kill_finished_tiles_are_not_refined_again(
         time.sleep(0.001)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    there = sorted(int(path.name[0]) for path in done.glob("[0-9]_0.json"))
+    there = {(int(path.name[0]), 0) for path in done.glob("[0-9]_0.json")}
     found = refined(run, work=work)
-    assert calls == [("refine_tile", tile) for tile in EVERY if tile[0] not in there]
+    assert calls == [("refine_block", block) for block in BLOCKS if not there.issuperset(block)]
     assert_same(run, found, before)
 
 
 def test_tasks_hold_neighbours_and_so_many_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tile_tasks, "VOXELS_PER_TASK", 40)
     square = {(x, y): 10 for x in range(-4, 4) for y in range(-4, 4)}
-    groups = tile_tasks._groups(list(square), square)
+    groups = tile_tasks._groups([(tile,) for tile in square], square)
     assert [len(group) for group in groups] == [4] * 16
     for group in groups:
-        assert np.ptp(group, axis=0).tolist() == [1, 1]
-    large = {(0, 0): 100, (0, 1): 10, (0, 2): 10}
-    assert tile_tasks._groups(list(large), large) == [[(0, 0)], [(0, 1), (0, 2)]]
+        assert np.ptp([tile for (tile,) in group], axis=0).tolist() == [1, 1]
+    large = {(0, 0): 100, (0, 1): 10, (0, 2): 10, (1, 2): 20}
+    blocks = [((0, 0),), ((0, 1),), ((0, 2), (1, 2))]
+    assert tile_tasks._groups(blocks, large) == [blocks[:1], blocks[1:]]
 
 
 def test_one_task_is_done_in_this_process() -> None:
@@ -182,7 +183,7 @@ def test_one_task_is_done_in_this_process() -> None:
         def run(self, tasks: Sequence[Task]) -> Iterator[tuple[Task, Any]]:
             raise AssertionError
 
-    assert list(on_tiles("gnss_sem_map.x:y", (), {}, {}, Unused())) == []
+    assert list(on_blocks("gnss_sem_map.x:y", (), {}, {}, Unused())) == []
 
 
 def test_tiles_that_a_worker_saved_elsewhere_are_an_error(tmp_path: Path, small_tasks: None) -> None:

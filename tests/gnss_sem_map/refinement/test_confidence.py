@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels.semantic_map import State, entropy_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack

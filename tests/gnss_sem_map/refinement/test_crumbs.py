@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from surfaces import with_heights
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.by_tile import refine, run_steps
+from gnss_sem_map.refinement.by_block import refine, run_steps
 from gnss_sem_map.refinement.columns import points_between
 from gnss_sem_map.refinement.crumbs import CrumbSettings, apply
 from gnss_sem_map.refinement.state import Evidence, MapState

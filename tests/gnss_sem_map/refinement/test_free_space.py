@@ -11,7 +11,7 @@ from gnss_sem_map.dynamics import range_images, visibility
 from gnss_sem_map.dynamics.visibility import POINTS_PER_BLOCK, KeyframeScans, KeyframeSelector, RangeImage
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement import free_space
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings, traversed
 from gnss_sem_map.refinement.state import Evidence
 from gnss_sem_map.refinement.steps import RefinementSettings

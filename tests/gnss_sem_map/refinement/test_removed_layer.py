@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.figures import LEAST_ERROR_RATE, STEP
 from gnss_sem_map.refinement.removed_layer import probabilities_of
 from gnss_sem_map.refinement.state import Evidence

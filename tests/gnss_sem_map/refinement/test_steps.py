@@ -10,7 +10,7 @@ import pytest
 from long_street import SIZE_M, keyframes, street
 
 from gnss_sem_map import refinement
-from gnss_sem_map.refinement.by_tile import refine
+from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import STEPS, RefinementSettings, Step
 
@@ -52,7 +52,7 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
         assert 100 < whole.is_removed[place].sum() < 0.5 * place.sum()
     for field in ("scores", "labels", "is_removed", "inferred"):
         expected, found = getattr(whole, field)[place], getattr(part, field)[place[near]]
-        if step.name == "levels":  # of what other planes are fitted to beyond the reach, see `by_tile`
+        if step.name == "levels":  # of what other planes are fitted to beyond the reach, see `by_block`
             assert (np.asarray(expected) == np.asarray(found)).mean() > 0.999
         else:
             np.testing.assert_array_equal(expected, found)

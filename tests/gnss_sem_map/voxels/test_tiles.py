@@ -149,7 +149,7 @@ def test_around_a_tile_are_its_voxels_and_those_of_a_margin_on_disk_and_in_memor
             low = np.array(tile) * 512 - margin
             xy = written.voxels.indices[:, :2]
             inside = ((xy >= low) & (xy < low + 512 + 2 * margin)).all(axis=1)
-            around = opened.around(tile, margin_m)
+            around = opened.around((tile,), margin_m)
             for name in ("keys", "evidence", "hits"):
                 expected = getattr(written.voxels, name)[inside]
                 np.testing.assert_array_equal(getattr(around, name), expected)
@@ -170,7 +170,7 @@ def test_a_small_map_is_read_once_however_many_tiles_ask_for_their_surroundings(
     monkeypatch.setattr(tile_files, "read_voxels", counted)
     opened = tiles.open_map(tmp_path / "map", URBAN, voxels_held=held)
     for tile in opened.tiles:
-        opened.around(tile, 1.0)
+        opened.around((tile,), 1.0)
     assert len(names) == len(opened.tiles)
     assert max(names.values()) == reads
 

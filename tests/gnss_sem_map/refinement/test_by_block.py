@@ -1,4 +1,4 @@
-"""A map is refined tile by tile: nobody needs the whole map, and nobody can tell the order."""
+"""A map is refined block by block: nobody needs the whole map, and nobody can tell the order."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from long_street import SIZE_M, URBAN, keyframes, street
 
-from gnss_sem_map.refinement.by_tile import halo_m, refine_tile, run_steps, sums_of, tiles_of
+from gnss_sem_map.refinement.by_block import halo_m, refine_block, run_steps, sums_of, tiles_of
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
+from gnss_sem_map.voxels.blocks import Block, blocks_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 VOXELS = street()
@@ -44,36 +45,37 @@ def assert_same(found: MapState, expected: MapState) -> None:
             np.testing.assert_array_equal(getattr(found.kerbs, name), getattr(expected.kerbs, name), name)
 
 
-def near(voxels: VoxelMap, tile: tuple[int, int], margin_m: float) -> VoxelMap:
-    """The voxels of a tile and of a margin, by their centres."""
-    low, high = np.array(tile) * 102.4 - margin_m, (np.array(tile) + 1) * 102.4 + margin_m
+def near(voxels: VoxelMap, block: Block, margin_m: float) -> VoxelMap:
+    """The voxels of a block and of a margin, by their centres."""
+    low, high = np.min(block, axis=0) * 102.4 - margin_m, (np.max(block, axis=0) + 1) * 102.4 + margin_m
     xy = voxels.centres[:, :2]
     return voxels[((xy > low) & (xy < high)).all(axis=1)]
 
 
+@pytest.mark.parametrize("block", [((3, 0),), ((3, 0), (4, 0))], ids=["tile", "block"])
 @pytest.mark.parametrize("settings", [ALL, PAPER], ids=["evidence", "paper"])
-def test_a_tile_needs_no_more_of_the_map_than_its_halo(settings: RefinementSettings) -> None:
-    tile, margin = (3, 0), halo_m(settings, SIZE_M)
+def test_a_block_needs_no_more_of_the_map_than_its_halo(settings: RefinementSettings, block: Block) -> None:
+    margin = halo_m(settings, SIZE_M)
     assert margin < 30
-    part = near(VOXELS, tile, margin)
-    assert len(part) < len(VOXELS) / 3
-    beside = replace(BESIDE, moved=near(MOVED, tile, 0))
-    sums = sums_of(tile, VOXELS, BESIDE, settings)
-    assert sums == sums_of(tile, part, beside, settings)
+    part = near(VOXELS, block, margin)
+    assert len(part) < len(VOXELS) * (len(block) + 1) / 6
+    beside = replace(BESIDE, moved=near(MOVED, block, 0))
+    sums = sums_of(block, VOXELS, BESIDE, settings)
+    assert sums == sums_of(block, part, beside, settings)
     assert sums.roads > 0
     assert sums.moved > sums.moved_otherwise > 0
-    whole, report = refine_tile(tile, VOXELS, BESIDE, settings, figures_of(sums))
-    cut, of_cut = refine_tile(tile, part, beside, settings, figures_of(sums))
+    whole, report = refine_block(block, VOXELS, BESIDE, settings, figures_of(sums))
+    cut, of_cut = refine_block(block, part, beside, settings, figures_of(sums))
     assert_same(cut, whole)
     assert report.steps == of_cut.steps
-    assert len(cut.voxels) == len(near(VOXELS, tile, 0))
+    assert len(cut.voxels) == len(near(VOXELS, block, 0))
 
 
-def test_the_map_is_the_sum_of_its_tiles_in_any_order() -> None:
-    tiles = tiles_of(VOXELS, MOVED)
-    assert len(tiles) == 7
-    sums = reduce(add, (sums_of(tile, VOXELS, BESIDE, ALL) for tile in reversed(tiles)))
-    parts = [refine_tile(tile, VOXELS, BESIDE, ALL, figures_of(sums)) for tile in reversed(tiles)]
+def test_the_map_is_the_sum_of_its_blocks_in_any_order() -> None:
+    blocks = blocks_of(tiles_of(VOXELS, MOVED))
+    assert [len(block) for block in blocks] == [1, 2, 2, 2]
+    sums = reduce(add, (sums_of(block, VOXELS, BESIDE, ALL) for block in reversed(blocks)))
+    parts = [refine_block(block, VOXELS, BESIDE, ALL, figures_of(sums)) for block in reversed(blocks)]
     state, report = run_steps(VOXELS, ALL, BESIDE)
     of_parts = RefinementReport.joined([report for _, report in parts])
     assert of_parts.steps == report.steps
@@ -81,18 +83,30 @@ def test_the_map_is_the_sum_of_its_tiles_in_any_order() -> None:
     assert [thing.voxels for thing in of_parts.objects] == [thing.voxels for thing in report.objects]
     assert [thing.number for thing in report.objects] == list(range(len(report.objects)))
     assert state.decided is not None
-    for tile, (part, _) in zip(reversed(tiles), parts, strict=True):
+    for block, (part, _) in zip(reversed(blocks), parts, strict=True):
         assert part.decided is not None
         places = state.decided.voxels.indices_of(part.decided.voxels.keys)
         assert (places >= 0).all()
         for name in OF_MAP:
             np.testing.assert_array_equal(getattr(part.decided, name), getattr(state.decided, name)[places])
-        assert len(part.decided) == len(near(state.decided.voxels, tile, 0))
+        assert len(part.decided) == len(near(state.decided.voxels, block, 0))
     changed = {step.name: step.changed for step in report.steps}
     assert changed["removed_layer"] == len(MOVED) - (VOXELS.indices_of(MOVED.keys) >= 0).sum()
 
 
-def test_nobody_sees_where_tiles_meet() -> None:
+def test_tiles_are_decided_alike_alone_and_in_a_block() -> None:
+    block = ((3, 0), (4, 0))
+    figures = figures_of(sums_of(block, VOXELS, BESIDE, ALL))
+    together, of_block = refine_block(block, VOXELS, BESIDE, ALL, figures)
+    alone = [refine_block((tile,), VOXELS, BESIDE, ALL, figures) for tile in block]
+    assert together.decided is not None
+    for name in ("labels", "states", "removed_hits"):
+        of_tiles = [getattr(one.decided, name) for one, _ in alone]
+        np.testing.assert_array_equal(np.concatenate(of_tiles), getattr(together.decided, name), name)
+    assert RefinementReport.joined([report for _, report in alone]).steps == of_block.steps
+
+
+def test_nobody_sees_where_blocks_meet() -> None:
     """The same street half a tile farther on: seams lie elsewhere, and cells of a metre lie the same."""
     moved_on = pack(VOXELS.indices + np.array([250, 0, 0]))
     here = run_steps(VOXELS, ALL)[0]

@@ -1,10 +1,10 @@
-"""Refinement tile by tile: a tile is refined from its voxels, those in a halo around it, and figures of the whole map.
+"""Refinement block by block: a tile, or four, from their voxels, those in a halo around, and figures of the whole map.
 
-A map is refined in two passes. The first adds up `sums_of` every tile, in any order; `figures_of` the sums are what a
-tile must know of the whole map. The second refines every tile for itself. All maps are refined so, those in memory
-too: what comes out depends neither on the order of the tiles nor on who refines which.
+A map is refined in two passes. The first adds up `sums_of` every block, in any order; `figures_of` the sums are what a
+block must know of the whole map. The second refines every block for itself. All maps are refined so, those in memory
+too: what comes out depends neither on the order of the blocks nor on who refines which.
 
-Before a step, the tile is cut down to what this step and the later ones reach. So the steps see the same in a map of
+Before a step, the block is cut down to what this step and the later ones reach. So the steps see the same in a map of
 any size, and the work in the halo shrinks from step to step.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -30,18 +31,18 @@ from gnss_sem_map.refinement import (
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence, MapState, NotApplicable
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings, do
-from gnss_sem_map.voxels.kernels import AXIS_BITS
+from gnss_sem_map.voxels.blocks import Block, blocks_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap
-from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
-from gnss_sem_map.voxels.tiles import joined, joined_voxels, places_around
-from gnss_sem_map.voxels.voxel_map import VoxelMap, unpack
+from gnss_sem_map.voxels.tile_files import Tile
+from gnss_sem_map.voxels.tiles import indices_by_tile, joined, joined_voxels, places_around
+from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 WORTH_CUTTING_M = 2.0
 """The halo is cut down by no less than this at a time: cutting is work, too."""
 
 
 def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
-    """How far around a tile voxels are read to refine it, m: for its height over ground, and for all steps."""
+    """How far around a block voxels are read to refine it, m: for its height over ground, and for all steps."""
     return max(
         height_above_ground.REACH_M + _reach_from(0, settings, voxel_size_m),
         sums_halo_m(settings, voxel_size_m),
@@ -49,22 +50,22 @@ def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
 
 
 def sums_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
-    """How far around a tile voxels are read for its sums, m."""
+    """How far around a block voxels are read for its sums, m."""
     return height_above_ground.REACH_M + _sums_reach_m(settings, voxel_size_m)
 
 
-def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
-    """What a tile adds to the figures of the map, from the voxels of the tile and its halo, and what moved there."""
+def sums_of(block: Block, around: VoxelMap, beside: Evidence, settings: RefinementSettings) -> Sums:
+    """What a block adds to the figures of the map, from its voxels and those of its halo, and what moved there."""
     size = around.voxel_size_m
-    around = around[places_around(around, tile, sums_halo_m(settings, size))]
+    around = around[places_around(around, block, sums_halo_m(settings, size))]
     heights = height_above_ground.height_over_ground(around.centres)
-    near = places_around(around, tile, _sums_reach_m(settings, size))
+    near = places_around(around, block, _sums_reach_m(settings, size))
     state = MapState.of(around[near], beside, heights=heights[near])
     state, _ = do(STEPS[0], state, settings)
     images = state.scores
     state, _ = do(STEPS[1], state, settings)
-    own, sums = _inside(state.voxels, tile), Sums()
-    moved = None if beside.moved is None else beside.moved[places_around(beside.moved, tile, 0)]
+    own, sums = _inside(state.voxels, block), Sums()
+    moved = None if beside.moved is None else beside.moved[places_around(beside.moved, block, 0)]
     measured = (
         (
             settings.systematic_error,
@@ -82,35 +83,35 @@ def sums_of(tile: Tile, around: VoxelMap, beside: Evidence, settings: Refinement
     return sums
 
 
-def refine_tile(
-    tile: Tile, around: VoxelMap, beside: Evidence, settings: RefinementSettings, figures: Figures
+def refine_block(
+    block: Block, around: VoxelMap, beside: Evidence, settings: RefinementSettings, figures: Figures
 ) -> tuple[MapState, RefinementReport]:
-    """Refine a tile, from the static voxels of the tile and of its halo: the last state of the tile alone, decided.
+    """Refine a block, from its static voxels and those of its halo: the last state of the block alone, decided.
 
-    Of what is `around` and `beside` the tile there may be more than its halo. The report counts changes and objects of
-    the tile alone; reports of tiles add up.
+    Of what is `around` and `beside` the block there may be more than its halo. The report counts changes and objects of
+    the block alone; reports of blocks add up.
     """
     size, reports = around.voxel_size_m, []
     halo = _reach_from(0, settings, size)
     if beside.moved is not None:
-        beside = replace(beside, moved=beside.moved[places_around(beside.moved, tile, halo)])
-    around = around[places_around(around, tile, halo_m(settings, size))]
-    heights, near = height_above_ground.height_over_ground(around.centres), places_around(around, tile, halo)
+        beside = replace(beside, moved=beside.moved[places_around(beside.moved, block, halo)])
+    around = around[places_around(around, block, halo_m(settings, size))]
+    heights, near = height_above_ground.height_over_ground(around.centres), places_around(around, block, halo)
     around, heights = around[near], heights[near]
     state = MapState.of(around, beside, figures, heights)
     del around  # 50 MB: the steps see less and less of it
-    own = _inside(state.voxels, tile)
+    own = _inside(state.voxels, block)
     for i, step in enumerate(STEPS):
         release_memory()  # of the steps before
         needed = _reach_from(i, settings, size)
         if halo - needed >= WORTH_CUTTING_M or needed == 0 < halo:
-            state, halo = _cut(state, tile, needed), needed
-            own = _inside(state.voxels, tile)
+            state, halo = _cut(state, block, needed), needed
+            own = _inside(state.voxels, block)
         state, report = do(step, state, settings, own if halo else None)
         reports.append(report)
     assert state.decided is not None
-    # of a long object every tile sees another part, with another centre; but those that meet see the same first tile
-    state = replace(state, vehicles=tuple(thing for thing in state.vehicles if thing.tile == tile))
+    # of a long object every block sees another part, with another centre; but those that meet see the same first tile
+    state = replace(state, vehicles=tuple(thing for thing in state.vehicles if thing.tile in block))
     return state, RefinementReport(tuple(reports), state.vehicles, systematic_errors=state.systematic_error)
 
 
@@ -126,30 +127,20 @@ def refine(
 def run_steps(
     voxels: VoxelMap, settings: RefinementSettings | None = None, beside: Evidence | None = None
 ) -> tuple[MapState, RefinementReport]:
-    """Refine a map in memory, tile by tile: the last state, decided, and what each step changed."""
+    """Refine a map in memory, block by block: the last state, decided, and what each step changed."""
     settings, beside = settings or RefinementSettings(), beside or Evidence()
-    tiles = tiles_of(voxels, *([] if beside.moved is None else [beside.moved])) or [(0, 0)]
-    sums = sum((sums_of(tile, voxels, beside, settings) for tile in tiles), Sums())
+    blocks = blocks_of(tiles_of(voxels, *([] if beside.moved is None else [beside.moved]))) or [((0, 0),)]
+    sums = sum((sums_of(block, voxels, beside, settings) for block in blocks), Sums())
     figures = figures_of(sums)
-    parts = [refine_tile(tile, voxels, beside, settings, figures) for tile in tiles]
+    parts = [refine_block(block, voxels, beside, settings, figures) for block in blocks]
     report = RefinementReport.joined([report for _, report in parts])
     return replace(_joined([state for state, _ in parts]), vehicles=report.objects), report
 
 
-def tiles_of(*maps: VoxelMap) -> list[Tile]:
-    """The tiles in which one of the maps has a voxel, in order."""
-    columns = np.unique(
-        np.concatenate([unpack(_first_of_tiles(voxels.keys))[:, :2] for voxels in maps]), axis=0
-    )
-    return [(x, y) for x, y in np.unique(columns >> TILE_BITS, axis=0).tolist()]
-
-
-def _first_of_tiles(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of the sorted packed voxels those whose tile is not that of the one before."""
-    x, y = keys >> (2 * AXIS_BITS + TILE_BITS), keys >> (AXIS_BITS + TILE_BITS)
-    changes = np.ones(len(keys), np.bool_)
-    changes[1:] = (np.diff(x) != 0) | (np.diff(y) != 0)
-    return keys[changes]
+def tiles_of(*maps: VoxelMap) -> dict[Tile, int]:
+    """How many voxels the maps have together in each tile that has one."""
+    keys = reduce(np.union1d, (voxels.keys for voxels in maps))
+    return {tile: len(places) for tile, places in indices_by_tile(keys)}
 
 
 def _sums_reach_m(settings: RefinementSettings, voxel_size_m: float) -> float:
@@ -166,24 +157,24 @@ def _reach_from(first: int, settings: RefinementSettings, voxel_size_m: float) -
     return sum((reach(section, voxel_size_m) for section, reach in reaches if section.enabled), 0.0)
 
 
-def _inside(voxels: VoxelMap, tile: Tile) -> NDArray[np.bool_]:
-    """Which voxels (v,) lie in a tile."""
+def _inside(voxels: VoxelMap, block: Block) -> NDArray[np.bool_]:
+    """Which voxels (v,) lie in a block."""
     inside = np.zeros(len(voxels), np.bool_)
-    inside[places_around(voxels, tile, 0)] = True
+    inside[places_around(voxels, block, 0)] = True
     return inside
 
 
-def _cut(state: MapState, tile: Tile, margin_m: float) -> MapState:
-    """The state of a tile and a margin around it, and what moved there."""
+def _cut(state: MapState, block: Block, margin_m: float) -> MapState:
+    """The state of a block and a margin around it, and what moved there."""
     if (moved := state.beside.moved) is not None:
-        moved = moved[places_around(moved, tile, margin_m)]
+        moved = moved[places_around(moved, block, margin_m)]
     return replace(
-        state[places_around(state.voxels, tile, margin_m)], beside=replace(state.beside, moved=moved)
+        state[places_around(state.voxels, block, margin_m)], beside=replace(state.beside, moved=moved)
     )
 
 
 def _joined(parts: Sequence[MapState]) -> MapState:
-    """The state of a map, of those of its tiles."""
+    """The state of a map, of those of its blocks."""
     if len(parts) == 1:
         return parts[0]
     keys = np.concatenate([part.voxels.keys for part in parts])

@@ -56,7 +56,7 @@ def block_by_block(run: Path) -> Figures:
         raw.evidence.keyframes_near(voxels.centres, steps.free_space.farthest_m),
     )
     halo = by_block.halo_m(steps, voxels.voxel_size_m)
-    blocks = {block: raw.around(block, halo) for block in blocks_of(by_block.tiles_of(voxels))}
+    blocks = {block: raw.around(block, halo) for block in blocks_of(by_block.voxels_by_tile(voxels))}
     of_sums, sums = cpu(lambda: [by_block.sums_of(*part, beside, steps) for part in blocks.items()], REPEATS)
     figures = figures_of(sum(sums, Sums()))
     of_blocks, _ = cpu(

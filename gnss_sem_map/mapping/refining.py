@@ -276,14 +276,14 @@ def _refine(block: Block, inputs: _Inputs, figures: Figures, about: dict[str, An
     beside = inputs.beside(block, around[0])
     release_memory()  # 110 MB of tiles that were read and cut
     state, report = refine_block(block, around.pop(), beside, inputs.steps, figures)
-    about["said"]["report"] = report.to_json()
     assert state.decided is not None
     # heights are in the raw map: here they would take a sixth of the bytes
     decided = replace(state.decided, voxels=replace(state.decided.voxels, heights=None))
-    kerbs, of_block = _packed(state.kerbs), about.pop("said")
+    said, made_from = about["said"] | {"report": report.to_json()}, {"made_from": about["made_from"]}
     for tile in block:
-        of_tile = (about | {"said": of_block}, kerbs) if tile == block[0] else (about, None)
-        save(tile, decided[places_around(decided.voxels, (tile,), 0)], *of_tile, made_in)
+        piece, is_first = decided[places_around(decided.voxels, (tile,), 0)], tile == block[0]
+        of_block = (made_from | {"said": said}, _packed(state.kerbs)) if is_first else (made_from, None)
+        save(tile, piece, *of_block, made_in)
 
 
 def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:

@@ -129,7 +129,9 @@ def run_steps(
 ) -> tuple[MapState, RefinementReport]:
     """Refine a map in memory, block by block: the last state, decided, and what each step changed."""
     settings, beside = settings or RefinementSettings(), beside or Evidence()
-    blocks = blocks_of(tiles_of(voxels, *([] if beside.moved is None else [beside.moved]))) or [((0, 0),)]
+    blocks = blocks_of(voxels_by_tile(voxels, *([] if beside.moved is None else [beside.moved]))) or [
+        ((0, 0),)
+    ]
     sums = sum((sums_of(block, voxels, beside, settings) for block in blocks), Sums())
     figures = figures_of(sums)
     parts = [refine_block(block, voxels, beside, settings, figures) for block in blocks]
@@ -137,7 +139,7 @@ def run_steps(
     return replace(_joined([state for state, _ in parts]), vehicles=report.objects), report
 
 
-def tiles_of(*maps: VoxelMap) -> dict[Tile, int]:
+def voxels_by_tile(*maps: VoxelMap) -> dict[Tile, int]:
     """How many voxels the maps have together in each tile that has one."""
     keys = reduce(np.union1d, (voxels.keys for voxels in maps))
     return {tile: len(places) for tile, places in indices_by_tile(keys)}

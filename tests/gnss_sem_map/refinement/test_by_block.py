@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from long_street import SIZE_M, URBAN, keyframes, street
 
-from gnss_sem_map.refinement.by_block import halo_m, refine_block, run_steps, sums_of, tiles_of
+from gnss_sem_map.refinement.by_block import halo_m, refine_block, run_steps, sums_of, voxels_by_tile
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.state import Evidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
@@ -72,7 +72,7 @@ def test_a_block_needs_no_more_of_the_map_than_its_halo(settings: RefinementSett
 
 
 def test_the_map_is_the_sum_of_its_blocks_in_any_order() -> None:
-    blocks = blocks_of(tiles_of(VOXELS, MOVED))
+    blocks = blocks_of(voxels_by_tile(VOXELS, MOVED))
     assert [len(block) for block in blocks] == [1, 2, 2, 2]
     sums = reduce(add, (sums_of(block, VOXELS, BESIDE, ALL) for block in reversed(blocks)))
     parts = [refine_block(block, VOXELS, BESIDE, ALL, figures_of(sums)) for block in reversed(blocks)]

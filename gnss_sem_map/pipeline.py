@@ -5,7 +5,7 @@
                         bind places that are passed again
     sharpness           measure the thickness of surfaces under the trajectories
     mapping             every scan once: deskew, label from its image, fuse into the voxels, find what moved
-    refinement          the steps of `refinement.steps`, tile by tile
+    refinement          the steps of `refinement.steps`, block by block
 
 Maps are written into a folder, tile by tile. The other files of a run are written by `runs`, with `export`.
 """

@@ -108,7 +108,7 @@ class _Refinement:
         made = self._made(made_from, said)
         new = {
             block: {"made_from": made_from[block], "said": said[block]}
-            for block in self.blocks
+            for block in self._blocks
             if block[0] not in made
         }
         made |= make_tiles(
@@ -117,7 +117,7 @@ class _Refinement:
         )  # fmt: skip
         pieces = [(tile, made[tile]) for tile in fused.tiles]
         tiles.write_tiles(pieces, self.run / REFINED, fused.frame, fused.voxel_size_m, fused.label_set)
-        of_blocks = [made[block[0]] for block in self.blocks]
+        of_blocks = [made[block[0]] for block in self._blocks]
         reports = [RefinementReport.from_json(one.about["said"]["report"]) for one in of_blocks]
         kerbs = [_kerbs(one.beside) for one in of_blocks if one.beside is not None]
         return Refined(RefinementReport.joined(reports), kerb_points.joined(kerbs) if kerbs else None)
@@ -128,7 +128,7 @@ class _Refinement:
         return str(self.run), self.settings.model_dump_json(), self.call, str(self.made_in)
 
     @cached_property
-    def blocks(self) -> list[Block]:
+    def _blocks(self) -> list[Block]:
         """Those of the map; of an empty one, a block without voxels."""
         return blocks_of(self._voxels) or [((0, 0),)]
 
@@ -150,7 +150,7 @@ class _Refinement:
         of_all = [said, None if model is None else repr(model.to_yaml())]
         tiles_in_halo = math.ceil(halo / (voxel_size_m * (1 << TILE_BITS)))
         found = {}
-        for block in self.blocks:
+        for block in self._blocks:
             near = [name_of(tile) for tile in tiles_around(block, tiles_in_halo)]
             found[block] = digest(
                 [*of_all, block, [[of_layer.get(name) for name in near] for of_layer in sums]]
@@ -161,7 +161,7 @@ class _Refinement:
         """What every block adds to the figures of the map."""
         earlier = files_of(None if self.earlier is None else self.earlier / REFINED)
         known = {}
-        for block in self.blocks:
+        for block in self._blocks:
             in_map = earlier.get(name_of(block[0]), {}).get("said")
             for said in (in_map, read_record(_sums_file(block, self.made_in))):
                 try:
@@ -169,13 +169,13 @@ class _Refinement:
                         known[block] = Sums.from_json(said["sums"])
                 except (KeyError, TypeError, ValueError):
                     continue  # there is none that can be read
-        new = {block: around[block] for block in self.blocks if block not in known}
+        new = {block: around[block] for block in self._blocks if block not in known}
         found = on_blocks(
             MEASURE_BLOCKS, self._shared, new, self._voxels, self.executor, partial(self.progress, "figures")
         )
         for block, sums in found:
             known[block] = Sums.from_json(sums)
-        return {block: known[block] for block in self.blocks}
+        return {block: known[block] for block in self._blocks}
 
     def _made_from(self, around: Mapping[Block, str], figures: Figures) -> dict[Block, str]:
         """Digest of all that decides each block."""
@@ -185,7 +185,7 @@ class _Refinement:
         steps = self.settings.refinement
         reach = steps.free_space.farthest_m + _moved_reach_m(steps, self.raw.fused.voxel_size_m)
         found = {}
-        for block in self.blocks:
+        for block in self._blocks:
             first, last = bounds_of(block)
             low, high = np.array(first) * edge, (np.array(last) + 1) * edge
             near = poses[((at > low - reach) & (at < high + reach)).all(axis=1)]
@@ -196,11 +196,11 @@ class _Refinement:
 
     def _made(self, made_from: Mapping[Block, str], said: Mapping[Block, Any]) -> dict[Tile, Made]:
         """The tiles of blocks that stay; one that is not whole, or without a report to be read, is refined again."""
-        of_tiles = {tile: made_from[block] for block in self.blocks for tile in block}
+        of_tiles = {tile: made_from[block] for block in self._blocks for tile in block}
         earlier = of_map(None if self.earlier is None else self.earlier / REFINED, of_tiles)
         there = earlier | of_work(self.made_in, of_tiles)
         found: dict[Tile, Made] = {}
-        for block in self.blocks:
+        for block in self._blocks:
             if not all(tile in there for tile in block):
                 continue
             of_block = {tile: there[tile] for tile in block}
@@ -287,7 +287,7 @@ def _refine(block: Block, inputs: _Inputs, figures: Figures, about: dict[str, An
 
 
 def _moved_reach_m(steps: RefinementSettings, voxel_size_m: float) -> float:
-    """How far around a tile the points that moved are read, m."""
+    """How far around a block the points that moved are read, m."""
     return free_space.reach_m(steps.free_space, voxel_size_m) + crumbs.reach_m(steps.crumbs, voxel_size_m)
 
 

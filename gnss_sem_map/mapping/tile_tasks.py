@@ -99,7 +99,8 @@ def _groups(blocks: list[Block], voxels: Mapping[Tile, int]) -> list[list[Block]
     """Neighbouring blocks, of VOXELS_PER_TASK together, or one block that has more."""
     groups: list[list[Block]] = []
     room, begins = 0, {block[0]: block for block in blocks}
-    for block in map(begins.__getitem__, z_order(begins)):
+    for first in z_order(begins):
+        block = begins[first]
         count = sum(voxels.get(tile, 0) for tile in block)
         if not groups or count > room:
             groups.append([])

@@ -1,4 +1,4 @@
-"""Refinement block by block: a tile, or four, from their voxels, those in a halo around, and figures of the whole map.
+"""Refinement block by block: from its voxels, those in a halo around it, and figures of the whole map.
 
 A map is refined in two passes. The first adds up `sums_of` every block, in any order; `figures_of` the sums are what a
 block must know of the whole map. The second refines every block for itself. All maps are refined so, those in memory
@@ -110,7 +110,7 @@ def refine_block(
         state, report = do(step, state, settings, own if halo else None)
         reports.append(report)
     assert state.decided is not None
-    # of a long object every block sees another part, with another centre; but those that meet see the same first tile
+    # of a long object every block sees another part, with another centre; but blocks that meet see the same first tile
     state = replace(state, vehicles=tuple(thing for thing in state.vehicles if thing.tile in block))
     return state, RefinementReport(tuple(reports), state.vehicles, systematic_errors=state.systematic_error)
 

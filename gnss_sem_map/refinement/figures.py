@@ -1,7 +1,7 @@
-"""What every tile must know of the whole map: sums over its tiles, and the figures that follow from them.
+"""What every block must know of the whole map: sums over its blocks, and the figures that follow from them.
 
 Sums are whole numbers, so they add to the same in any order. Figures are rounded, so that a drive more in a large map
-seldom changes them: a tile with the same voxels around it and the same figures is refined to the same.
+seldom changes them: a block with the same voxels around it and the same figures is refined to the same.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LEAST_ERROR_RATE, MOST_ERROR_RATE = 0.05, 1 / 3
 
 @dataclass(frozen=True)
 class Sums:
-    """What one tile, or several, add to the figures; `a + b` adds, and `Sums()` is that of no tile."""
+    """What one block, or several, add to the figures; `a + b` adds, and `Sums()` is that of no block."""
 
     observed: int = 0
     """Voxels that some image shows."""
@@ -61,7 +61,7 @@ class Sums:
         names = {field.name for field in fields(cls)}
         if set(content) != names or len(numbers) < len(names):
             raise ValueError(
-                f"sums of a tile: found {str(dict(content))[:200]}, expected whole numbers {sorted(names)};"
+                f"sums of a block: found {str(dict(content))[:200]}, expected whole numbers {sorted(names)};"
                 " refine the map again"
             )
         return cls(**numbers)
@@ -83,7 +83,7 @@ class Figures:
 
 
 def figures_of(sums: Sums) -> Figures:
-    """The rounded figures that follow from the sums over all tiles."""
+    """The rounded figures that follow from the sums over all blocks."""
     odds = np.log((sums.buildings + 1) / (sums.vegetation + 1))
     return Figures(
         _rounded(systematic_errors(sums)),

@@ -64,7 +64,7 @@ class VehicleObject:
     """(3,) m, in the map frame."""
     length_m: float
     tile: Tile
-    """The first one, by x and then y, that holds a part of it: this one reports it."""
+    """The first one, by x and then y, that holds a part of it: its block reports it."""
 
 
 @dataclass(frozen=True, eq=False)

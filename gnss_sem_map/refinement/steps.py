@@ -177,7 +177,7 @@ class RefinementReport:
     """Objects that had too few points to be tracked."""
 
     def to_json(self) -> dict[str, Any]:
-        """What it says of a tile, without objects through time; `from_json` reads it back."""
+        """What it says of a block, without objects through time; `from_json` reads it back."""
         steps = [
             {
                 "name": step.name,

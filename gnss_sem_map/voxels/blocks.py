@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 
 from gnss_sem_map.voxels.tile_files import Tile
 
 Block = tuple[Tile, ...]
 """One tile, or up to four that meet at a corner, in order."""
 MOST_VOXELS = 1 << 19
-"""Four tiles with more voxels together are refined one by one: a dense tile alone has as many, and it must fit into
-memory with its halo. In blocks, a map of 314,000 voxels in 11 tiles is refined with 1.2 times its voxels, halos
+"""Four tiles with more voxels together are refined one by one: a dense tile alone has as many, so memory must hold it
+anyway. In blocks, a map of 314,000 voxels in 11 tiles is refined with 1.2 times its voxels, halos
 included, in place of 2.0 times; a dense one of 2.5 million in 25, with 1.76 in place of 1.83."""
 
 
@@ -33,7 +33,7 @@ def bounds_of(block: Block) -> tuple[Tile, Tile]:
     return (min(x), min(y)), (max(x), max(y))
 
 
-def tiles_around(block: Block, tiles: int) -> Iterable[Tile]:
+def tiles_around(block: Block, tiles: int) -> Iterator[Tile]:
     """The tiles of the rectangle that holds a block, and so many around it."""
     (x, y), (last_x, last_y) = bounds_of(block)
     return (

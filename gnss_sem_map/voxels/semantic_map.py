@@ -115,8 +115,11 @@ class SemanticMap:
     @property
     def removed_hits(self) -> NDArray[np.uint32]:
         """(v,) hits of moving objects."""
-        if self.hits_removed is not None:
-            return self.hits_removed
+        return self.hits_of_removed if self.hits_removed is None else self.hits_removed
+
+    @property
+    def hits_of_removed(self) -> NDArray[np.uint32]:
+        """(v,) hits of the removed voxels, 0 of others: those that moved, unless `hits_removed` says more."""
         return np.where(self.states == State.REMOVED, self.voxels.hits, np.uint32(0))
 
     @property

@@ -44,7 +44,7 @@ def encode(piece: SemanticMap) -> bytes:
     columns = _columns_of(piece.voxels)
     columns |= {"label": piece.labels.astype(np.int32), "state": piece.states.astype(np.int32)}
     columns |= {"confidence": piece.confidence}
-    if piece.hits_removed is not None:
+    if piece.hits_removed is not None and (piece.hits_removed != piece.hits_of_removed).any():
         columns[HITS_REMOVED] = piece.hits_removed
     if piece.reasons is not None and piece.reasons.any():
         columns[REASON] = piece.reasons.astype(np.int32)
@@ -168,7 +168,7 @@ def as_parquet(
     table = pa.table({name: _arrow_column(values) for name, values in columns.items()})
     sink = pa.BufferOutputStream()
     pq.write_table(
-        table, sink, compression="zstd", use_dictionary=False,
+        table, sink, compression="zstd", compression_level=1, use_dictionary=False,
         write_statistics=False, store_schema=False, write_page_checksum=page_checksums,
         column_encoding={name: "DELTA_BINARY_PACKED" for name in columns if name in by_difference},
     )  # fmt: skip

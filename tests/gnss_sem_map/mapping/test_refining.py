@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from gnss_sem_map.voxels import reuse, tiles
 from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
-from gnss_sem_map.voxels.voxel_map import VoxelMap
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 WITHOUT_FREE_SPACE = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
 
@@ -188,6 +190,41 @@ def test_what_an_earlier_map_says_is_made_anew_where_it_cannot_be_read(
     _, called = refine(write_raw(tmp_path / "run"), earlier)
     assert called == ([BLOCKS[2]] if again else [])
     assert content(tmp_path / "run/refined") == content(before / "refined")
+
+
+PART = VOXELS[np.flatnonzero(VOXELS.indices[:, 0] < 150)]
+TOWNS: dict[str, tuple[list[Tile], list[Tile]]] = {
+    "one": ([(2, 2)], []),
+    "diagonal": ([(1, 2), (2, 1), (4, 1)], []),
+    "three": ([(1, 2), (2, 1), (2, 2)], [(1, 2)]),
+    "four": ([(1, 1), (1, 2), (2, 1), (2, 2), (3, 2)], [(1, 1)]),
+}
+"""Tiles with a part of the street, and those of them where all points moved."""
+
+
+def town(run: Path, name: str) -> Path:
+    """Parts of the street where four tiles meet, so that the same tiles are in different blocks."""
+    tiles_of_town, moving = TOWNS[name]
+
+    def part(tile: Tile) -> VoxelMap:
+        x, y = (512 * axis + (at if axis % 2 else 5) for axis, at in zip(tile, (350, 495), strict=True))
+        return replace(PART, keys=pack(PART.indices + np.array([x, y, 0])))
+
+    moved = reduce(add, map(part, moving), PART[:0])
+    return write_raw(run, reduce(add, map(part, tiles_of_town)), moved=moved)
+
+
+@pytest.mark.parametrize("later", TOWNS)
+@pytest.mark.parametrize("earlier", TOWNS)
+def test_tiles_that_come_or_go_change_blocks_and_leave_no_trace(
+    earlier: str, later: str, tmp_path: Path, refine: Any
+) -> None:
+    refine(town(tmp_path / "earlier", earlier))
+    scratch, _ = refine(town(tmp_path / "scratch", later))
+    found, called = refine(town(tmp_path / "run", later), tmp_path / "earlier")
+    assert content(tmp_path / "run/refined") == content(tmp_path / "scratch/refined")
+    assert found.report.to_json() == scratch.report.to_json()
+    assert (called == []) == (earlier == later)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": 1}'])

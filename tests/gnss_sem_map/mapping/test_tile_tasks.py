@@ -96,7 +96,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Block]]:
     return made
 
 
+@pytest.mark.parametrize("damaged", ["1_0.parquet", "2_0.json"])
 def test_what_an_interrupted_refinement_made_is_taken_over(
+    damaged: str,
     before: tuple[Path, Refined],
     tmp_path: Path,
     calls: list[tuple[str, Block]],
@@ -115,8 +117,8 @@ def test_what_an_interrupted_refinement_made_is_taken_over(
         with pytest.raises(KeyboardInterrupt):
             refined(run, work=work)
     calls.clear()
-    tile = work / TILES / "refined/1_0.parquet"
-    tile.write_bytes(tile.read_bytes()[:-1])
+    file = work / TILES / "refined" / damaged
+    file.write_bytes(file.read_bytes()[:-1])
     found = refined(run, work=work)
     assert calls == [("refine_block", block) for block in BLOCKS[1:]]
     assert_same(run, found, before)

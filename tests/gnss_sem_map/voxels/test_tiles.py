@@ -17,7 +17,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.voxels import tile_files, tiles
 from gnss_sem_map.voxels.map_json import read_frame
-from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap
+from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 URBAN, FRAME = open_label_set(), LocalFrame(49.0, 8.4, 110.0)
@@ -53,6 +53,17 @@ def test_hits_of_what_moved_come_back_from_every_tile(tmp_path: Path) -> None:
     low, high = written.voxels.centres.min(axis=0), written.voxels.centres.max(axis=0)
     inside = tiles.read(tmp_path / "map", URBAN, (low, (low + high) / 2))
     np.testing.assert_array_equal(inside.hits_removed, inside.voxels.hits // 2)
+
+
+def test_hits_that_moved_are_not_written_where_they_are_those_of_the_removed_voxels(tmp_path: Path) -> None:
+    written = random_map()
+    states = np.where(np.arange(len(written)) % 7 == 0, np.uint8(State.REMOVED), written.states)
+    written = replace(written, states=states)
+    tiles.write(replace(written, hits_removed=written.hits_of_removed), tmp_path / "map", FRAME)
+    read = tiles.read(tmp_path / "map", URBAN)
+    assert read.hits_removed is None
+    assert read.removed_hits.sum() > 0
+    np.testing.assert_array_equal(read.removed_hits, written.hits_of_removed)
 
 
 def test_reasons_come_back_and_cost_little(tmp_path: Path) -> None:

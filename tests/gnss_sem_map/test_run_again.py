@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from street import Street
 
-from gnss_sem_map.voxels import tiles
+from gnss_sem_map.voxels import map_json, tiles
+from gnss_sem_map.voxels.blocks import blocks_of
 
 
 def command(*arguments: str | Path) -> list[str]:
@@ -40,7 +41,15 @@ def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None
 KILLED = 137
 ONE_PROCESS = ("--workers", "1")
 """The command dies, not a process that it has started, on a machine with many cores too."""
-LIVE = ("--set", "dynamics.window_scans=2", "--write-labels", *ONE_PROCESS)
+LIVE = (
+    "--set",
+    "dynamics.window_scans=2",
+    "--set",
+    "mapping.voxel_size_m=0.1",
+    "--write-labels",
+    *ONE_PROCESS,
+)
+"""With tiles of 51 m: some are refined together, and some alone."""
 SMALL = ("--set", "dynamics.window_scans=1", *ONE_PROCESS)
 """Two scans in a chunk."""
 COMMAND = """
@@ -164,19 +173,26 @@ def test_a_killed_run_is_resumed_by_two_processes_and_keeps_what_it_had(
     assert_same_maps(out, whole)
 
 
-def test_a_run_that_is_killed_while_it_is_refined_keeps_the_tiles_that_it_had(
+def test_a_run_that_is_killed_while_it_is_refined_keeps_the_blocks_that_it_had(
     small_drive: Street, live: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     words = run_of(small_drive, out, *LIVE, labels="python:network:look")
-    died = watched(tmp_path / "first", words, die_after_tiles=1)
+    voxels = {
+        map_json.tile_of(name): about["voxels"] for name, about in map_json.files_of(live / "map").items()
+    }
+    blocks = {block[0]: block for block in blocks_of(voxels)}
+    first = blocks[tiles.z_order(blocks)[0]]
+    died = watched(tmp_path / "first", words, die_after_tiles=len(first) + 1)
     assert died.code == KILLED
-    assert len(died.tiles) == 1
+    assert len(died.tiles) == len(first) + 1
     resumed = watched(tmp_path / "second", [*words, "--resume"])
     assert resumed.code == 0, resumed.err
+    of_first = {Path(map_json.name_of(tile)).with_suffix(".json").name for tile in first}
+    assert of_first < {*died.tiles}
     assert resumed.tiles
-    assert not {*resumed.tiles} & {*died.tiles}, "a tile that was there is refined again"
-    assert len(resumed.tiles) == len(tiles.open_map(out / "refined").tiles) - 1
+    assert not {*resumed.tiles} & of_first, "a block that was there is refined again"
+    assert len(resumed.tiles) == len(voxels) - len(first)
     assert results_of(out) == results_of(live)
 
 

@@ -129,8 +129,7 @@ class _Refinement:
 
     @cached_property
     def _blocks(self) -> list[Block]:
-        """Those of the map; of an empty one, a block without voxels."""
-        return blocks_of(self._voxels) or [((0, 0),)]
+        return blocks_of(self._voxels)
 
     @cached_property
     def _voxels(self) -> dict[Tile, int]:

@@ -129,9 +129,7 @@ def run_steps(
 ) -> tuple[MapState, RefinementReport]:
     """Refine a map in memory, block by block: the last state, decided, and what each step changed."""
     settings, beside = settings or RefinementSettings(), beside or Evidence()
-    blocks = blocks_of(voxels_by_tile(voxels, *([] if beside.moved is None else [beside.moved]))) or [
-        ((0, 0),)
-    ]
+    blocks = blocks_of(voxels_by_tile(*(one for one in (voxels, beside.moved) if one is not None)))
     sums = sum((sums_of(block, voxels, beside, settings) for block in blocks), Sums())
     figures = figures_of(sums)
     parts = [refine_block(block, voxels, beside, settings, figures) for block in blocks]

@@ -11,7 +11,7 @@ from gnss_sem_map.voxels.blocks import MOST_VOXELS, blocks_of, bounds_of, tiles_
 from gnss_sem_map.voxels.tile_files import Tile
 
 axis = st.integers(-5, 5)
-maps = st.dictionaries(st.tuples(axis, axis), st.integers(1, MOST_VOXELS), max_size=30)
+maps = st.dictionaries(st.tuples(axis, axis), st.integers(1, MOST_VOXELS), min_size=1, max_size=30)
 
 
 @given(maps, st.randoms())
@@ -34,7 +34,7 @@ def test_the_four_tiles_at_the_origin_are_one_block_unless_they_hold_too_much() 
     four = dict.fromkeys([(-1, -1), (-1, 0), (0, -1), (0, 0)], MOST_VOXELS // 4)
     assert blocks_of(four | {(1, 0): 1}) == [tuple(four), ((1, 0),)]
     assert blocks_of(four | {(0, 0): MOST_VOXELS // 4 + 1}) == [(tile,) for tile in four]
-    assert blocks_of({}) == []
+    assert blocks_of({}) == [((0, 0),)]
 
 
 def test_around_a_block_are_the_tiles_of_its_rectangle_and_its_neighbours() -> None:

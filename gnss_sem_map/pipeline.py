@@ -27,6 +27,7 @@ from gnss_sem_map.evaluation.map_sharpness import Sharpness, SweepSample, of_sam
 from gnss_sem_map.evaluation.preflight.findings import Level, Preflight, PreflightError
 from gnss_sem_map.files.work_folder import SWEEPS
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.machine import one_blas_thread
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
@@ -106,6 +107,7 @@ class Mapped:
     """Findings of the pre-flight check."""
 
 
+@one_blas_thread()
 def run(
     log: SensorLog,
     segmenter: Segmenter | None,

@@ -8,6 +8,9 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+from threadpoolctl import threadpool_info
+
 from gnss_sem_map.errors import DataError, WriteError
 from gnss_sem_map.machine import threads
 from gnss_sem_map.mapping.execution import failure_of
@@ -28,6 +31,12 @@ def process_and_threads(folder: str) -> list[int]:
     (Path(folder) / f"{os.getpid()}").touch()
     time.sleep(0.05)
     return [os.getpid(), threads(), int(os.environ.get("NUMBA_NUM_THREADS", 0))]
+
+
+def blas_threads() -> list[int]:
+    """Threads of every BLAS that is loaded, that of numpy at least."""
+    np.dot(1.0, 1.0)
+    return [about["num_threads"] for about in threadpool_info() if about["user_api"] == "blas"]
 
 
 def _attempt(folder: str) -> int:

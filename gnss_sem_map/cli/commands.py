@@ -26,6 +26,7 @@ from gnss_sem_map.cli import (
 from gnss_sem_map.cli.signals import Stopped, caused_by_signal, ignore_signals
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.files.ownership import MARKER
+from gnss_sem_map.machine import BLAS_THREADS_VARIABLE
 from gnss_sem_map.memory import collect_seldom, share_one_heap, use_huge_pages
 
 COMMANDS = (
@@ -109,6 +110,7 @@ def main() -> None:
     """
     from factor_graphs.errors import FactorGraphError
 
+    os.environ[BLAS_THREADS_VARIABLE] = "1"  # before numpy is imported; see `machine.one_blas_thread`
     share_one_heap()
     use_huge_pages()
     collect_seldom()

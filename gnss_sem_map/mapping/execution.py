@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 from factor_graphs.errors import EstimationError, FactorGraphError, MeasurementError
 from gnss_sem_map.errors import ConfigError, DataError, SemMapError, WriteError
+from gnss_sem_map.machine import one_blas_thread
 
 ALLOWED = "gnss_sem_map."
 """Modules whose functions may be tasks begin with this."""
@@ -141,7 +142,8 @@ def call(function: str, arguments: str, allowed: str = ALLOWED) -> str:
         raise ConfigError(
             f"{function}: no such function ({error}); is another version installed here?"
         ) from None
-    return json.dumps(called(*json.loads(arguments)))
+    with one_blas_thread():
+        return json.dumps(called(*json.loads(arguments)))
 
 
 def answer(function: str, arguments: str, allowed: str = ALLOWED, place: str = "") -> str:

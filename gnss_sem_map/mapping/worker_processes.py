@@ -21,13 +21,13 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess, parent_process
 from typing import Any
 
-from gnss_sem_map.machine import THREADS_VARIABLE, held_bytes, memory_bytes, threads
+from gnss_sem_map.machine import BLAS_THREADS_VARIABLE, THREADS_VARIABLE, held_bytes, memory_bytes, threads
 from gnss_sem_map.mapping.execution import ALLOWED, Losses, Lost, Task, answer, result_of
 from gnss_sem_map.memory import collect_seldom
 
 WATCH_S = 0.1
 """Memory and time of the workers are looked at this often, whenever the next result is waited for."""
-THREADS_VARIABLES = (THREADS_VARIABLE, "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+THREADS_VARIABLES = (THREADS_VARIABLE, "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Worker:
     """One process, our end of its pipe, and the task that it has under way."""
 
     def __init__(self, own_threads: int) -> None:
-        with _environment(dict.fromkeys(THREADS_VARIABLES, str(own_threads))):
+        with _environment(dict.fromkeys(THREADS_VARIABLES, str(own_threads)) | {BLAS_THREADS_VARIABLE: "1"}):
             self.connection, self._process = _start()
         self.threads = own_threads
         self.task: Task | None = None

@@ -10,10 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_tasks import blas_threads
+from threadpoolctl import threadpool_limits
 
 from gnss_sem_map import machine
 from gnss_sem_map.cli.options import default_workers
 from gnss_sem_map.machine import cores, held_bytes, memory_bytes, most_held_bytes, threads
+from gnss_sem_map.mapping import passes
+from gnss_sem_map.scans.revisits import RevisitSettings
 
 
 def test_threads_obey_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -70,3 +74,48 @@ def test_a_process_that_has_ended_holds_nothing() -> None:
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     assert held_bytes(ended.pid) == 0
+
+
+def test_blas_has_one_thread_while_it_is_asked_for() -> None:
+    with threadpool_limits(2, "blas"):
+        with machine.one_blas_thread():
+            assert set(blas_threads()) == {1}
+        assert set(blas_threads()) == {2}
+
+
+def test_drives_are_bound_with_one_thread_of_blas(monkeypatch: pytest.MonkeyPatch) -> None:
+    # with two, the covariances of six drives that were bound had other last bits than with one
+    found: list[int] = []
+
+    class Asked(Exception):
+        pass
+
+    def register(*_: object) -> None:
+        found.extend(blas_threads())
+        raise Asked
+
+    monkeypatch.setattr(passes, "register_passes", register)
+    with threadpool_limits(2, "blas"), pytest.raises(Asked):
+        passes.bind_passes([], RevisitSettings())
+    assert set(found) == {1}
+
+
+PROGRAM = """
+from gnss_sem_map.cli import commands
+
+def asked():
+    import scipy.linalg
+    from threadpoolctl import threadpool_info
+    print({about["num_threads"] for about in threadpool_info() if about["user_api"] == "blas"})
+    return 0
+
+commands._called = asked
+commands.main()
+"""
+
+
+@pytest.mark.integration
+def test_a_command_has_one_thread_of_blas_whatever_its_environment_says() -> None:
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    said = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True)
+    assert (said.stdout, said.stderr) == ("{1}\n", "")

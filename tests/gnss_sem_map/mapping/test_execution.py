@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import small_tasks
 from processes import is_alive, wait_until
+from threadpoolctl import threadpool_limits
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
 from gnss_sem_map.mapping.execution import Executor, InProcess, Task, run_tasks
@@ -126,6 +128,19 @@ def test_workers_share_the_cores_and_are_recycled(tmp_path: Path, monkeypatch: p
     assert max(map(workers.count, workers)) <= 3
     assert os.environ["GNSS_SEM_MAP_THREADS"] == "6"
     assert not any(is_alive(pid) for pid in workers)
+
+
+@integration
+@pytest.mark.parametrize("executor", [HERE, processes(1)], ids=["here", "elsewhere"])
+def test_a_task_has_one_thread_of_blas_whatever_the_cores(
+    executor: Executor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GNSS_SEM_MAP_THREADS", "6")
+    with threadpool_limits(2, "blas"):
+        assert set(small_tasks.blas_threads()) == {2}
+        ((_, found),) = run_tasks([task("blas_threads")], executor)
+        assert set(found) == {1}
+        assert set(small_tasks.blas_threads()) == {2}
 
 
 @integration

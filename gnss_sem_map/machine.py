@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 THREADS_VARIABLE = "GNSS_SEM_MAP_THREADS"
 """Environment variable: threads of one process. Several processes of one machine share its cores by it."""
+BLAS_THREADS_VARIABLE = "OPENBLAS_NUM_THREADS"
+"""Environment variable: threads of matrix products in a process that starts with it."""
 CONTAINER_MEMORY = Path("/sys/fs/cgroup/memory.max")
 """Bytes that this container may use, or "max"."""
 
@@ -35,16 +37,12 @@ def threads() -> int:
     return int(said) if said.isdecimal() and int(said) else cores()
 
 
-BLAS_THREADS_VARIABLE = "OPENBLAS_NUM_THREADS"
-"""Environment variable: threads of matrix products in a process that starts with it."""
-
-
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """While it lasts, BLAS uses one thread: with more, the last bits of a product depend on the number of cores.
 
-    Found where six drives were bound: covariances of 1e-16 m² differed on one core and on two. Our matrices are small,
-    so more threads save no time.
+    Found where six drives were bound: the last bits of their covariances differed on one core and on two. Our matrices
+    are small, and threads wait for each other by spinning: to bind four drives took several times as long with two.
     """
     with threadpool_limits(1, "blas"):
         yield

@@ -259,11 +259,11 @@ def workers(drives: Drives, out: Path) -> Figures:
 
 
 def twenty(drives: Drives, out: Path) -> Figures:
-    """Twenty drives, one map: one process, two processes, and Dask with a worker killed on the way."""
+    """Twenty drives, one map: one process on one core, two on two, and Dask with a worker killed on the way."""
     some, sums = drives.of(30)[:20], []
     found: Figures = {"drives": len(some)}
     for count in (1, 2):
-        figures = run(drives.words(some, out / f"twenty{count}", "--workers", str(count)))
+        figures = run(drives.words(some, out / f"twenty{count}", "--workers", str(count)), cores=count)
         found[f"wall_s_{count}"] = figures["wall_s"]
         sums.append(checksums(out / f"twenty{count}"))
     with _dask(2) as (address, processes):

@@ -40,6 +40,7 @@ from gnss_sem_map.dynamics.visibility import KeyframeScans
 from gnss_sem_map.evaluation.metrics import MOVING_IDS, Tables, confusion, dynamic, dynamic_counts, semantics
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
 from gnss_sem_map.pipeline import estimate_trajectory
 from gnss_sem_map.refinement.by_block import refine
@@ -153,7 +154,9 @@ def removed_in_all(drive: Drive, chunks: list[MappedChunk], refined: SemanticMap
 def mapped(drive: Drive) -> list[MappedChunk]:
     """What every chunk of a drive says."""
     with tempfile.TemporaryDirectory() as folder:
-        return list(map_chunks(drive, range(len(chunks_of(drive))), Path(folder), Path(folder)))
+        return list(
+            map_chunks(drive, range(len(chunks_of(drive))), Path(folder), EdgeWindows(Path(folder), ""))
+        )
 
 
 def timed_mapping(drive: Drive) -> tuple[list[MappedChunk], dict[str, float]]:

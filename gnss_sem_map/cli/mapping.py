@@ -115,8 +115,7 @@ def run(
 
         progress("loading", 1, 1)
     settings, frame, found = settings_of(config, set_, crs, geoid), frame_of(origin), drives_of(drives)
-    if scheduler is not None and workers is not None:
-        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
+    _refuse_both(scheduler, workers)
     is_of_many = len(found) > 1 or align_to is not None
     if is_of_many and segmenter is None:
         refuse_unlabelled(found[0])
@@ -145,6 +144,11 @@ def run(
     about = finished.about
     warn(about["warnings"])
     print_run(about, out, as_json)
+
+
+def _refuse_both(scheduler: str | None, workers: int | None) -> None:
+    if scheduler is not None and workers is not None:
+        raise typer.BadParameter("a scheduler has its own workers", param_hint="--workers")
 
 
 def _run_many(
@@ -180,21 +184,27 @@ def add(
     device: Device = "auto",
     frames: Frames = None,
     drive_format: Format = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     resume: Resume = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Add a drive to a finished map, with the map's settings: the same bytes as a run of all drives at once."""
     from gnss_sem_map.runs.finished_run import Run
-    from gnss_sem_map.runs.many_drives import HowMapped, add_drive, has_point_labels
+    from gnss_sem_map.runs.many_drives import HowMapped, add_drive
+    from gnss_sem_map.runs.point_label_files import has_point_labels
 
+    _refuse_both(scheduler, workers)
     Run.open(out)
     if segmenter is None:
         refuse_unlabelled(drive)
     how = HowMapped(segmenter, frames, drive_format, device, force, resume)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:
-        made = add_drive(out, drive, how, progress=progress)
+        made = add_drive(
+            out, drive, how, workers=workers or default_workers(), scheduler=scheduler, progress=progress
+        )
     warn([*made.about["warnings"], *_labels_gone(had_labels)])
     print_many(made.about, out, as_json)
 
@@ -210,14 +220,24 @@ def _labels_gone(had_labels: bool) -> list[str]:
 def remove(
     out: Annotated[Path, typer.Argument(help="Folder of a finished map of several drives.")],
     name: Annotated[str, typer.Argument(help="Name of the drive, as in OUT/drives/.")],
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    resume: Resume = False,
     as_json: Json = False,
 ) -> None:
     """Take a drive out of a finished map: the same bytes as a run of the others."""
-    from gnss_sem_map.runs.many_drives import has_point_labels, remove_drive
+    from gnss_sem_map.runs.finished_run import Run
+    from gnss_sem_map.runs.many_drives import remove_drive
+    from gnss_sem_map.runs.point_label_files import has_point_labels
 
+    _refuse_both(scheduler, workers)
+    Run.open(out)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:
-        made = remove_drive(out, name, progress)
+        made = remove_drive(
+            out, name,
+            workers=workers or default_workers(), scheduler=scheduler, resume=resume, progress=progress,
+        )  # fmt: skip
     warn([*made.about["warnings"], *_labels_gone(had_labels)])
     print_many(made.about, out, as_json)
 

@@ -22,6 +22,7 @@ from typing import TextIO
 
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import ownership, work_folder
+from gnss_sem_map.files.atomic import sync
 
 NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 """Errors of file systems without locks: there we continue without a lock."""
@@ -43,6 +44,11 @@ class Claim:
         """The work folder beside it."""
         return self.out.with_name(f".{self.out.name}.work")
 
+    @property
+    def old(self) -> Path:
+        """Where the old result is while it is replaced."""
+        return self.work / work_folder.OLD
+
 
 _HELD: dict[Path, Claim] = {}
 """The claims of this process: a claim that is already held is not checked again."""
@@ -54,13 +60,14 @@ def claimed(
     inputs: Iterable[Path | str | None] = (),
     by_name: Callable[[str], bool] = lambda name: False,
     is_resumable: bool = False,
+    waits: bool = False,
 ) -> Iterator[Claim]:
     """Claim an output folder, and check before any work that results can be written there.
 
     What a killed command left in the work folder is put right: the old result is moved back, an unfinished new one is
     removed. Intermediate results stay until the run is complete; an error says so if the command `is_resumable`: if it
-    has --resume. Raises DataError when another command writes there, when what is there is not ours, when it is, holds
-    or lies in one of the `inputs`, and when it may not be changed.
+    has --resume. Raises DataError when another command writes there (or `waits` for it), when what is there is not
+    ours, when it is, holds or lies in one of the `inputs`, and when it may not be changed.
     """
     real = real_path(out)
     if real in _HELD:
@@ -70,7 +77,7 @@ def claimed(
     claim = Claim(real, by_name)
     refuse_places(real)
     refuse_inputs(real, inputs)
-    with parents_made(real), locked(real):
+    with parents_made(real), locked(real, waits):
         work_folder.refuse_foreign(claim.work)
         with _explained(claim.work):
             _move_back(claim)
@@ -110,6 +117,7 @@ def new_folder(
             part.mkdir()
             yield part
             ownership.write_list(part, all_content)
+            sync(part)  # then the old result goes, and all that this one was made from
             _swap(claim, part)
         except OSError as error:
             raise DataError(
@@ -123,7 +131,7 @@ def new_folder(
 
 
 def _swap(claim: Claim, part: Path) -> None:
-    out, old = claim.out, claim.work / work_folder.OLD
+    out, old = claim.out, claim.old
     try:
         refuse_foreign(claim)  # hours may have passed
         if out.exists() and any(out.iterdir()):
@@ -150,10 +158,18 @@ def _free_name(out: Path) -> Path:
 
 def _move_back(claim: Claim) -> None:
     """Restore the old result when a command was killed before it had moved the new one into place."""
-    out, old = claim.out, claim.work / work_folder.OLD
+    out, old = claim.out, claim.old
     free = not os.path.lexists(out) or (out.is_dir() and not any(out.iterdir()))
     if free and ownership.is_whole(old):
         old.rename(out)
+
+
+def restore(out: Path, by_name: Callable[[str], bool] = lambda name: False) -> None:
+    """Move an old result back, if a command was killed while it replaced it; raises DataError as `claimed` does."""
+    real = real_path(out)
+    if not os.path.lexists(real) and Claim(real, by_name).old.is_dir():
+        with claimed(out, by_name=by_name):
+            pass
 
 
 @contextmanager
@@ -274,18 +290,18 @@ def parents_made(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def locked(out: Path) -> Iterator[None]:
+def locked(out: Path, waits: bool = False) -> Iterator[None]:
     """Lock an output folder with `.OUT.lock`, which names the process. The lock of a dead process is ignored.
 
-    What this process has claimed is locked already. Raises DataError when another command writes there, or the lock
-    cannot be written.
+    What this process has claimed is locked already. Raises DataError when another command writes there (or `waits`
+    until it has ended), or the lock cannot be written.
     """
     if out in _HELD:
         yield
         return
     path = out.with_name(f".{out.name}.lock")
     try:
-        file = _lock(path, out)
+        file = _lock(path, out, waits)
     except OSError as error:
         raise DataError(
             f"{out}: cannot be written ({error.strerror}); see to its rights, or choose another place"
@@ -333,7 +349,7 @@ def _refuse_replaced(opened: Mapping[Path, int]) -> None:
             raise DataError(f"{folder}: was replaced by another command while it was read; run this again")
 
 
-def _lock(path: Path, out: Path) -> TextIO:
+def _lock(path: Path, out: Path, waits: bool) -> TextIO:
     while True:
         number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
         if not stat.S_ISREG(os.fstat(number).st_mode):
@@ -341,7 +357,7 @@ def _lock(path: Path, out: Path) -> TextIO:
             raise DataError(f"{path}: is in the way, and no lock of ours; move it away")
         file = os.fdopen(number, "r+", encoding="utf-8", errors="replace")
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = file.read(200).strip() or f"{FIRST_WORDS} it"
             file.close()

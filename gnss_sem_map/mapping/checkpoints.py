@@ -95,11 +95,15 @@ class ChunkStore:
 
     def _put(self, beside: Path, number: int) -> None:
         """Give a finished folder its name, unless another process was quicker: both have the same bytes."""
+        folder = self.folder / str(number)
         try:
-            beside.rename(self.folder / str(number))
+            beside.rename(folder)
         except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not self.is_whole(number):
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
+            if not self.is_whole(number):  # of another run
+                shutil.rmtree(folder)
+                beside.rename(folder)
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk is of this run, complete and undamaged."""

@@ -24,7 +24,7 @@ from gnss_sem_map.dynamics.visibility import THREADS, KeyframeScans, KeyframeSel
 from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import edge_windows
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive, LabelledScan, label_each_scan
 from gnss_sem_map.mapping.moving_points import observe_scan, range_images
 from gnss_sem_map.mapping.waiting_images import WaitingImages
@@ -79,12 +79,12 @@ def _chunks_of(drive: Drive) -> list[Sequence[Scan]]:
 
 
 def map_chunks(
-    drive: Drive, numbers: range, folder: Path, work: Path, progress: Progress = silent
+    drive: Drive, numbers: range, folder: Path, edges: EdgeWindows, progress: Progress = silent
 ) -> Iterator[MappedChunk]:
     """Map consecutive chunks; each scan of them is read once. `folder` is for points that wait for a decision.
 
-    What its first window tells of motion is saved in the folder `work`, for the process that maps the chunk before.
-    Raises DataError when the stamps of the scans do not increase, or a folder cannot be written.
+    What their first window tells of motion is saved in `edges`, for the process that maps the chunk before. Raises
+    DataError when the stamps of the scans do not increase, or a folder cannot be written.
     """
     chunks = chunks_of(drive)
     total, first, done = sum(len(chunks[number]) for number in numbers), 0, 0
@@ -92,13 +92,13 @@ def map_chunks(
         count = len(_chunks_of(one))
         here = range(max(numbers.start - first, 0), min(numbers.stop - first, count))
         if len(here):
-            yield from _map_chunks(one, here, first, folder, work, shifted(progress, done, total))
+            yield from _map_chunks(one, here, first, folder, edges, shifted(progress, done, total))
             done += sum(len(chunks[first + number]) for number in here)
         first += count
 
 
 def _map_chunks(
-    drive: Drive, numbers: range, first: int, folder: Path, work: Path, progress: Progress
+    drive: Drive, numbers: range, first: int, folder: Path, edges: EdgeWindows, progress: Progress
 ) -> Iterator[MappedChunk]:
     """Those of one LiDAR, whose first chunk has the number `first` in the drive."""
     chunks, window = _chunks_of(drive), drive.settings.dynamics.window_scans
@@ -122,8 +122,8 @@ def _map_chunks(
                 chunk.take_table_back()
                 before, undecided = undecided.last_images, None
             elif place == window and number > 0 and is_sought:
-                with writing_to(work):
-                    edge_windows.save(chunk.observations, work, first + number)
+                with writing_to(edges.work):
+                    edges.save(chunk.observations, first + number)
             done += 1
             progress("mapping", done, total)
             release_memory()  # what lasts lies among what scans have used, and ten scans leave 70 MB of holes
@@ -131,7 +131,7 @@ def _map_chunks(
         undecided = chunk
     if undecided is not None:
         is_followed = numbers.stop < len(chunks) and is_sought
-        after = edge_windows.read(work, first + numbers.stop, drive.image_rows) if is_followed else []
+        after = edges.read(first + numbers.stop, drive.image_rows) if is_followed else []
         if after is None:
             after = _observations(drive, chunks[numbers.stop][:window])
         yield undecided.decided(before, after)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import secrets
 import socket
 import threading
@@ -45,12 +46,13 @@ WATCH_S = 1.0
 class Cluster:
     """Calls tasks on the Dask cluster whose scheduler is at `address`, e.g. tcp://10.0.0.1:8786.
 
-    `work` is a folder that this machine and all workers share. A worker that works on one task for more than
-    `timeout_s` is restarted; what a dead or restarted worker had under way is called again.
+    `work` is a folder that this machine and all workers share, and they must see all of `reads`. A worker that works on
+    one task for more than `timeout_s` is restarted; what a dead or restarted worker had under way is called again.
     """
 
     address: str
     work: Path
+    reads: tuple[Path, ...] = ()
     timeout_s: float = 3600.0
     allowed: str = ALLOWED
 
@@ -59,14 +61,13 @@ class Cluster:
 
         Raises what `check` raises, and DataError when all workers are gone for long.
         """
-        with self._checked() as client:
-            waiting, losses = deque(tasks), Losses()
+        with self._workers() as workers:
+            client, waiting, losses = workers.client, deque(tasks), Losses()
             under_way: dict[Future[Any], Task] = {}
             finished: SimpleQueue[Future[Any]] = SimpleQueue()
-            threads = _Threads(client, self.address)
             try:
                 while waiting or under_way:
-                    for _ in range(min(len(waiting), IN_FLIGHT * threads.count() - len(under_way))):
+                    for _ in range(min(len(waiting), IN_FLIGHT * workers.threads() - len(under_way))):
                         task = waiting.popleft()
                         future = self._submit(client, task)
                         under_way[future] = task
@@ -74,7 +75,7 @@ class Cluster:
                     for future in _taken(finished):
                         task = under_way.pop(future)
                         try:
-                            yield task, _result(client, task, future)
+                            yield task, _result(workers, task, future)
                         except Lost as lost:
                             yield from losses.add(task, lost, waiting)
             finally:
@@ -83,18 +84,25 @@ class Cluster:
 
     def check(self) -> None:
         """Raise ConfigError without Dask or a scheduler, and DataError when workers are missing or not fit."""
-        with self._checked():
+        with self._workers():
             pass
 
     @contextmanager
-    def _checked(self) -> Iterator[Client]:
+    def _workers(self) -> Iterator[_Workers]:
         with _quiet_client(), _connected(self.address) as client:
-            ask = partial(_asked, client, self.address)
             _wait_for_worker(client, self.address)
-            _refuse_other_versions(ask)
-            _refuse_without_nanny(ask)
-            _refuse_own_folders(ask, self.work.resolve())
-            yield client
+            workers = _Workers(client, self)
+            workers.threads()  # looks at them for the first time
+            yield workers
+
+    def refuse_unfit(self, client: Client, workers: Sequence[str]) -> None:
+        """Raise DataError when some of the workers cannot do our tasks."""
+        ask = partial(_asked, client, self.address, workers)
+        _refuse_other_versions(ask)
+        _refuse_without_nanny(ask)
+        _refuse_more_threads(ask)
+        _refuse_own_folders(ask, self.work.resolve())
+        _refuse_without_inputs(ask, self.reads)
 
     def _submit(self, client: Client, task: Task) -> Future[Any]:
         words = (task.function, json.dumps(task.arguments), self.allowed, self.timeout_s, _version())
@@ -121,7 +129,7 @@ def _answer_in_time(
     return address, answers[0] if answers else json.dumps({"lost": f"it was not done after {timeout_s:g} s"})
 
 
-def _result(client: Client, task: Task, future: Future[Any]) -> Any:
+def _result(workers: _Workers, task: Task, future: Future[Any]) -> Any:
     """The result of a finished task; raises Lost when a second attempt may succeed."""
     from distributed import KilledWorker
 
@@ -130,13 +138,14 @@ def _result(client: Client, task: Task, future: Future[Any]) -> Any:
         if isinstance(error, KilledWorker):  # Dask itself has made several attempts
             reason = "a Dask worker died (its log says why; lack of memory is likely)"
             raise Lost(reason, times=error.allowed_failures + 1)
+        workers.look()  # one that came just now may have no package
         raise DataError(
             f"{task.name}: Dask could not call it ({error!r}); install the same {PACKAGE} on all workers"
         )
     try:
         address, answered = future.result()
     except (CancelledError, OSError) as error:
-        if client.status != "running":
+        if workers.client.status != "running":
             raise DataError(
                 "the connection to the Dask scheduler was lost; see that it runs, and --resume"
             ) from None
@@ -144,7 +153,7 @@ def _result(client: Client, task: Task, future: Future[Any]) -> Any:
     try:
         return result_of(task, answered)
     except Lost:
-        client.restart_workers([address], timeout=CONNECT_S, raise_for_error=False)
+        workers.client.restart_workers([address], timeout=CONNECT_S, raise_for_error=False)
         raise
 
 
@@ -159,24 +168,35 @@ def _taken(finished: SimpleQueue[Future[Any]]) -> list[Future[Any]]:
     return taken
 
 
-class _Threads:
-    """Threads of the cluster, which may grow and shrink; raises DataError when all have been gone for long."""
+class _Workers:
+    """The workers of a cluster, which come and go."""
 
-    def __init__(self, client: Client, address: str) -> None:
-        self._client, self._address = client, address
-        self._count, self._looked, self._seen = 0, float("-inf"), time.monotonic()
+    def __init__(self, client: Client, cluster: Cluster) -> None:
+        self.client, self._cluster = client, cluster
+        self._known: set[str] = set()
+        self._threads, self._looked, self._seen = 0, float("-inf"), time.monotonic()
 
-    def count(self) -> int:
+    def threads(self) -> int:
+        """How many threads they have; raises DataError for one that is not fit, and when all are gone for long."""
         now = time.monotonic()
         if now - self._looked >= WATCH_S:
-            self._count, self._looked = sum(_nthreads(self._client, self._address).values()), now
-        if self._count:
+            self.look()
+        if self._threads:
             self._seen = now
         elif now - self._seen > NO_WORKER_S:
             raise DataError(
-                f"scheduler {self._address}: has had no worker for {NO_WORKER_S:g} s; start workers, and --resume"
+                f"scheduler {self._cluster.address}: has had no worker for {NO_WORKER_S:g} s; start workers, and"
+                " --resume"
             )
-        return self._count
+        return self._threads
+
+    def look(self) -> None:
+        """See who is there; raises DataError for a new one that is not fit."""
+        there = _nthreads(self.client, self._cluster.address)
+        if new := sorted(there.keys() - self._known):
+            self._cluster.refuse_unfit(self.client, new)
+            self._known |= there.keys()
+        self._threads, self._looked = sum(there.values()), time.monotonic()
 
 
 def _nthreads(client: Client, address: str) -> dict[str, int]:
@@ -209,7 +229,7 @@ def _quiet_client() -> Iterator[None]:
 @contextmanager
 def _connected(address: str) -> Iterator[Client]:
     try:
-        from distributed import Client
+        from distributed import Client, Security
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"scheduler {address}: {error.name} is not installed; {how_to_install('cluster')}"
@@ -219,6 +239,11 @@ def _connected(address: str) -> Iterator[Client]:
         if place.scheme != "inproc":
             # a Client that fails may block later ones for ever, when it is collected at the wrong moment
             socket.create_connection((place.hostname or "", place.port or 0), CONNECT_S).close()
+        if place.scheme == "tls" and Security().get_connection_args("client").get("ssl_context") is None:
+            raise ConfigError(
+                f"scheduler {address}: Dask's configuration names no certificates; set those of the client in"
+                " distributed.comm.tls"
+            )
         client = Client(address, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
         raise ConfigError(
@@ -239,13 +264,18 @@ def _wait_for_worker(client: Client, address: str) -> None:
             ) from None
 
 
-def _asked(client: Client, address: str, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-    """What a function returns on every worker; one that dies meanwhile is left out, as Dask starts it again.
+def _asked(
+    client: Client, address: str, workers: Sequence[str], function: Callable[..., Any], *arguments: Any
+) -> dict[str, Any]:
+    """What a function returns on some workers; one that dies meanwhile is left out, as Dask starts it again.
 
     Raises DataError for a worker that cannot call it, and for a scheduler that is lost.
     """
+    there = sorted(_nthreads(client, address).keys() & set(workers))
+    if not there:
+        return {}
     with _scheduler_there(address):
-        said = client.run(function, *arguments, on_error="return")
+        said = client.run(function, *arguments, workers=there, on_error="return")
     for worker, one in said.items():
         if isinstance(one, Exception) and not isinstance(one, OSError):
             raise DataError(
@@ -270,6 +300,25 @@ def _refuse_without_nanny(ask: Callable[..., dict[str, Any]]) -> None:
             raise DataError(
                 f"Dask worker {worker}: has no nanny, which restarts it when it hangs or needs too much memory; start"
                 " it without --no-nanny, a LocalCluster with processes=True"
+            )
+
+
+def _refuse_more_threads(ask: Callable[..., dict[str, Any]]) -> None:
+    for worker, threads in ask(_threads_of).items():
+        if threads != 1:
+            raise DataError(
+                f"Dask worker {worker}: has {threads} threads, which would share its memory, its BLAS and its time-out;"
+                " start it with --nthreads 1, and --nworkers for its cores"
+            )
+
+
+def _refuse_without_inputs(ask: Callable[..., dict[str, Any]], reads: Sequence[Path]) -> None:
+    for worker, missing in ask(_missing, [str(path) for path in reads]).items():
+        if missing:
+            more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+            raise DataError(
+                f"Dask worker {worker}: does not see {missing[0]}{more}, which is to be read; make it visible there"
+                " under the same path"
             )
 
 
@@ -313,6 +362,14 @@ def _token_file(work: Path, token: str, number: int) -> Path:
 
 def _has_nanny(dask_worker: Worker) -> bool:
     return dask_worker.nanny is not None
+
+
+def _threads_of(dask_worker: Worker) -> int:
+    return dask_worker.state.nthreads
+
+
+def _missing(paths: list[str]) -> list[str]:
+    return [path for path in paths if not os.path.exists(path)]
 
 
 def _version() -> str:

@@ -1,7 +1,7 @@
 """What the first window of a range of chunks tells of motion, on disk: the chunk before it needs it, too.
 
-Another process maps that chunk. Without the file, or with a damaged one, it looks at these scans itself, with the same
-result.
+Another process maps that chunk. Without the file, or with one that is damaged or of another run, it looks at these
+scans itself, with the same result.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,29 +27,36 @@ from gnss_sem_map.files.untrusted import is_file, read_bytes
 from gnss_sem_map.files.work_folder import EDGES
 
 
-def save(observations: Sequence[Observation], work: Path, chunk: int) -> None:
-    """Save the observations of the first window of a chunk in the work folder of a run; raises OSError."""
-    file = io.BytesIO()
-    arrays = {f"{n}/{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
-    np.savez(file, **arrays)
-    (work / EDGES).mkdir(exist_ok=True)
-    write_whole(_file(work, chunk), file.getvalue())
+@dataclass(frozen=True)
+class EdgeWindows:
+    """Those of the run with this fingerprint, in its work folder."""
 
+    work: Path
+    fingerprint: str
 
-def read(work: Path, chunk: int, rows: Rows) -> list[Observation] | None:
-    """The observations of the first window of a chunk, by a LiDAR with these rows; None where they are not saved."""
-    try:
-        if not is_file(_file(work, chunk)):
+    def save(self, observations: Sequence[Observation], chunk: int) -> None:
+        """Save the observations of the first window of a chunk; raises OSError."""
+        file = io.BytesIO()
+        arrays = {f"{n}/{name}": a for n, one in enumerate(observations) for name, a in _arrays(one).items()}
+        np.savez(file, **arrays, made_from=np.array(self.fingerprint))
+        (self.work / EDGES).mkdir(exist_ok=True)
+        write_whole(self._file(chunk), file.getvalue())
+
+    def read(self, chunk: int, rows: Rows) -> list[Observation] | None:
+        """Those of the first window of a chunk, by a LiDAR with these rows; None where they are not saved."""
+        try:
+            if not is_file(self._file(chunk)):
+                return None
+            with np.load(io.BytesIO(read_bytes(self._file(chunk))), allow_pickle=False) as arrays:
+                if str(arrays["made_from"]) != self.fingerprint:
+                    return None
+                count = len({name.partition("/")[0] for name in arrays.files} - {"made_from"})
+                return [_observation(arrays, f"{n}/", rows) for n in range(count)]
+        except (DataError, KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile):
             return None
-        with np.load(io.BytesIO(read_bytes(_file(work, chunk))), allow_pickle=False) as arrays:
-            count = len({name.partition("/")[0] for name in arrays.files})
-            return [_observation(arrays, f"{n}/", rows) for n in range(count)]
-    except (DataError, KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile):
-        return None
 
-
-def _file(work: Path, chunk: int) -> Path:
-    return work / EDGES / f"{chunk}.npz"
+    def _file(self, chunk: int) -> Path:
+        return self.work / EDGES / f"{chunk}.npz"
 
 
 def _arrays(one: Observation) -> dict[str, Any]:

@@ -7,6 +7,7 @@ evidence/moved/               the voxels of moving points, tile by tile
 
 from __future__ import annotations
 
+import hashlib
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -73,6 +74,11 @@ class RunEvidence:
         """T_lidar_map (k, 4, 4) of the keyframe scans of every file; raises DataError."""
         return {path: read_poses(path) for path in self.keyframes}
 
+    @cached_property
+    def image_digests(self) -> dict[Path, NDArray[np.uint8]]:
+        """(k, 32) SHA-256 of what each keyframe scan of every file has seen; raises DataError."""
+        return {path: read_packed(path).digests() for path in self.keyframes}
+
     def keyframes_near(self, positions: NDArray[np.float64], reach_m: float) -> NearKeyframes | None:
         """The keyframe scans at most `reach_m` from the bounding box of positions (m, 3) m; None if there are none.
 
@@ -103,6 +109,17 @@ class PackedKeyframes:
     T_lidar_map: NDArray[np.float64]
     """(k, 4, 4)."""
     rows: Rows
+
+    def digests(self) -> NDArray[np.uint8]:
+        """(k, 32) SHA-256 of each image and of its rows."""
+        images = np.split(self.packed, self.ends[:-1])
+        rows = hashlib.sha256(self.rows.seen.tobytes())
+        found = []
+        for image in images:
+            one = rows.copy()
+            one.update(image.tobytes())
+            found.append(one.digest())
+        return np.frombuffer(b"".join(found), np.uint8).reshape(-1, 32)
 
     def scans(self, places: NDArray[np.intp]) -> KeyframeScans:
         """Those at some places; raises DataError when an image is damaged."""

@@ -18,6 +18,7 @@ from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.checkpoints import ChunkStore, open_store
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.waiting_points import WAITING
 from gnss_sem_map.memory import release_memory
@@ -89,7 +90,8 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
     with writing_to(waiting):
         waiting.mkdir()
     try:
-        for chunk in map_chunks(drive, numbers, waiting, store.folder, progress):
+        edges = EdgeWindows(store.folder, store.fingerprint)
+        for chunk in map_chunks(drive, numbers, waiting, edges, progress):
             store.write(chunk)
             del chunk
             release_memory(always=True)  # the next one needs what it has used

@@ -179,6 +179,7 @@ class _Refinement:
     def _made_from(self, around: Mapping[Block, str], figures: Figures) -> dict[Block, str]:
         """Digest of all that decides each block."""
         poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
+        images = np.concatenate([np.empty((0, 32), np.uint8), *self.raw.evidence.image_digests.values()])
         at = origins_of(poses)[:, :2]
         edge = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
         steps = self.settings.refinement
@@ -187,10 +188,11 @@ class _Refinement:
         for block in self._blocks:
             first, last = bounds_of(block)
             low, high = np.array(first) * edge, (np.array(last) + 1) * edge
-            near = poses[((at > low - reach) & (at < high + reach)).all(axis=1)]
+            near = ((at > low - reach) & (at < high + reach)).all(axis=1)
             # to 1 um: poses that were saved as quaternions come back with other last bits; + 0.0 makes -0.0 a 0.0
-            keyframes = hashlib.sha256((near.round(6) + 0.0).tobytes()).hexdigest()
-            found[block] = digest([around[block], asdict(figures), keyframes])
+            keyframes = hashlib.sha256((poses[near].round(6) + 0.0).tobytes())
+            keyframes.update(images[near].tobytes())
+            found[block] = digest([around[block], asdict(figures), keyframes.hexdigest()])
         return found
 
     def _made(self, made_from: Mapping[Block, str], said: Mapping[Block, Any]) -> dict[Tile, Made]:

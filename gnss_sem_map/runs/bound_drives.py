@@ -167,9 +167,10 @@ def locate_one(source: Mapping[str, Any], settings: str, origin: Sequence[float]
 def _locate_one(source: Source, settings: Settings, frame: LocalFrame, work: Path) -> None:
     log, folder = source.open_log().in_our_conventions(settings.sensors), work / BOUND / source.name
     fingerprint = _fingerprint(log, settings, frame)
-    if _is_located(folder, fingerprint):  # before an interruption
-        return
-    with run_folder.claimed_run(work / DRIVES / source.name) as claim:
+    # it waits: a cluster may call a task again while the call that it took for lost goes on
+    with run_folder.claimed_run(work / DRIVES / source.name, waits=True) as claim:
+        if _is_located(folder, fingerprint):  # before an interruption, or by that call
+            return
         for name in (LOCATED, JOB):  # of the drive as it was
             (folder / name).unlink(missing_ok=True)
         match = SavedMatches(source, claim.work, resume=True, mapped_next=False)

@@ -19,8 +19,6 @@ from gnss_sem_map.runs.drive_job import other_drive, read_job, write_job
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.segmentation.cached_segmenter import CachedSegmenter
 
-RANGES_PER_WORKER, LEAST_CHUNKS = 1, 2
-"""Shorter ranges end more evenly, but each processes a window of scans before it and one after it as well."""
 CHUNKS_ON_CLUSTER = 4
 """Chunks of a range on a cluster, whose workers come and go."""
 
@@ -48,17 +46,17 @@ class ChunkTasks:
             yield range(*task.arguments[2:])
 
     def _length(self, chunks: int) -> int:
-        """Chunks of a range."""
+        """Chunks of a range. Shorter ones end more evenly, but each looks at a window of scans before it as well."""
         if isinstance(self.executor, Cluster):
             return CHUNKS_ON_CLUSTER
-        of_worker = math.ceil(chunks / self.executor.workers)
-        return max(math.ceil(of_worker / RANGES_PER_WORKER), min(of_worker, LEAST_CHUNKS))
+        return math.ceil(chunks / self.executor.workers)
 
 
 def map_range(work: str, fingerprint: str, start: int, stop: int) -> None:
     """Map the chunks of a range that are not mapped yet: a task. Raises DataError if the drive is another one here."""
     drive, store = _opened(work, fingerprint)
-    left = sorted(set(range(start, stop)) - store.done())
+    # a chunk may be of an earlier run, of which a cluster still mapped something when this one began
+    left = [number for number in range(start, stop) if not store.is_whole(number)]
     if left:
         fusion.map_range(drive, store, range(left[0], stop))
 

@@ -1,13 +1,13 @@
 """Each of many drives is mapped into a folder of its own: a task, which is the name of a function, paths and settings.
 
 WORK/drives/config.yaml    the settings, for tasks
+            failed.json    the drives that have failed
             NAME/          raw map, evidence, trajectory, run.json and report of one drive
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,30 +15,40 @@ from typing import Any
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import config, pipeline
 from gnss_sem_map.config import Settings
-from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
-from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.files.untrusted import is_file
 from gnss_sem_map.files.work_folder import DRIVES
-from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.execution import failure_of
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
 from gnss_sem_map.runs.match_tasks import SavedMatches
-from gnss_sem_map.runs.run_settings import differing, read_settings
+from gnss_sem_map.runs.same_run import digest_of, is_made_from
 from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source
+from gnss_sem_map.voxels.reuse import read_record, write_record
+
+FAILED = "failed.json"
 
 
 def map_all(sources: Sequence[Source], bound: BoundDrives, force: bool, run: SeveralDrives) -> dict[str, str]:
     """Map every drive into the work folder; name -> reason of those that fail."""
+    if not sources:
+        return {}
     more = (
         (str(run.work / DRIVES / source.name), force, str(bound.corrections.get(source.name, "")))
         for source in sources
     )
     reasons = run.call(map_one, "drives", zip(sources, more, strict=True))
     return {name: reason.removeprefix(f"{name}: ") for name, reason in reasons.items() if reason}
+
+
+def save_failed(failed: Mapping[str, str], run: SeveralDrives) -> None:
+    """Save which drives have failed, and why; raises DataError."""
+    write_record(dict(failed), run.work / DRIVES / FAILED)
+
+
+def failed_before(run: SeveralDrives) -> set[str]:
+    """Names of the drives that had failed when the run was interrupted."""
+    return set(read_record(run.work / DRIVES / FAILED) or ())
 
 
 def map_one(
@@ -66,11 +76,11 @@ def _map_one(
     source: Source, settings: Settings, frame: LocalFrame, folder: Path, force: bool, correction_file: str
 ) -> None:
     log, (correction, digest) = source.open_log(), read_correction(correction_file)
-    read = fingerprints.of_log(log, source.labels_from, open_label_set(settings.classes))
-    # what is not to be used was removed before
-    if _is_done(folder, settings, source.inputs, frame, read, digest):
-        return
-    with run_folder.claimed_run(folder, run_folder.places_read([source], settings)) as claim:
+    read = digest_of(log, source, settings)
+    # it waits: a cluster may call a task again while the call that it took for lost goes on
+    with run_folder.claimed_run(folder, run_folder.places_read([source], settings), waits=True) as claim:
+        if is_made_from(folder, source, settings, frame, read, digest):
+            return
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
         with new_folder(folder, all_content=True) as part:
@@ -81,18 +91,3 @@ def _map_one(
                 write=partial(run_folder.write_trajectory_files, part, delivery=settings.delivery),
             )  # fmt: skip
             run_folder.write_drive(part, source, mapped, settings, read, digest)
-
-
-def _is_done(
-    folder: Path, settings: Settings, inputs: dict[str, Any], frame: LocalFrame, read: str, correction: str
-) -> bool:
-    """Whether a folder holds this drive, mapped from the same inputs in the same way."""
-    if not is_file(folder / "run.json"):
-        return False
-    try:
-        about = read_run(folder)
-        same = about["inputs"] == inputs and about["local_frame"] == asdict(frame)
-        same = same and about["read"] == read and about["correction"] == correction
-        return bool(same and not differing(read_settings(folder), settings))
-    except (SemMapError, KeyError):
-        return False

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -15,14 +16,20 @@ LONGEST_TASK_S = 86_400.0
 
 
 @contextmanager
-def executor_of(workers: int, scheduler: str | None, work: Path) -> Iterator[Processes | Cluster | None]:
+def executor_of(
+    workers: int, scheduler: str | None, work: Path, reads: Iterable[Path | str | None]
+) -> Iterator[Processes | Cluster | None]:
     """Processes, or the workers of the Dask scheduler at an address; None for this process.
 
-    `work` is the work folder of the run. Raises ConfigError and DataError for a cluster that cannot do the tasks.
+    `work` is the work folder of the run, and it `reads` these inputs; what is not there is told later. Raises
+    ConfigError and DataError for a cluster that cannot do the tasks.
     """
     if scheduler is not None:
         work_folder.make(work)
-        cluster = Cluster(scheduler, work, timeout_s=LONGEST_TASK_S)
+        there = [
+            Path(os.path.abspath(place)) for place in reads if place is not None and os.path.exists(place)
+        ]
+        cluster = Cluster(scheduler, work, tuple(there), timeout_s=LONGEST_TASK_S)
         cluster.check()
         yield cluster
     elif workers > 1:

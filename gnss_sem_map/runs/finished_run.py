@@ -23,6 +23,7 @@ from gnss_sem_map.export.changes import copy_changes
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.export.georeference import check_delivery
+from gnss_sem_map.files import ownership, work_folder
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import (
     locked,
@@ -31,6 +32,7 @@ from gnss_sem_map.files.output_folder import (
     read_whole,
     real_path,
     refuse_inputs,
+    restore,
 )
 from gnss_sem_map.files.ownership import amend_all
 from gnss_sem_map.files.run_json import inputs_of, read_run
@@ -41,6 +43,7 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.fusion import GEOMETRY_ONLY
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
+from gnss_sem_map.mapping.refining import REFINED
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.about import about_map, about_skips, with_objects
@@ -48,9 +51,16 @@ from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.executors import executor_of
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.merged_run import write_merged
-from gnss_sem_map.runs.point_label_files import LABELS, RAW_LABELS, LabelledDrive, write_point_labels
+from gnss_sem_map.runs.point_label_files import (
+    LABELS,
+    RAW_LABELS,
+    LabelledDrive,
+    has_point_labels,
+    write_point_labels,
+)
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.run_settings import SETTINGS, differing, read_settings, write_settings
+from gnss_sem_map.runs.same_run import digest_of, is_made_from
 from gnss_sem_map.runs.source import Source, absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
@@ -90,13 +100,18 @@ def run(
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
     source = source_of(drive, segmenter, frames, drive_format, device)
-    with run_folder.claimed_run(out, run_folder.places_read([source], settings), is_resumable=True) as claim:
+    places = run_folder.places_read([source], settings)
+    with run_folder.claimed_run(out, places, is_resumable=True) as claim:
         log = log or source.open_log()
         run_folder.georeference_of(settings, origin or log.frame)
         refuse_inputs(claim.out, sorted(log.folders))
+        read = digest_of(log, source, settings)
+        if resume and _is_finished(out, source, settings, origin or log.frame, read, write_labels):
+            work_folder.clear(claim.work)  # it was killed when the map was there already
+            return Run(out)
         network = source.open_network(settings, log)
         with new_folder(out) as folder:
-            with executor_of(workers, scheduler, claim.work) as executor:
+            with executor_of(workers, scheduler, claim.work, places) as executor:
                 match = SavedMatches(source, claim.work, executor, resume)
                 register = None if executor is None else RevisitTasks(source, claim.work, executor)
                 elsewhere = None if executor is None else ChunkTasks(source, executor)
@@ -109,8 +124,20 @@ def run(
                 refined = pipeline.refine(
                     folder, settings, mapped.stats, progress, executor=executor, work=claim.work
                 )
-            run_folder.write_run(folder, source, mapped, refined, settings, write_labels, progress)
+            run_folder.write_run(folder, source, mapped, refined, settings, read, write_labels, progress)
     return Run(out)
+
+
+def _is_finished(
+    out: Path, source: Source, settings: Settings, frame: LocalFrame | None, read: str, write_labels: bool
+) -> bool:
+    """Whether a folder holds the whole map of this drive, with point labels if they are to be written."""
+    is_there = ownership.is_whole(out) and is_folder(out / REFINED) and not is_folder(out / DRIVES)
+    return (
+        is_there
+        and write_labels <= has_point_labels(out)
+        and is_made_from(out, source, settings, frame, read)
+    )
 
 
 @dataclass(frozen=True)
@@ -123,6 +150,7 @@ class Run:
     def open(cls, folder: Path | str) -> Run:
         """Raises DataError for a folder that holds no finished map."""
         folder = Path(folder)
+        restore(folder, run_folder.is_run_file)
         read_run(folder)
         if not is_folder(folder / "refined"):
             raise DataError(f"{shown(folder)}: found no map in it; expected the -o of `gnss-sem-map run`")

@@ -34,10 +34,11 @@ from gnss_sem_map.mapping.trajectory import check_georeference
 from gnss_sem_map.run_stats import Progress, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
-from gnss_sem_map.runs.drive_tasks import map_all
+from gnss_sem_map.runs.drive_tasks import failed_before, map_all, save_failed
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.point_label_files import RAW_LABELS
+from gnss_sem_map.runs.point_label_files import has_point_labels
 from gnss_sem_map.runs.run_settings import read_settings
+from gnss_sem_map.runs.same_run import is_map_of
 from gnss_sem_map.runs.several_drives import SeveralDrives
 from gnss_sem_map.runs.source import Source, source_of
 from gnss_sem_map.runs.tracks import tracks_of
@@ -107,8 +108,12 @@ def run_drives(
     places = run_folder.places_read(sources, settings)
     with (
         run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
-        executor_of(workers, scheduler, claim.work) as workers_of_run,
+        executor_of(workers, scheduler, claim.work, places) as workers_of_run,
     ):
+        is_there = how.resume and align_to is None and write_labels <= has_point_labels(out)
+        if is_there and is_map_of(out, sources, settings, frame):
+            work_folder.clear(claim.work)  # it was killed when the map was there already
+            return ManyDrives(out, read_run(out))
         run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
         _begin(run, how.resume)
         base = None if align_to is None else read_base(align_to, frame)
@@ -134,8 +139,13 @@ def _bound_and_mapped(
     while True:
         stay = [source for source in sources if source.name not in failed]
         bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base)
-        failing = map_all(stay, bound, force, run)
+        # first those that failed before an interruption: the others may be done without them
+        first = [source for source in stay if source.name in failed_before(run)]
+        failing = map_all(first, bound, force, run)
+        if failing.keys().isdisjoint(bound.corrections):
+            failing |= map_all([source for source in stay if source not in first], bound, force, run)
         failed |= failing
+        save_failed(failed, run)
         if failing.keys().isdisjoint(bound.corrections):
             return bound, failed
 
@@ -155,47 +165,56 @@ def frame_of_all(
     return frame
 
 
-def has_point_labels(out: Path) -> bool:
-    """Whether a finished map has labels of LiDAR points: a drive that is added or removed makes another map."""
-    return is_folder(out / RAW_LABELS) or any(out.glob(f"{DRIVES}/*/{RAW_LABELS}"))
-
-
 def add_drive(
     out: Path,
     drive: Path,
     how: HowMapped,
     *,
+    workers: int = 1,
+    scheduler: str | None = None,
     progress: Progress = silent,
 ) -> ManyDrives:
     """Add a drive to a finished map, with its settings and in its frame; raises DataError when the drive fails."""
     drive = _absolute(drive)
     added = [how.source(drive)]
-    with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
+    places = run_folder.places_read(added)
+    with (
+        run_folder.claimed_run(out, places, is_resumable=True) as claim,
+        executor_of(workers, scheduler, claim.work, places) as workers_of_run,
+    ):
         settings, frame, there = _opened(out)  # now no other command can change it
         if how.resume and drive.name in there and _is_of(there[drive.name], added[0]):
             work_folder.clear(claim.work)  # it was killed when the map was there already
             return ManyDrives(out, read_run(out))
         known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
         _check_distinct([*known, (drive.name, drive)])
-        run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
+        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
         about = _changed(out, there, added, how, run)
     return ManyDrives(out, about)
 
 
-def remove_drive(out: Path, name: str, progress: Progress = silent) -> ManyDrives:
+def remove_drive(
+    out: Path,
+    name: str,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    resume: bool = False,
+    progress: Progress = silent,
+) -> ManyDrives:
     """Take a drive out of a finished map; raises DataError when it is not there, or the only one."""
-    with run_folder.claimed_run(out) as claim:
+    with (
+        run_folder.claimed_run(out, is_resumable=True) as claim,
+        executor_of(workers, scheduler, claim.work, ()) as workers_of_run,
+    ):
         settings, frame, there = _opened(out)
         stay = {known: folder for known, folder in there.items() if known != name}
         if len(stay) == len(there):
             raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
         if not stay:
             raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
-        run = SeveralDrives(settings, frame, claim.work, InProcess(), progress)
-        try:
-            about = _changed(out, stay, [], HowMapped(force=True), run)
-        finally:
-            work_folder.remove_drives(claim.work)  # nothing resumes a removal
+        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
+        about = _changed(out, stay, [], HowMapped(force=True, resume=resume), run)
     return ManyDrives(out, about)
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
+from gnss_sem_map.files.untrusted import is_folder
+from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.machine import threads
 from gnss_sem_map.mapping import evidence
@@ -29,6 +31,11 @@ from gnss_sem_map.voxels.tiles import TiledMap
 RAW_LABELS = "labels_raw"
 LABELS = ("labels", RAW_LABELS, "confidence", "looks", "removed")
 """Folders of the point labels of one drive."""
+
+
+def has_point_labels(out: Path) -> bool:
+    """Whether a finished map has labels of LiDAR points, as it is or of its drives."""
+    return is_folder(out / RAW_LABELS) or any(out.glob(f"{DRIVES}/*/{RAW_LABELS}"))
 
 
 @dataclass(frozen=True, eq=False)

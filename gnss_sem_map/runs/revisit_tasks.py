@@ -54,11 +54,11 @@ class RevisitTasks:
         if len(pairs) <= PAIRS_PER_TASK:  # a worker would take as long to open the drive
             yield from (register_pair([places], pair, settings.trajectory.revisits) for pair in pairs)
             return
-        fingerprint = fingerprints.of_matches(log, trajectory, settings)
+        stamps, sweeps = places.stamps.tolist(), sorted(places.maps.sweeps.numbers)
+        fingerprint = _fingerprint(log, trajectory, settings, stamps, sweeps)
         work_folder.make(self.work)
         folder = (self.work / REVISITS).resolve()
         folder.mkdir(exist_ok=True)
-        stamps, sweeps = places.stamps.tolist(), sorted(places.maps.sweeps.numbers)
         write_job(folder, self.source, settings, trajectory, fingerprint, stamps=stamps, sweeps=sweeps)
         groups = [pairs[start : start + PAIRS_PER_TASK] for start in range(0, len(pairs), PAIRS_PER_TASK)]
         function = path_of(register_some)
@@ -74,8 +74,8 @@ class RevisitTasks:
 def register_some(folder: str, fingerprint: str, number: int, pairs: list[list[int]]) -> list[Any]:
     """Register pairs, and save what was found: a task. Raises DataError if the drive is another one here."""
     file = Path(folder) / f"{number}.json"
-    passes, settings, places = _opened(folder, fingerprint)
-    made_from = digest([fingerprint, places, settings.model_dump_json(), pairs])
+    passes, settings = _opened(folder, fingerprint)
+    made_from = digest([fingerprint, pairs])
     known = read_record(file)
     if known is not None and known.get("made_from") == made_from:
         return list(known["found"])
@@ -85,17 +85,25 @@ def register_some(folder: str, fingerprint: str, number: int, pairs: list[list[i
 
 
 @lru_cache(1)
-def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings, list[Any]]:
-    """The places of a job, and what the job says of them: opened once for all tasks of a worker."""
+def _opened(folder: str, fingerprint: str) -> tuple[list[Pass], RevisitSettings]:
+    """The places of a job: opened once for all tasks of a worker."""
     about, source, settings, log, trajectory = read_job(Path(folder))
-    if not fingerprints.of_matches(log, trajectory, settings) == about["fingerprint"] == fingerprint:
+    here = _fingerprint(log, trajectory, settings, about["stamps"], about["sweeps"])
+    if not here == about["fingerprint"] == fingerprint:
         raise other_drive(source)
     stamps = np.array(about["stamps"])
     sweeps = sweeps_of(log, about["sweeps"], Path(folder).parent / SWEEPS)
     maps = LocalMaps(sweeps, trajectory, stamps)
     anchors = np.empty(0, np.intp)  # of the graph, which is elsewhere
-    places = [about["stamps"], about["sweeps"]]
-    return [Pass(anchors, stamps, trajectory.at(stamps), maps)], settings.trajectory.revisits, places
+    return [Pass(anchors, stamps, trajectory.at(stamps), maps)], settings.trajectory.revisits
+
+
+def _fingerprint(
+    log: SensorLog, trajectory: Trajectory, settings: Settings, stamps: list[float], sweeps: list[int]
+) -> str:
+    """Digest of all that decides what is found, but the pairs: a worker of a cluster outlives a run."""
+    of_drive = fingerprints.of_matches(log, trajectory, settings)
+    return digest([of_drive, settings.trajectory.revisits.model_dump_json(), stamps, sweeps])
 
 
 def _packed(found: Found | None) -> Any:

@@ -73,10 +73,10 @@ def is_run_file(name: str) -> bool:
 
 @contextmanager
 def claimed_run(
-    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False
+    out: Path, inputs: Iterable[Path | str | None] = (), is_resumable: bool = False, waits: bool = False
 ) -> Iterator[Claim]:
     """Hold the output folder of a run exclusively; see `files.output_folder.claimed`."""
-    with claimed(out, inputs, is_run_file, is_resumable) as claim, leaving_all():
+    with claimed(out, inputs, is_run_file, is_resumable, waits) as claim, leaving_all():
         yield claim
 
 
@@ -95,10 +95,14 @@ def write_run(
     mapped: Mapped,
     refined: Refined,
     settings: Settings,
+    read: str,
     write_labels: bool,
     progress: Progress = silent,
 ) -> None:
-    """Write everything that a run of one drive made beside its maps, which are in the folder already."""
+    """Write everything that a run of one drive made beside its maps, which are in the folder already.
+
+    `read`: digest of all that was read.
+    """
     refined = replace(refined, report=with_objects(refined.report, mapped))
     if write_labels:
         with mapped.stats.stage("labels"):
@@ -110,7 +114,7 @@ def write_run(
         scans = mapped.log.scans
         track = mapped.trajectory.during(scans[0].stamp, scans[-1].stamp)
         write_map_files(folder, [track], mapped.log.name, settings.delivery, progress=progress)
-    about = about_mapped(source, mapped) | {"map": about_map(folder, refined.report)}
+    about = about_mapped(source, mapped) | {"read": read, "map": about_map(folder, refined.report)}
     write_about(folder, settings, about, metrics_of(mapped))
 
 

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import laspy
 import numpy as np
@@ -26,7 +26,7 @@ from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import passes
 from gnss_sem_map.mapping.trajectory import locate
 from gnss_sem_map.run_stats import RunStats
-from gnss_sem_map.runs import bound_drives, finished_run, many_drives
+from gnss_sem_map.runs import bound_drives, finished_run, many_drives, run_folder
 from gnss_sem_map.runs.bound_drives import KnownTrack, groups_of
 from gnss_sem_map.runs.finished_run import Run
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
@@ -105,8 +105,12 @@ def test_both_days_lie_to_each_other_as_they_were_driven(
     assert np.linalg.norm(found - true, axis=1).min() > 0.1
 
 
+def stopped(*_: object, **__: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
 def test_a_day_that_is_added_moves_the_first_one_as_a_run_of_both_does(
-    days: list[Path], both: Path, tmp_path: Path
+    days: list[Path], both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     finished_run.run(days[0], out, None, Settings(), force=True)
@@ -115,7 +119,12 @@ def test_a_day_that_is_added_moves_the_first_one_as_a_run_of_both_does(
     found, expected = products(out), products(both)
     assert [name for name in expected if found.get(name) != expected[name]] == []
     assert found.keys() == expected.keys()
-    remove_drive(out, days[1].name)
+    with monkeypatch.context() as patch:
+        patch.setattr(many_drives, "write_drives", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            remove_drive(out, days[1].name)
+    monkeypatch.setattr(run_folder, "write_drive", stopped)  # the first day was mapped again
+    remove_drive(out, days[1].name, resume=True)
     assert products(out)[f"drives/{days[0].name}/trajectory.tum"] == alone["trajectory.tum"]
 
 
@@ -131,12 +140,27 @@ def test_a_drive_is_not_added_where_one_that_it_moves_is_gone(days: list[Path], 
     assert products(out) == before
 
 
-def test_a_drive_that_is_left_out_moves_no_other(days: list[Path], tmp_path: Path) -> None:
+def test_a_drive_that_is_left_out_moves_no_other(
+    days: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its labels are missing, which is seen when all drives are bound and it is mapped."""
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels" / days[0].name).symlink_to(days[0] / "truth/train_ids")
     how = HowMapped(f"labels:{tmp_path}/labels/{{drive}}", force=True)
-    made = run_drives(days, tmp_path / "both", Settings(), how)
+    with monkeypatch.context() as patch:
+        patch.setattr(many_drives, "write_drives", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run_drives(days, tmp_path / "both", Settings(), how)
+    mapped: list[str] = []
+    write_drive = run_folder.write_drive
+
+    def noted(folder: Path, source: Source, *rest: Any) -> None:
+        mapped.append(source.name)
+        write_drive(folder, source, *rest)
+
+    monkeypatch.setattr(run_folder, "write_drive", noted)
+    made = run_drives(days, tmp_path / "both", Settings(), replace(how, resume=True))
+    assert mapped == [], "the other one was mapped when this one had failed"
     assert list(made.failed) == [days[1].name]
     assert made.about["passes"] == []
     run_drives(days[:1], tmp_path / "one", Settings(), how)

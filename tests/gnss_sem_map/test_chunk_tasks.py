@@ -98,7 +98,7 @@ def test_dask_maps_the_bytes_of_this_process(
     distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
     (tmp_path / "work").mkdir()
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50
     ) as cluster:
         executor = Cluster(cluster.scheduler_address, tmp_path / "work")
         assert files_of(shared(drive, source, tmp_path / "work", executor)) == expected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -113,6 +114,29 @@ def test_a_worker_that_finds_another_trajectory_registers_again(
         RevisitTasks(small_source, tmp_path, InProcess())(small_log, moved, SETTINGS)([there], PAIRS)
     )
     assert_same(found, [register_pair([there], pair, SETTINGS.trajectory.revisits) for pair in PAIRS])
+
+
+def test_a_worker_that_outlives_a_run_takes_the_places_and_settings_of_the_next_one(
+    small_log: SensorLog, small_track: Trajectory, small_source: Source, places: Pass, tmp_path: Path
+) -> None:
+    """In the same folder, with the same sweeps and the same pairs of numbers, as of a cluster."""
+    looser = Settings.model_validate({"trajectory": {"revisits": {"min_inlier_share": 0.05}}})
+    later = places.stamps + 0.1
+    there = Pass(
+        places.anchors, later, small_track.at(later), LocalMaps(places.maps.sweeps, small_track, later)
+    )
+    for settings, at in ((SETTINGS, places), (looser, places), (looser, there)):
+        registrar = RevisitTasks(small_source, tmp_path, InProcess())(small_log, small_track, settings)
+        expected = [register_pair([at], pair, settings.trajectory.revisits) for pair in PAIRS]
+        assert_same(list(registrar([at], PAIRS)), expected)
+        assert revisit_tasks._opened.cache_info().currsize == 1
+        _, opened = revisit_tasks._opened(*_last_job(tmp_path))
+        assert opened == settings.trajectory.revisits
+
+
+def _last_job(work: Path) -> tuple[str, str]:
+    folder = work / "revisits"
+    return str(folder.resolve()), json.loads((folder / "job.json").read_text())["fingerprint"]
 
 
 def test_a_worker_that_finds_another_drive_says_so(

@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NoReturn
@@ -22,10 +23,14 @@ from street_drives import Drives
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.files.output_folder import RESUMABLE
-from gnss_sem_map.files.ownership import CONTENT_BYTES
-from gnss_sem_map.runs import many_drives, run_folder
+from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
+from gnss_sem_map.mapping.execution import Task
+from gnss_sem_map.mapping.worker_processes import Processes
+from gnss_sem_map.runs import finished_run, many_drives, run_folder
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
+from gnss_sem_map.runs.source import source_of
 from gnss_sem_map.sensor_log import SensorLog
 
 KILLED_BY_ITSELF = """
@@ -103,10 +108,9 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, calls = shutil.copytree(made["ab"], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
-    removing = stop_of(lambda: remove_drive(out, "b"), many_drives, "write_drives")
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    stop_of(lambda: remove_drive(out, "b"), many_drives, "write_drives")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"], "no drive was to be mapped again"
     adding = stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
-    assert not hasattr(removing, "__notes__"), "nothing resumes a removal"
     assert adding.__notes__ == [RESUMABLE.format(tmp_path / ".out.work")]
     calls.clear()
     assert products(out) == products(made["ab"])
@@ -176,6 +180,70 @@ def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
     add_drive(out, drives.by_name["c"], again)
     assert_same(out, made["abc"])
     assert not work.exists()
+
+
+@pytest.mark.parametrize("names", ["a", "ab"])
+def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
+    names: str, made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    out, calls = shutil.copytree(made[names], tmp_path / "out"), calls_of_the_pipeline(monkeypatch)
+
+    def resumed(**more: Any) -> None:
+        (tmp_path / ".out.work/matches").mkdir(parents=True)  # it was killed when it cleaned up
+        write_list(tmp_path / ".out.work")
+        if len(names) == 1:
+            more = {"settings": SETTINGS, **more}
+            finished_run.run(drives.by_name["a"], out, drives.labels, force=True, resume=True, **more)
+        else:
+            places, again = [drives.by_name[name] for name in names], replace(how, resume=True)
+            run_drives(places, out, more.pop("settings", SETTINGS), again, **more)
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    before = (out / "run.json").stat()
+    resumed()
+    assert calls == []
+    assert os.path.samestat((out / "run.json").stat(), before)
+    resumed(write_labels=True)
+    assert calls == list(names)
+    calls.clear()
+    resumed(write_labels=True)
+    assert calls == []
+    resumed(settings=SETTINGS.changed("mapping.voxel_size_m=0.4"))
+    assert calls == list(names)
+
+
+def test_commands_find_the_result_that_a_killed_one_had_moved_away(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out, work = tmp_path / "out", tmp_path / ".out.work"
+    for words in (
+        ["add", out, drives.by_name["c"], "--segmenter", drives.labels, "--force"],
+        ["refine", out],
+    ):
+        shutil.rmtree(out, ignore_errors=True)
+        work.mkdir()
+        write_list(work)
+        shutil.copytree(made["ab"], work / "old")
+        done = gnss_sem_map(*words)
+        assert done.returncode == 0, done.stderr
+        assert_same(out, made["abc" if "add" in words else "ab"])
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
+    """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
+    settings, folder, call = tmp_path / "config.yaml", tmp_path / "drives/a", "map_one"
+    settings.write_text(SETTINGS.to_yaml())
+    folder.parent.mkdir()
+    frame = open_drive(drives.by_name["a"]).frame
+    source = source_of(drives.by_name["a"], drives.labels)
+    words = asdict(source), str(settings), astuple(frame), str(folder), True, ""
+    task = Task("a", f"gnss_sem_map.runs.drive_tasks:{call}", words)
+    with closing(Processes(2)) as processes:
+        assert [reason for _, reason in processes.run([task, replace(task)])] == ["", ""]
+    assert (folder / "run.json").is_file()
+    assert [path.name for path in folder.parent.iterdir()] == ["a"]
 
 
 def test_a_drive_that_was_added_while_another_command_began_stays(

@@ -88,7 +88,7 @@ def test_a_map_from_which_a_drive_was_taken_is_that_of_the_others(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
     out = shutil.copytree(made["abc"], tmp_path / "out")
-    remove_drive(out, "c")
+    remove_drive(out, "c", workers=2)
     assert_same(out, made["ab"])
     remove_drive(out, "a")
     frame = read_frame(made["ab"] / "map")
@@ -162,7 +162,8 @@ def test_every_drive_has_the_point_labels_of_the_map_of_all(
     assert labels["a"] != alone, "the other drive sees the same walls"
     Run.open(out).refine(SETTINGS)
     assert {name: labels_of(out / "drives" / name) for name in "ab"} == labels
-    done = gnss_sem_map("add", out, drives.by_name["c"], "--segmenter", drives.labels, "--force")
+    words = "--segmenter", drives.labels, "--force", "--workers", "2"
+    done = gnss_sem_map("add", out, drives.by_name["c"], *words)
     assert done.returncode == 0
     assert "warning: the point labels were those of the map as it was, and are gone" in done.stderr
     assert_same(out, made["abc"])

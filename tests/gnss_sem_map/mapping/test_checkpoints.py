@@ -201,6 +201,22 @@ def test_a_chunk_that_is_there_already_is_left_as_it_is(drive: Drive, tmp_path: 
     assert {path.name for path in (tmp_path / "work").iterdir() if path.name.endswith(".part")} == set()
 
 
+def test_a_chunk_of_another_run_that_came_late_is_replaced(
+    drive: Drive, at_once: tuple[Maps, RunStats], tmp_path: Path
+) -> None:
+    """A cluster goes on with what it has under way when a command is killed."""
+    drive = by_chunks(drive, 2)
+    other = map_scans(drive, tmp_path / "other", RunStats(), labels_from="elsewhere")
+    store = map_scans(drive, tmp_path / "work", RunStats())
+    shutil.rmtree(tmp_path / "work/1")
+    shutil.copytree(other.folder / "1", tmp_path / "work/1")
+    with pytest.raises(DataError, match="damaged chunk"):
+        replace(store).records()
+    map_range(drive, store, range(1, 2))
+    assert store.is_whole(1)
+    assert [path.name for path in (tmp_path / "work").iterdir() if path.name.endswith(".part")] == []
+
+
 def test_a_chunk_that_is_damaged_under_way_is_named_and_never_used(drive: Drive, tmp_path: Path) -> None:
     store = map_scans(by_chunks(drive, 2), tmp_path / "work", RunStats())
     tile = sorted((tmp_path / "work/1").glob("static/*.parquet"))[0]

@@ -16,6 +16,7 @@ from counted_reads import counted
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.mapping.chunks import MappedChunk, chunks_of, map_chunks
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.evidence import read_moving_points
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, labelled_scans
@@ -54,7 +55,12 @@ def moving() -> Drive:
 def together(moving: Drive, tmp_path_factory: pytest.TempPathFactory) -> list[MappedChunk]:
     """All chunks, mapped in one go."""
     return list(
-        map_chunks(moving, range(3), tmp_path_factory.mktemp("waiting"), tmp_path_factory.mktemp("work"))
+        map_chunks(
+            moving,
+            range(3),
+            tmp_path_factory.mktemp("waiting"),
+            EdgeWindows(tmp_path_factory.mktemp("work"), ""),
+        )
     )
 
 
@@ -97,7 +103,11 @@ def test_the_chunks_say_the_same_for_any_division_among_processes(
 ) -> None:
     waiting = tmp_path / "waiting"
     waiting.mkdir()
-    apart = [chunk for numbers in ranges for chunk in map_chunks(moving, numbers, waiting, tmp_path)]
+    apart = [
+        chunk
+        for numbers in ranges
+        for chunk in map_chunks(moving, numbers, waiting, EdgeWindows(tmp_path, ""))
+    ]
     apart.sort(key=lambda chunk: chunk.number)
     assert [chunk.number for chunk in apart] == [0, 1, 2]
     assert sum(len(chunk.removed) for chunk in together) > 100
@@ -112,20 +122,23 @@ def assert_same_chunks(apart: list[MappedChunk], together: list[MappedChunk]) ->
             assert same_value, f"chunk {one.number}: {name}"
 
 
-@pytest.mark.parametrize("damage", [None, b"", b"PK\x03\x04 cut off"])
-def test_a_window_that_another_process_has_looked_at_is_not_read_again_unless_it_is_damaged(
-    moving: Drive, together: list[MappedChunk], damage: bytes | None, tmp_path: Path
+@pytest.mark.parametrize(
+    ("run", "damage"), [("this", None), ("another", None), ("this", b""), ("this", b"PK\x03\x04 cut off")]
+)
+def test_a_window_that_another_process_of_this_run_has_looked_at_is_not_read_again_unless_it_is_damaged(
+    moving: Drive, together: list[MappedChunk], run: str, damage: bytes | None, tmp_path: Path
 ) -> None:
     (waiting := tmp_path / "waiting").mkdir()
-    for _ in map_chunks(moving, range(1, 3), waiting, tmp_path):
+    for _ in map_chunks(moving, range(1, 3), waiting, EdgeWindows(tmp_path, run)):
         pass
     assert [path.name for path in (tmp_path / "edges").iterdir()] == ["1.npz"]
     if damage is not None:
         (tmp_path / "edges/1.npz").write_bytes(damage)
     drive, reads = counting(moving)
-    first = list(map_chunks(drive, range(1), waiting, tmp_path))
+    first = list(map_chunks(drive, range(1), waiting, EdgeWindows(tmp_path, "this")))
     assert_same_chunks(first, together[:1])
-    assert (7 in reads) == (damage is not None), "an odd one, which does not tell the rows"
+    is_read = run == "another" or damage is not None
+    assert (7 in reads) == is_read, "an odd one, which does not tell the rows"
 
 
 def counting(drive: Drive) -> tuple[Drive, Counter[int]]:
@@ -145,7 +158,7 @@ def test_a_range_of_chunks_reads_its_scans_and_a_window_on_either_side_once(
     drive, reads = counting(replace(moving, saved=tmp_path))
     _ = drive.image_rows  # their scans are saved, as when odometry has read them
     reads.clear()
-    for _ in map_chunks(drive, numbers, waiting, tmp_path):
+    for _ in map_chunks(drive, numbers, waiting, EdgeWindows(tmp_path, "")):
         pass
     assert reads.keys() == set(range(first, last))
     again = {number for number, times in reads.items() if times > 1}
@@ -205,4 +218,4 @@ def test_a_run_folder_holds_what_the_chunks_say(
 
 def test_points_that_cannot_wait_are_an_error_in_one_line(moving: Drive, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"nowhere: cannot be written .*run it again"):
-        list(map_chunks(moving, range(3), tmp_path / "nowhere", tmp_path))
+        list(map_chunks(moving, range(3), tmp_path / "nowhere", EdgeWindows(tmp_path, "")))

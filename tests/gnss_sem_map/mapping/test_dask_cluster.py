@@ -6,17 +6,16 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 import small_tasks
+from dask_clusters import started, two_workers
 from processes import wait_until
 
 from gnss_sem_map.errors import ConfigError, DataError, WriteError
@@ -28,12 +27,15 @@ distributed = pytest.importorskip("distributed", reason="the extra [cluster] is 
 pytestmark = pytest.mark.integration
 
 ALLOWED = "small_tasks."
-TESTS = Path(__file__).parents[2]
 OTHER_VERSION = "import importlib.metadata as m; m.version = lambda name: '0.0.1'"
 NO_PACKAGE = """
 import importlib.metadata as m
 def version(name): raise m.PackageNotFoundError(name)
 m.version = version
+"""
+NO_INPUT = """
+from gnss_sem_map.mapping import dask_cluster
+dask_cluster._missing = lambda paths: paths
 """
 OWN_FOLDER = """
 from pathlib import Path
@@ -44,18 +46,15 @@ dask_cluster._token_file = lambda *words: Path("/nowhere/file")
 
 def local_cluster(workers: int, **more: Any) -> Any:
     return distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, dashboard_address=None, silence_logs=50, **more
+        n_workers=workers, threads_per_worker=1, dashboard_address=":0", silence_logs=50, **more
     )
 
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of a cluster of two workers in processes of its own, as users have it."""
-    file = tmp_path_factory.mktemp("dask") / "scheduler.json"
-    with started("scheduler", file, "--port", "0", "--dashboard-address", ":0"):
-        assert wait_until(file.exists)
-        with started("worker", file, "--nthreads", "1", "--nworkers", "2", "--no-dashboard"):
-            yield json.loads(file.read_text())["address"]
+    with two_workers(tmp_path_factory.mktemp("dask")) as address:
+        yield address
 
 
 def task(function: str, *arguments: object) -> Task:
@@ -132,6 +131,12 @@ def test_errors_of_ours_name_the_dask_worker(scheduler: str, tmp_path: Path) -> 
         results(products(1), Cluster(scheduler, tmp_path))
 
 
+def test_a_scheduler_with_tls_but_no_certificates_is_told(scheduler: str, tmp_path: Path) -> None:
+    address = scheduler.replace("tcp:", "tls:")
+    with pytest.raises(ConfigError, match=f"scheduler {address}: Dask's configuration names no certificates"):
+        results(products(1), Cluster(address, tmp_path))
+
+
 @pytest.mark.parametrize(
     "address", ["tcp://127.0.0.1:1", "nonsense", "tcp://no.such.host.example:1", "foo://x:1"]
 )
@@ -155,12 +160,44 @@ def test_dask_that_is_not_installed_is_told(monkeypatch: pytest.MonkeyPatch, tmp
         (OTHER_VERSION, r"Dask worker tcp://\S+: has gnss-sem-map 0\.0\.1; expected \d+\.\d+\S*, as here"),
         (NO_PACKAGE, r"Dask worker tcp://\S+: has no gnss-sem-map \(.*\); install version \d"),
         (OWN_FOLDER, r"Dask worker tcp://\S+: does not share the folder /"),
+        (
+            NO_INPUT,
+            r"Dask worker tcp://\S+: does not see \S+ and 1 more, which is to be read; make it visible",
+        ),
     ],
 )
 def test_a_dask_worker_that_is_not_fit_is_refused_by_name(preload: str, message: str, tmp_path: Path) -> None:
+    reads = (tmp_path, tmp_path.parent)
     with local_cluster(1, preload=[preload]) as cluster, pytest.raises(DataError, match=message):
-        results(products(1), Cluster(cluster.scheduler_address, tmp_path, allowed=ALLOWED))
+        results(products(1), Cluster(cluster.scheduler_address, tmp_path, reads, allowed=ALLOWED))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dask_worker_with_several_threads_is_refused(tmp_path: Path) -> None:
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, dashboard_address=":0", silence_logs=50
+        ) as cluster,
+        pytest.raises(DataError, match=r"Dask worker tcp://\S+: has 2 threads, .*--nthreads 1"),
+    ):
+        results(products(1), Cluster(cluster.scheduler_address, tmp_path, allowed=ALLOWED))
+
+
+def test_a_dask_worker_that_comes_later_is_looked_at_before_it_is_counted(tmp_path: Path) -> None:
+    file = tmp_path / "scheduler.json"
+    (work := tmp_path / "work").mkdir()
+    with started("scheduler", file, "--port", "0", "--dashboard-address", ":0"):
+        assert wait_until(file.exists)
+        with started("worker", file, "--nthreads", "1", "--no-dashboard"):
+            cluster = Cluster(json.loads(file.read_text())["address"], work, allowed=ALLOWED)
+            (begun := tmp_path / "begun").mkdir()
+            running = run_tasks([task("process_and_threads", str(begun))] * 2000, cluster)
+            next(running)
+            with (
+                started("worker", file, "--nthreads", "1", "--no-dashboard", "--preload", NO_PACKAGE),
+                pytest.raises(DataError, match=r"Dask worker tcp://\S+: has no gnss-sem-map"),
+            ):
+                list(running)
 
 
 def test_a_dask_worker_that_comes_later_is_checked_too(
@@ -241,19 +278,3 @@ def test_a_dask_worker_that_dies_while_it_is_asked_is_left_out(
     monkeypatch.setattr(dask_cluster, "_has_nanny", partial(small_tasks.dies_once, str(dead)))
     assert len(results(products(4), Cluster(scheduler, work, allowed=ALLOWED))) == 4
     assert dead.is_dir()
-
-
-@contextmanager
-def started(what: str, scheduler_file: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A `dask scheduler` or `dask worker`, killed with all its processes at the end."""
-    command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--scheduler-file", str(scheduler_file)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), *sys.path])}
-    with (scheduler_file.parent / f"{what}.log").open("wb") as log:
-        process = subprocess.Popen(
-            [*command, *words], env=environment, start_new_session=True, stdout=log, stderr=log
-        )
-        try:
-            yield process
-        finally:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()

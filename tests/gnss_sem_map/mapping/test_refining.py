@@ -18,7 +18,7 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.mapping import refining
+from gnss_sem_map.mapping import evidence, refining
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.voxels import reuse, tiles
@@ -107,6 +107,24 @@ def test_only_blocks_near_a_new_keyframe_scan_are_refined_again(
     assert called == BLOCKS[1:3]
     assert linked(tmp_path / "run", before) == [*EVERY[:1], *EVERY[5:]]
     assert_as_from_scratch(tmp_path / "run", found, write_raw(tmp_path / "scratch", scans=True), refine)
+
+
+def test_blocks_near_a_keyframe_scan_that_saw_something_else_are_refined_again(
+    tmp_path: Path, refine: Any
+) -> None:
+    """Far away, where no voxel of theirs changes: its rays pass them all the same."""
+    earlier, run = write_raw(tmp_path / "earlier", scans=True), write_raw(tmp_path / "run", scans=True)
+    refine(earlier)
+    file = run / "evidence/keyframes/0.npz"
+    scans = evidence.read_keyframes(file)
+    images = scans.images.copy()
+    images[0][images[0] > 0] += 1000
+    evidence.write_keyframes(replace(scans, images=images), file)
+    found, called = refine(run, earlier)
+    assert called == BLOCKS[1:3]
+    scratch = write_raw(tmp_path / "scratch", scans=True)
+    evidence.write_keyframes(replace(scans, images=images), scratch / "evidence/keyframes/0.npz")
+    assert_as_from_scratch(run, found, scratch, refine)
 
 
 def test_a_map_that_stays_is_not_refined_again(before: Path, tmp_path: Path, refine: Any) -> None:

@@ -22,6 +22,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.fusion import map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import open_raw, write_raw
@@ -115,7 +116,7 @@ def test_chunks_of_two_lidars_are_the_same_for_any_division(moving: Drive, tmp_p
     count = len(chunks_of(both))
     waiting = tmp_path / "waiting"
     waiting.mkdir()
-    together = list(map_chunks(both, range(count), waiting, tmp_path))
+    together = list(map_chunks(both, range(count), waiting, EdgeWindows(tmp_path, "")))
     assert [chunk.number for chunk in together] == list(range(count))
     assert [chunk.lidar for chunk in together] == ["a"] * len(chunks_of(moving)) + ["second"] * (
         count - len(chunks_of(moving))
@@ -126,7 +127,7 @@ def test_chunks_of_two_lidars_are_the_same_for_any_division(moving: Drive, tmp_p
         apart = [
             chunk
             for part in (range(split, count), range(split))
-            for chunk in map_chunks(both, part, waiting, work)
+            for chunk in map_chunks(both, part, waiting, EdgeWindows(work, ""))
         ]
         for one, other in zip(together, sorted(apart, key=lambda chunk: chunk.number), strict=True):
             assert (one.number, one.lidar) == (other.number, other.lidar)

@@ -7,6 +7,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping.chunks import chunks_of, map_chunks
+from gnss_sem_map.mapping.edge_windows import EdgeWindows
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.segmentation import open_segmenter
 
@@ -20,7 +21,7 @@ def test_the_van_and_the_car_go_and_the_parked_vehicles_stay(real_data, tmp_path
         f"labels:{real_data / 'labels/kitti_raw_0005/probabilities'}", open_label_set()
     )
     drive = Drive(log, log.reference, segmenter, Settings())
-    chunks = map_chunks(drive, range(len(chunks_of(drive))), tmp_path, tmp_path)
+    chunks = map_chunks(drive, range(len(chunks_of(drive))), tmp_path, EdgeWindows(tmp_path, ""))
     moving = {number: points for chunk in chunks for number, points in chunk.moving.items()}
     figures = tracklets.removal(drive, moving, real_data / DRIVE)
     assert figures["moving_points"] > 5000

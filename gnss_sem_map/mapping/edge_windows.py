@@ -29,7 +29,7 @@ from gnss_sem_map.files.work_folder import EDGES
 
 @dataclass(frozen=True)
 class EdgeWindows:
-    """Those of the run with this fingerprint, in its work folder."""
+    """What the run with this fingerprint has saved in its work folder."""
 
     work: Path
     fingerprint: str

@@ -131,11 +131,11 @@ def run(
 def _is_finished(
     out: Path, source: Source, settings: Settings, frame: LocalFrame | None, read: str, write_labels: bool
 ) -> bool:
-    """Whether a folder holds the whole map of this drive, with point labels if they are to be written."""
+    """Whether a folder holds the whole map of this drive, with point labels just if they are to be written."""
     is_there = ownership.is_whole(out) and is_folder(out / REFINED) and not is_folder(out / DRIVES)
     return (
         is_there
-        and write_labels <= has_point_labels(out)
+        and write_labels == has_point_labels(out)
         and is_made_from(out, source, settings, frame, read)
     )
 

@@ -110,7 +110,7 @@ def run_drives(
         run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
         executor_of(workers, scheduler, claim.work, places) as workers_of_run,
     ):
-        is_there = how.resume and align_to is None and write_labels <= has_point_labels(out)
+        is_there = how.resume and align_to is None and write_labels == has_point_labels(out)
         if is_there and is_map_of(out, sources, settings, frame):
             work_folder.clear(claim.work)  # it was killed when the map was there already
             return ManyDrives(out, read_run(out))

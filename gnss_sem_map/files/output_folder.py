@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import logging
 import os
 import socket
 import stat
@@ -314,6 +315,12 @@ def locked(out: Path, waits: bool = False) -> Iterator[None]:
                 path.unlink()
 
 
+def refuse_locked(folder: Path) -> None:
+    """Raise DataError when something in a folder of ours is locked: then a task of an earlier run still writes it."""
+    for path in sorted(folder.glob(".*.lock")):
+        _lock(path, folder / path.name[1 : -len(".lock")], waits=False).close()
+
+
 @contextmanager
 def read_whole(*results: Path) -> Iterator[None]:
     """Read results that other commands may replace; raises DataError when one of them was.
@@ -357,11 +364,15 @@ def _lock(path: Path, out: Path, waits: bool) -> TextIO:
             raise DataError(f"{path}: is in the way, and no lock of ours; move it away")
         file = os.fdopen(number, "r+", encoding="utf-8", errors="replace")
         try:
-            fcntl.flock(file, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = file.read(200).strip() or f"{FIRST_WORDS} it"
-            file.close()
-            raise DataError(f"{out}: {holder}; wait for it, or choose another -o") from None
+            if not waits:
+                file.close()
+                raise DataError(f"{out}: {holder}; wait for it, or choose another -o") from None
+            logging.getLogger("gnss-sem-map").warning("%s: %s; waiting for it", out, holder)
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.seek(0)
         except OSError as error:
             if error.errno not in NO_LOCKS:
                 file.close()

@@ -75,7 +75,7 @@ def refuse_foreign(folder: Path) -> None:
         return
     if folder.is_symlink() or not folder.is_dir():
         raise DataError(f"{folder}: is in the way, and no folder of ours; move it away")
-    names = [path.relative_to(folder).as_posix() + "/" * _is_folder(path) for path in folder.rglob("*")]
+    names = list(_content(folder))
     if ownership.read_list(folder) is None and not all(map(ownership.is_partial, names)):
         raise DataError(f"{folder}: exists and holds no interrupted run; remove it")
     strange = [name for name in names if not OURS.fullmatch(name)]
@@ -83,6 +83,16 @@ def refuse_foreign(folder: Path) -> None:
         raise DataError(
             f"{folder / min(strange)}: is in the folder of an interrupted run, and not ours; move it away"
         )
+
+
+def _content(folder: Path) -> Iterator[str]:
+    """Paths of all within, those of folders with a slash, but for what another process removes meanwhile."""
+    for place, folders, files in os.walk(folder):
+        at = Path(place).relative_to(folder)
+        yield from (
+            (at / name).as_posix() + "/" * (not (Path(place) / name).is_symlink()) for name in folders
+        )
+        yield from ((at / name).as_posix() for name in files)
 
 
 def holds_work(folder: Path) -> bool:

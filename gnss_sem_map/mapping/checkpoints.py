@@ -101,9 +101,12 @@ class ChunkStore:
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
-            if not self.is_whole(number):  # of another run
-                shutil.rmtree(folder)
-                beside.rename(folder)
+            if self.is_whole(number):
+                return
+            if _fingerprint(self.folder / work_folder.CHUNKS) != self.fingerprint:
+                raise  # it is this run that has ended, and another one has begun
+            shutil.rmtree(folder)
+            beside.rename(folder)
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk is of this run, complete and undamaged."""

@@ -14,11 +14,10 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence, Set
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -95,14 +94,21 @@ class Cluster:
             workers.threads()  # looks at them for the first time
             yield workers
 
-    def refuse_unfit(self, client: Client, workers: Sequence[str]) -> None:
-        """Raise DataError when some of the workers cannot do our tasks."""
-        ask = partial(_asked, client, self.address, workers)
+    def refuse_unfit(self, client: Client, workers: Iterable[str]) -> set[str]:
+        """Those of the workers that answer all questions; raises DataError when one cannot do our tasks."""
+        fit = set(workers)
+
+        def ask(function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
+            answers = _asked(client, self.address, fit, function, *arguments)
+            fit.intersection_update(answers)
+            return answers
+
         _refuse_other_versions(ask)
         _refuse_without_nanny(ask)
         _refuse_more_threads(ask)
         _refuse_own_folders(ask, self.work.resolve())
         _refuse_without_inputs(ask, self.reads)
+        return fit
 
     def _submit(self, client: Client, task: Task) -> Future[Any]:
         words = (task.function, json.dumps(task.arguments), self.allowed, self.timeout_s, _version())
@@ -193,9 +199,9 @@ class _Workers:
     def look(self) -> None:
         """See who is there; raises DataError for a new one that is not fit."""
         there = _nthreads(self.client, self._cluster.address)
-        if new := sorted(there.keys() - self._known):
-            self._cluster.refuse_unfit(self.client, new)
-            self._known |= there.keys()
+        self._known &= there.keys()
+        if new := there.keys() - self._known:
+            self._known |= self._cluster.refuse_unfit(self.client, new)
         self._threads, self._looked = sum(there.values()), time.monotonic()
 
 
@@ -229,21 +235,18 @@ def _quiet_client() -> Iterator[None]:
 @contextmanager
 def _connected(address: str) -> Iterator[Client]:
     try:
-        from distributed import Client, Security
+        from distributed import Client
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"scheduler {address}: {error.name} is not installed; {how_to_install('cluster')}"
         ) from None
+    if address.startswith("tls:"):
+        _refuse_without_certificates(address)
     try:
         place = urlsplit(address)
         if place.scheme != "inproc":
             # a Client that fails may block later ones for ever, when it is collected at the wrong moment
             socket.create_connection((place.hostname or "", place.port or 0), CONNECT_S).close()
-        if place.scheme == "tls" and Security().get_connection_args("client").get("ssl_context") is None:
-            raise ConfigError(
-                f"scheduler {address}: Dask's configuration names no certificates; set those of the client in"
-                " distributed.comm.tls"
-            )
         client = Client(address, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
         raise ConfigError(
@@ -252,6 +255,21 @@ def _connected(address: str) -> Iterator[Client]:
         ) from None
     with client:
         yield client
+
+
+def _refuse_without_certificates(address: str) -> None:
+    from distributed import Security
+
+    reason = "none is named"
+    try:
+        context = Security().get_connection_args("client").get("ssl_context")
+    except OSError as error:
+        context, reason = None, str(error)
+    if context is None:
+        raise ConfigError(
+            f"scheduler {address}: the certificates of the client cannot be used ({reason}); set distributed.comm.tls"
+            " in Dask's configuration"
+        )
 
 
 def _wait_for_worker(client: Client, address: str) -> None:
@@ -265,13 +283,13 @@ def _wait_for_worker(client: Client, address: str) -> None:
 
 
 def _asked(
-    client: Client, address: str, workers: Sequence[str], function: Callable[..., Any], *arguments: Any
+    client: Client, address: str, workers: Set[str], function: Callable[..., Any], *arguments: Any
 ) -> dict[str, Any]:
     """What a function returns on some workers; one that dies meanwhile is left out, as Dask starts it again.
 
     Raises DataError for a worker that cannot call it, and for a scheduler that is lost.
     """
-    there = sorted(_nthreads(client, address).keys() & set(workers))
+    there = sorted(_nthreads(client, address).keys() & workers)
     if not there:
         return {}
     with _scheduler_there(address):

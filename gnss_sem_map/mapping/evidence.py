@@ -77,7 +77,7 @@ class RunEvidence:
     @cached_property
     def image_digests(self) -> dict[Path, NDArray[np.uint8]]:
         """(k, 32) SHA-256 of what each keyframe scan of every file has seen; raises DataError."""
-        return {path: read_packed(path).digests() for path in self.keyframes}
+        return {path: read_digests(path, len(T)) for path, T in self.poses.items()}
 
     def keyframes_near(self, positions: NDArray[np.float64], reach_m: float) -> NearKeyframes | None:
         """The keyframe scans at most `reach_m` from the bounding box of positions (m, 3) m; None if there are none.
@@ -109,17 +109,6 @@ class PackedKeyframes:
     T_lidar_map: NDArray[np.float64]
     """(k, 4, 4)."""
     rows: Rows
-
-    def digests(self) -> NDArray[np.uint8]:
-        """(k, 32) SHA-256 of each image and of its rows."""
-        images = np.split(self.packed, self.ends[:-1])
-        rows = hashlib.sha256(self.rows.seen.tobytes())
-        found = []
-        for image in images:
-            one = rows.copy()
-            one.update(image.tobytes())
-            found.append(one.digest())
-        return np.frombuffer(b"".join(found), np.uint8).reshape(-1, 32)
 
     def scans(self, places: NDArray[np.intp]) -> KeyframeScans:
         """Those at some places; raises DataError when an image is damaged."""
@@ -185,10 +174,17 @@ def write_keyframes(scans: KeyframeScans, file: Path | BinaryIO) -> None:
     arrays: dict[str, NDArray[Any]] = {
         "packed": np.concatenate(packed),
         "ends": np.cumsum([len(one) for one in packed], dtype=np.int64),
+        "digests": _digests(packed, scans.rows),
         "T_lidar_map": scans.T_lidar_map,
         "seen": scans.rows.seen,
     }
     _write(file, arrays, zipfile.ZIP_STORED)
+
+
+def _digests(packed: Sequence[NDArray[np.uint8]], rows: Rows) -> NDArray[np.uint8]:
+    """(k, 32) SHA-256 of packed images and of their rows."""
+    found = [hashlib.sha256(rows.seen.tobytes() + image.tobytes()).digest() for image in packed]
+    return np.frombuffer(b"".join(found), np.uint8).reshape(-1, 32)
 
 
 def _image_codec() -> pa.Codec:
@@ -276,6 +272,17 @@ def read_poses(path: Path) -> NDArray[np.float64]:
     if T.shape[1:] != (4, 4):
         raise DataError(f"{shown(path)}: found poses {T.shape}, expected (k, 4, 4); make the run again")
     return T.astype(np.float64)
+
+
+def read_digests(path: Path, count: int) -> NDArray[np.uint8]:
+    """(k, 32) SHA-256 of what each of so many keyframe scans has seen; raises DataError."""
+    with open_archive(path) as archive:
+        found = _array(archive, path, "digests", "u", 2)
+    if found.shape != (count, 32):
+        raise DataError(
+            f"{shown(path)}: found digests {found.shape}, expected {(count, 32)}; make the run again"
+        )
+    return found.astype(np.uint8)
 
 
 def _array(

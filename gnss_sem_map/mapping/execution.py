@@ -202,7 +202,7 @@ class Losses:
         yield (
             task,
             GivenUp(
-                f"{task.name}: given up after {len(reasons)} attempts: {told}; take fewer workers, or"
-                " more memory for each, if it was short, and run it again"
+                f"{task.name}: given up after {len(reasons)} attempts: {told}; if memory was short, take"
+                " fewer workers, or more memory for each; run it again"
             ),
         )

@@ -42,7 +42,7 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.drive_job import read_job, read_trajectory, write_job
 from gnss_sem_map.runs.match_tasks import SavedMatches
-from gnss_sem_map.runs.several_drives import SeveralDrives
+from gnss_sem_map.runs.several_drives import SeveralDrives, refuse_earlier
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.scans.downsampling import one_per_cube
@@ -159,17 +159,19 @@ def locate_one(source: Mapping[str, Any], settings: str, origin: Sequence[float]
 
     What was matched stays in the work folder of the drive, where its mapping finds it.
     """
-    return failure_of(
-        lambda: _locate_one(Source(**source), config.load(Path(settings)), LocalFrame(*origin), Path(work))
-    )
+    return failure_of(lambda: _locate_one(Source(**source), Path(settings), LocalFrame(*origin), Path(work)))
 
 
-def _locate_one(source: Source, settings: Settings, frame: LocalFrame, work: Path) -> None:
+def _locate_one(source: Source, settings_file: Path, frame: LocalFrame, work: Path) -> None:
+    settings = config.load(settings_file)
     log, folder = source.open_log().in_our_conventions(settings.sensors), work / BOUND / source.name
     fingerprint = _fingerprint(log, settings, frame)
-    # it waits: a cluster may call a task again while the call that it took for lost goes on
+    if _is_located(folder, fingerprint):  # before an interruption
+        return
     with run_folder.claimed_run(work / DRIVES / source.name, waits=True) as claim:
-        if _is_located(folder, fingerprint):  # before an interruption, or by that call
+        # it has waited where a cluster called it again while the call that it took for lost went on
+        refuse_earlier(settings_file)
+        if _is_located(folder, fingerprint):
             return
         for name in (LOCATED, JOB):  # of the drive as it was
             (folder / name).unlink(missing_ok=True)

@@ -1,8 +1,8 @@
 """Each of many drives is mapped into a folder of its own: a task, which is the name of a function, paths and settings.
 
-WORK/drives/config.yaml    the settings, for tasks
-            failed.json    the drives that have failed
-            NAME/          raw map, evidence, trajectory, run.json and report of one drive
+WORK/drives/config.TOKEN.yaml    the settings, for the tasks of this run
+            failed.json          the drives that have failed
+            NAME/                raw map, evidence, trajectory, run.json and report of one drive
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import config, pipeline
-from gnss_sem_map.config import Settings
 from gnss_sem_map.files.output_folder import new_folder, refuse_inputs
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.mapping.execution import failure_of
@@ -22,7 +21,7 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, read_correction
 from gnss_sem_map.runs.match_tasks import SavedMatches
 from gnss_sem_map.runs.same_run import digest_of, is_made_from
-from gnss_sem_map.runs.several_drives import SeveralDrives
+from gnss_sem_map.runs.several_drives import SeveralDrives, refuse_earlier
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.voxels.reuse import read_record, write_record
 
@@ -63,7 +62,7 @@ def map_one(
     return failure_of(
         lambda: _map_one(
             Source(**source),
-            config.load(Path(settings)),
+            Path(settings),
             LocalFrame(*origin),
             Path(folder),
             force,
@@ -73,13 +72,17 @@ def map_one(
 
 
 def _map_one(
-    source: Source, settings: Settings, frame: LocalFrame, folder: Path, force: bool, correction_file: str
+    source: Source, settings_file: Path, frame: LocalFrame, folder: Path, force: bool, correction_file: str
 ) -> None:
-    log, (correction, digest) = source.open_log(), read_correction(correction_file)
-    read = digest_of(log, source, settings)
-    # it waits: a cluster may call a task again while the call that it took for lost goes on
+    settings, log = config.load(settings_file), source.open_log()
+    correction, digest = read_correction(correction_file)
+    made_from = source, settings, frame, digest_of(log, source, settings), digest
+    if is_made_from(folder, *made_from):
+        return
     with run_folder.claimed_run(folder, run_folder.places_read([source], settings), waits=True) as claim:
-        if is_made_from(folder, source, settings, frame, read, digest):
+        # it has waited where a cluster called it again while the call that it took for lost went on
+        refuse_earlier(settings_file)
+        if is_made_from(folder, *made_from):
             return
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
@@ -90,4 +93,4 @@ def _map_one(
                 labels_from=source.labels_from, force=force, correction=correction,
                 write=partial(run_folder.write_trajectory_files, part, delivery=settings.delivery),
             )  # fmt: skip
-            run_folder.write_drive(part, source, mapped, settings, read, digest)
+            run_folder.write_drive(part, source, mapped, settings, *made_from[3:])

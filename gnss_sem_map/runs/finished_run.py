@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -107,7 +107,8 @@ def run(
         refuse_inputs(claim.out, sorted(log.folders))
         read = digest_of(log, source, settings)
         if resume and _is_finished(out, source, settings, origin or log.frame, read, write_labels):
-            work_folder.clear(claim.work)  # it was killed when the map was there already
+            with suppress(OSError):  # it was killed while it cleaned up
+                work_folder.clear(claim.work)
             return Run(out)
         network = source.open_network(settings, log)
         with new_folder(out) as folder:

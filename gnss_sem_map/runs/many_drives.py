@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from gnss_sem_map.datasets.laz_cloud import read_base
 from gnss_sem_map.errors import DataError, SemMapError
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.files import work_folder
+from gnss_sem_map.files.output_folder import Claim, refuse_locked
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
@@ -106,15 +108,13 @@ def run_drives(
     drives = [_absolute(drive) for drive in drives]
     sources = [how.source(drive) for drive in drives]
     places = run_folder.places_read(sources, settings)
-    with (
-        run_folder.claimed_run(out, [*places, align_to], is_resumable=True) as claim,
-        executor_of(workers, scheduler, claim.work, places) as workers_of_run,
-    ):
+    with ExitStack() as held:
+        claim = held.enter_context(run_folder.claimed_run(out, [*places, align_to], is_resumable=True))
         is_there = how.resume and align_to is None and write_labels == has_point_labels(out)
         if is_there and is_map_of(out, sources, settings, frame):
-            work_folder.clear(claim.work)  # it was killed when the map was there already
-            return ManyDrives(out, read_run(out))
-        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
+            return _finished_before(claim)
+        executor = held.enter_context(executor_of(workers, scheduler, claim.work, places))
+        run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
         _begin(run, how.resume)
         base = None if align_to is None else read_base(align_to, frame)
         bound, failed = _bound_and_mapped(sources, how.force, run, base)
@@ -134,13 +134,13 @@ def _bound_and_mapped(
 
     One that fails may be wrong, and is not in the map: then those that it moved are bound without it, and mapped again.
     """
-    tracks = _tracks(sources, run.frame, run.settings)
+    tracks, before = _tracks(sources, run.frame, run.settings), failed_before(run)
     failed: dict[str, str] = {}
     while True:
         stay = [source for source in sources if source.name not in failed]
         bound = bind_drives(stay, {name: tracks[name] for name in tracks.keys() - failed}, run, base)
         # first those that failed before an interruption: the others may be done without them
-        first = [source for source in stay if source.name in failed_before(run)]
+        first = [source for source in stay if source.name in before]
         failing = map_all(first, bound, force, run)
         if failing.keys().isdisjoint(bound.corrections):
             failing |= map_all([source for source in stay if source not in first], bound, force, run)
@@ -177,20 +177,30 @@ def add_drive(
     """Add a drive to a finished map, with its settings and in its frame; raises DataError when the drive fails."""
     drive = _absolute(drive)
     added = [how.source(drive)]
-    places = run_folder.places_read(added)
-    with (
-        run_folder.claimed_run(out, places, is_resumable=True) as claim,
-        executor_of(workers, scheduler, claim.work, places) as workers_of_run,
-    ):
+    with run_folder.claimed_run(out, run_folder.places_read(added), is_resumable=True) as claim:
         settings, frame, there = _opened(out)  # now no other command can change it
         if how.resume and drive.name in there and _is_of(there[drive.name], added[0]):
-            work_folder.clear(claim.work)  # it was killed when the map was there already
-            return ManyDrives(out, read_run(out))
+            return _finished_before(claim)
         known = [(name, Path(inputs_of(folder).get("drive", folder))) for name, folder in there.items()]
         _check_distinct([*known, (drive.name, drive)])
-        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
-        about = _changed(out, there, added, how, run)
-    return ManyDrives(out, about)
+        with executor_of(workers, scheduler, claim.work, _places_read(there, added, settings)) as executor:
+            run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
+            return ManyDrives(out, _changed(out, there, added, how, run))
+
+
+def _finished_before(claim: Claim) -> ManyDrives:
+    """The map that a command had made when it was killed while it cleaned up."""
+    with suppress(OSError):  # the next command tries again
+        work_folder.clear(claim.work)
+    return ManyDrives(claim.out, read_run(claim.out))
+
+
+def _places_read(
+    there: Mapping[str, Path], added: Sequence[Source], settings: Settings
+) -> list[Path | str | None]:
+    """All inputs of a map to which drives are added: those that are there may be mapped again."""
+    known = [_source_of(name, folder) for name, folder in there.items()]
+    return run_folder.places_read([*known, *added], settings)
 
 
 def remove_drive(
@@ -203,19 +213,18 @@ def remove_drive(
     progress: Progress = silent,
 ) -> ManyDrives:
     """Take a drive out of a finished map; raises DataError when it is not there, or the only one."""
-    with (
-        run_folder.claimed_run(out, is_resumable=True) as claim,
-        executor_of(workers, scheduler, claim.work, ()) as workers_of_run,
-    ):
+    with run_folder.claimed_run(out, is_resumable=True) as claim:
         settings, frame, there = _opened(out)
         stay = {known: folder for known, folder in there.items() if known != name}
+        if len(stay) == len(there) and resume and work_folder.holds_work(claim.work):
+            return _finished_before(claim)
         if len(stay) == len(there):
             raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
         if not stay:
             raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
-        run = SeveralDrives(settings, frame, claim.work, workers_of_run or InProcess(), progress)
-        about = _changed(out, stay, [], HowMapped(force=True, resume=resume), run)
-    return ManyDrives(out, about)
+        with executor_of(workers, scheduler, claim.work, _places_read(stay, [], settings)) as executor:
+            run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
+            return ManyDrives(out, _changed(out, stay, [], HowMapped(force=True, resume=resume), run))
 
 
 def _changed(
@@ -303,11 +312,12 @@ def _begin(run: SeveralDrives, resume: bool) -> None:
     """Prepare the work folder, with the settings for tasks; raises DataError."""
     with work_folder.writing_to(run.work):
         if not resume:
+            refuse_locked(run.work / DRIVES)
             work_folder.remove_drives(run.work)
         work_folder.make(run.work)
         (run.work / DRIVES).mkdir(exist_ok=True)
         work_folder.remove_damaged_drives(run.work)
-        run.settings_file.write_text(run.settings.to_yaml(), "utf-8")
+        run.write_settings()
 
 
 def _opened(out: Path) -> tuple[Settings, LocalFrame, dict[str, Path]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, astuple, replace
@@ -24,11 +26,13 @@ from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
-from gnss_sem_map.mapping.execution import Task
+from gnss_sem_map.mapping.execution import Task, path_of
 from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.runs import finished_run, many_drives, run_folder
+from gnss_sem_map.runs.drive_tasks import map_one
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
 from gnss_sem_map.runs.source import source_of
 from gnss_sem_map.sensor_log import SensorLog
@@ -209,7 +213,7 @@ def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     calls.clear()
     resumed(write_labels=True)
     assert calls == []
-    resumed(settings=SETTINGS.changed("mapping.voxel_size_m=0.4"))
+    resumed(write_labels=True, settings=SETTINGS.changed("mapping.voxel_size_m=0.4"))
     assert calls == list(names)
 
 
@@ -233,17 +237,67 @@ def test_commands_find_the_result_that_a_killed_one_had_moved_away(
 
 def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
     """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
-    settings, folder, call = tmp_path / "config.yaml", tmp_path / "drives/a", "map_one"
+    settings, folder = tmp_path / "config.yaml", tmp_path / "drives/a"
     settings.write_text(SETTINGS.to_yaml())
     folder.parent.mkdir()
-    frame = open_drive(drives.by_name["a"]).frame
-    source = source_of(drives.by_name["a"], drives.labels)
+    frame, source = open_drive(drives.by_name["a"]).frame, source_of(drives.by_name["a"], drives.labels)
+    assert frame is not None
     words = asdict(source), str(settings), astuple(frame), str(folder), True, ""
-    task = Task("a", f"gnss_sem_map.runs.drive_tasks:{call}", words)
+    task = Task("a", path_of(map_one), words)
     with closing(Processes(2)) as processes:
         assert [reason for _, reason in processes.run([task, replace(task)])] == ["", ""]
     assert (folder / "run.json").is_file()
     assert [path.name for path in folder.parent.iterdir()] == ["a"]
+
+
+def test_a_call_that_waited_until_another_run_had_begun_does_nothing(drives: Drives, tmp_path: Path) -> None:
+    settings, folder = tmp_path / "config.yaml", tmp_path / "drives/a"
+    settings.write_text(SETTINGS.to_yaml())
+    folder.parent.mkdir()
+    frame, source = open_drive(drives.by_name["a"]).frame, source_of(drives.by_name["a"], drives.labels)
+    assert frame is not None
+    words = asdict(source), str(settings), astuple(frame), str(folder), True, ""
+    answers: list[str] = []
+    with (folder.parent / ".a.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        waiting = threading.Thread(target=lambda: answers.append(map_one(*words)), daemon=True)
+        waiting.start()
+        waiting.join(1.0)
+        assert waiting.is_alive()
+        settings.unlink()
+    waiting.join(30.0)
+    (reason,) = answers
+    assert reason == f"{settings}: is gone; this task is of a run that has ended"
+    assert not folder.exists()
+
+
+def test_a_run_does_not_begin_anew_while_a_task_of_an_earlier_one_still_writes(
+    drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    stop_of(lambda: mapped("ab", drives, tmp_path / "out", how), run_folder, "write_drive")
+    lock = tmp_path / ".out.work/drives/.b.lock"
+    with lock.open("w") as other:
+        other.write("gnss-sem-map writes it now (process 7 on far)")
+        other.flush()
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DataError, match=r"drives/b: gnss-sem-map writes it now \(process 7 on far\)"):
+            mapped("ab", drives, tmp_path / "out", how)
+    mapped("ab", drives, tmp_path / "out", how)
+
+
+def test_a_removal_that_was_stopped_when_the_map_was_there_does_nothing_twice(
+    made: dict[str, Path], tmp_path: Path
+) -> None:
+    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
+    (work / "drives/a").mkdir(parents=True)
+    write_list(work)
+    (work / "drives/a/run.json").write_text("{}")
+    before = (out / "run.json").stat()
+    assert remove_drive(out, "c", resume=True).about["merged"] == ["a", "b"]
+    assert os.path.samestat((out / "run.json").stat(), before)
+    assert not work.exists()
+    with pytest.raises(DataError, match="holds no drive 'c'"):
+        remove_drive(out, "c", resume=True)
 
 
 def test_a_drive_that_was_added_while_another_command_began_stays(

@@ -214,6 +214,10 @@ def test_a_chunk_of_another_run_that_came_late_is_replaced(
         replace(store).records()
     map_range(drive, store, range(1, 2))
     assert store.is_whole(1)
+    late = replace(store, fingerprint=other.fingerprint)
+    with pytest.raises(DataError, match="cannot save voxels"):
+        map_range(drive, late, range(1, 2))
+    assert store.is_whole(1)
     assert [path.name for path in (tmp_path / "work").iterdir() if path.name.endswith(".part")] == []
 
 

@@ -235,14 +235,19 @@ def test_commands_find_the_result_that_a_killed_one_had_moved_away(
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
-    """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
-    settings, folder = tmp_path / "config.yaml", tmp_path / "drives/a"
+def call_of_map_one(drives: Drives, work: Path) -> tuple[Path, Path, tuple[Any, ...]]:
+    """The file of its settings, its folder, and the arguments of the task that maps the first drive."""
+    settings, folder = work / "config.yaml", work / "drives/a"
     settings.write_text(SETTINGS.to_yaml())
     folder.parent.mkdir()
     frame, source = open_drive(drives.by_name["a"]).frame, source_of(drives.by_name["a"], drives.labels)
     assert frame is not None
-    words = asdict(source), str(settings), astuple(frame), str(folder), True, ""
+    return settings, folder, (asdict(source), str(settings), astuple(frame), str(folder), True, "")
+
+
+def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
+    """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
+    _, folder, words = call_of_map_one(drives, tmp_path)
     task = Task("a", path_of(map_one), words)
     with closing(Processes(2)) as processes:
         assert [reason for _, reason in processes.run([task, replace(task)])] == ["", ""]
@@ -251,12 +256,7 @@ def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Driv
 
 
 def test_a_call_that_waited_until_another_run_had_begun_does_nothing(drives: Drives, tmp_path: Path) -> None:
-    settings, folder = tmp_path / "config.yaml", tmp_path / "drives/a"
-    settings.write_text(SETTINGS.to_yaml())
-    folder.parent.mkdir()
-    frame, source = open_drive(drives.by_name["a"]).frame, source_of(drives.by_name["a"], drives.labels)
-    assert frame is not None
-    words = asdict(source), str(settings), astuple(frame), str(folder), True, ""
+    settings, folder, words = call_of_map_one(drives, tmp_path)
     answers: list[str] = []
     with (folder.parent / ".a.lock").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)

@@ -27,9 +27,23 @@ Listed = Mapping[str, list[str]]
 """Path within the folder -> accepted states (size, checksum) of our file; folders end in '/'."""
 
 
+def content_of(folder: Path) -> Iterator[str]:
+    """All paths within a folder without its list; folders end in '/', links to folders do not.
+
+    What another process removes meanwhile may be left out.
+    """
+    for place, folders, files in os.walk(folder):
+        within = Path(place).relative_to(folder)
+        for name in sorted(folders):
+            yield (within / name).as_posix() + ("" if os.path.islink(Path(place, name)) else "/")
+        for name in sorted(files):
+            if (within / name).as_posix() != MARKER:
+                yield (within / name).as_posix()
+
+
 def write_list(folder: Path, all_content: bool = False) -> None:
     """Write the list of all files in a folder: they are ours. With `all_content`, large ones count with theirs, too."""
-    _write_marker(folder, {name: [state_of(folder / name, all_content)] for name in _content(folder)})
+    _write_marker(folder, {name: [state_of(folder / name, all_content)] for name in content_of(folder)})
 
 
 def read_list(folder: Path) -> Listed | None:
@@ -47,7 +61,7 @@ def foreign(folder: Path, by_name: Callable[[str], bool] = lambda name: False) -
     A folder without a list is ours when `by_name` accepts the path of everything in it.
     """
     listed = read_list(folder)
-    for name in _content(folder):
+    for name in content_of(folder):
         if is_partial(name, listed or ()) and not os.path.islink(folder / name):
             continue
         if listed is None:
@@ -77,7 +91,7 @@ def remove(folder: Path) -> None:
         path = folder / name
         if _is_as_listed(path, listed[name]):
             path.rmdir() if name.endswith("/") else path.unlink()
-    left = next(_content(folder), None)
+    left = next(content_of(folder), None)
     if left is None:
         (folder / MARKER).unlink(missing_ok=True)
     folder.rmdir()
@@ -103,7 +117,7 @@ def amend(folder: Path, name: str, content: bytes) -> None:
 
 def amend_all(folder: Path, source: Path) -> None:
     """Add or replace all files and folders that lie in `source`, as `amend` does."""
-    names = sorted(_content(source))
+    names = sorted(content_of(source))
     with _amending(folder, {name: state_of(source / name) for name in names}):
         for name in names:
             if name.endswith("/"):
@@ -185,17 +199,6 @@ def _is_as_listed(path: Path, states: list[str]) -> bool:
 def _state_of_bytes(content: bytes) -> str:
     size = len(content)
     return str(size) if size > CONTENT_BYTES else f"{size} {hashlib.sha256(content).hexdigest()[:32]}"
-
-
-def _content(folder: Path) -> Iterator[str]:
-    """All paths within a folder without its list; folders end in '/', links to folders do not."""
-    for place, folders, files in os.walk(folder):
-        within = Path(place).relative_to(folder)
-        for name in sorted(folders):
-            yield (within / name).as_posix() + ("" if os.path.islink(Path(place, name)) else "/")
-        for name in sorted(files):
-            if (within / name).as_posix() != MARKER:
-                yield (within / name).as_posix()
 
 
 def _write_marker(folder: Path, files: Listed) -> None:

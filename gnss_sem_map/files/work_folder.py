@@ -10,6 +10,7 @@
           answers/               class probabilities of the images (`segmentation.cached_segmenter`)
           drives/NAME/           the maps of single drives (`runs.many_drives`)
           bound/NAME/            where these were driven, and how they are bound (`runs.bound_drives`)
+          removed.json           the drive that is taken out of a map of several (`runs.many_drives`)
           tiles/refined/         tiles of a map that is being made (`mapping.tile_tasks`)
           .0.12.waiting/         points of a chunk that may have moved (`mapping.waiting_points`), the images of the
                                  scans before it (`mapping.waiting_images`), and tables that wait (`mapping.chunks`)
@@ -32,7 +33,7 @@ from gnss_sem_map.files import ownership
 CHUNKS, MATCHES, SWEEPS, REVISITS = "chunks.json", "matches", "sweeps", "revisits"
 ANSWERS, DRIVES = "answers", "drives"
 BOUND, TILES, EDGES, PART, OLD = "bound", "tiles", "edges", "part", "old"
-JOB, TRAJECTORY = "job.json", "trajectory.npz"
+JOB, TRAJECTORY, REMOVED = "job.json", "trajectory.npz", "removed.json"
 OF_CHUNKS = re.compile(
     r"\.[^/]+\.\d+\.part|chunks\.json|job\.json|trajectory\.npz"
     r"|(\d+|\.\d+\.\d+\.part)/((record\.json|\w+\.npz|\w+/|\w+/-?\d+_-?\d+\.parquet)?|(\w+/)?\.[^/]+\.\d+\.part)"
@@ -41,7 +42,7 @@ OF_CHUNKS = re.compile(
 OURS = re.compile(
     r"\.gnss-sem-map\.json|part/.*|old/.*|drives/.*|bound/.*|tiles/.*|answers/(about\.json|([\w-]+/)?(\d+\.npz|\.[^/]+\.\d+\.part)?)"
     r"|(matches|revisits)/((\d+|job)\.json|(\d+|trajectory)\.npz|\.[^/]+\.\d+\.part)?"
-    r"|sweeps/(about\.json|\d+\.\w+\.npz|\.[^/]+\.\d+\.part)?"
+    r"|removed\.json|\.removed\.json\.\d+\.part|sweeps/(about\.json|\d+\.\w+\.npz|\.[^/]+\.\d+\.part)?"
     rf"|{OF_CHUNKS.pattern}"
 )
 """Pattern of all paths that we write into a work folder."""
@@ -75,24 +76,15 @@ def refuse_foreign(folder: Path) -> None:
         return
     if folder.is_symlink() or not folder.is_dir():
         raise DataError(f"{folder}: is in the way, and no folder of ours; move it away")
-    names = list(_content(folder))
-    if ownership.read_list(folder) is None and not all(map(ownership.is_partial, names)):
+    names, marker = list(ownership.content_of(folder)), folder / ownership.MARKER
+    is_begun = not os.path.lexists(marker) and all(map(ownership.is_partial, names))
+    if ownership.read_list(folder) is None and not is_begun:
         raise DataError(f"{folder}: exists and holds no interrupted run; remove it")
     strange = [name for name in names if not OURS.fullmatch(name)]
     if strange:
         raise DataError(
             f"{folder / min(strange)}: is in the folder of an interrupted run, and not ours; move it away"
         )
-
-
-def _content(folder: Path) -> Iterator[str]:
-    """Paths of all within, those of folders with a slash, but for what another process removes meanwhile."""
-    for place, folders, files in os.walk(folder):
-        at = Path(place).relative_to(folder)
-        yield from (
-            (at / name).as_posix() + "/" * (not (Path(place) / name).is_symlink()) for name in folders
-        )
-        yield from ((at / name).as_posix() for name in files)
 
 
 def holds_work(folder: Path) -> bool:
@@ -118,6 +110,7 @@ def clear(folder: Path) -> None:
     remove_answers(folder)
     remove_drives(folder)
     drop_results(folder)
+    (folder / REMOVED).unlink(missing_ok=True)
     if {path.name for path in folder.iterdir()} <= {ownership.MARKER}:
         (folder / ownership.MARKER).unlink(missing_ok=True)
         folder.rmdir()

@@ -76,13 +76,17 @@ def _map_one(
 ) -> None:
     settings, log = config.load(settings_file), source.open_log()
     correction, digest = read_correction(correction_file)
-    made_from = source, settings, frame, digest_of(log, source, settings), digest
-    if is_made_from(folder, *made_from):
+    read = digest_of(log, source, settings)
+
+    def is_done() -> bool:
+        return is_made_from(folder, source, settings, frame, read, digest)
+
+    if is_done():
         return
     with run_folder.claimed_run(folder, run_folder.places_read([source], settings), waits=True) as claim:
         # it has waited where a cluster called it again while the call that it took for lost went on
         refuse_earlier(settings_file)
-        if is_made_from(folder, *made_from):
+        if is_done():
             return
         refuse_inputs(claim.out, sorted(log.folders))
         network = source.open_network(settings, log)
@@ -93,4 +97,4 @@ def _map_one(
                 labels_from=source.labels_from, force=force, correction=correction,
                 write=partial(run_folder.write_trajectory_files, part, delivery=settings.delivery),
             )  # fmt: skip
-            run_folder.write_drive(part, source, mapped, settings, *made_from[3:])
+            run_folder.write_drive(part, source, mapped, settings, read, digest)

@@ -23,7 +23,7 @@ from gnss_sem_map.export.changes import copy_changes
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.formats import FORMATS, Format
 from gnss_sem_map.export.georeference import check_delivery
-from gnss_sem_map.files import ownership, work_folder
+from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.atomic import link_or_copy
 from gnss_sem_map.files.output_folder import (
     locked,
@@ -43,7 +43,6 @@ from gnss_sem_map.mapping import evidence
 from gnss_sem_map.mapping.fusion import GEOMETRY_ONLY
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
-from gnss_sem_map.mapping.refining import REFINED
 from gnss_sem_map.run_stats import Progress, RunStats, silent
 from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.about import about_map, about_skips, with_objects
@@ -55,12 +54,11 @@ from gnss_sem_map.runs.point_label_files import (
     LABELS,
     RAW_LABELS,
     LabelledDrive,
-    has_point_labels,
     write_point_labels,
 )
 from gnss_sem_map.runs.revisit_tasks import RevisitTasks
 from gnss_sem_map.runs.run_settings import SETTINGS, differing, read_settings, write_settings
-from gnss_sem_map.runs.same_run import digest_of, is_made_from
+from gnss_sem_map.runs.same_run import digest_of, is_run_of
 from gnss_sem_map.runs.source import Source, absolute, source_of
 from gnss_sem_map.runs.tracks import TRACKS, tracks_of
 from gnss_sem_map.segmentation import open_segmenter
@@ -106,7 +104,7 @@ def run(
         run_folder.georeference_of(settings, origin or log.frame)
         refuse_inputs(claim.out, sorted(log.folders))
         read = digest_of(log, source, settings)
-        if resume and _is_finished(out, source, settings, origin or log.frame, read, write_labels):
+        if resume and is_run_of(out, source, settings, origin or log.frame, read, write_labels):
             with suppress(OSError):  # it was killed while it cleaned up
                 work_folder.clear(claim.work)
             return Run(out)
@@ -127,18 +125,6 @@ def run(
                 )
             run_folder.write_run(folder, source, mapped, refined, settings, read, write_labels, progress)
     return Run(out)
-
-
-def _is_finished(
-    out: Path, source: Source, settings: Settings, frame: LocalFrame | None, read: str, write_labels: bool
-) -> bool:
-    """Whether a folder holds the whole map of this drive, with point labels just if they are to be written."""
-    is_there = ownership.is_whole(out) and is_folder(out / REFINED) and not is_folder(out / DRIVES)
-    return (
-        is_there
-        and write_labels == has_point_labels(out)
-        and is_made_from(out, source, settings, frame, read)
-    )
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import Claim, refuse_locked
 from gnss_sem_map.files.run_json import inputs_of, read_run
 from gnss_sem_map.files.untrusted import is_folder, shown
-from gnss_sem_map.files.work_folder import DRIVES
+from gnss_sem_map.files.work_folder import DRIVES, REMOVED
 from gnss_sem_map.mapping.execution import InProcess
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.mapping.trajectory import check_georeference
@@ -38,7 +38,6 @@ from gnss_sem_map.runs import run_folder
 from gnss_sem_map.runs.bound_drives import BoundDrives, KnownTrack, bind_drives, read_correction
 from gnss_sem_map.runs.drive_tasks import failed_before, map_all, save_failed
 from gnss_sem_map.runs.executors import executor_of
-from gnss_sem_map.runs.point_label_files import has_point_labels
 from gnss_sem_map.runs.run_settings import read_settings
 from gnss_sem_map.runs.same_run import is_map_of
 from gnss_sem_map.runs.several_drives import SeveralDrives
@@ -48,6 +47,7 @@ from gnss_sem_map.runs.written_drives import write_drives
 from gnss_sem_map.scans.base_cloud import BaseCloud
 from gnss_sem_map.sensor_log import SensorLog
 from gnss_sem_map.voxels.map_json import read_frame
+from gnss_sem_map.voxels.reuse import read_record, write_record
 
 LONGEST_GAP_S = 3.0
 """In a longer gap of its fixes a drive may pass a place that is `bound_drives.NEAR_M` from all of them."""
@@ -110,8 +110,7 @@ def run_drives(
     places = run_folder.places_read(sources, settings)
     with ExitStack() as held:
         claim = held.enter_context(run_folder.claimed_run(out, [*places, align_to], is_resumable=True))
-        is_there = how.resume and align_to is None and write_labels == has_point_labels(out)
-        if is_there and is_map_of(out, sources, settings, frame):
+        if how.resume and align_to is None and is_map_of(out, sources, settings, frame, write_labels):
             return _finished_before(claim)
         executor = held.enter_context(executor_of(workers, scheduler, claim.work, places))
         run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
@@ -185,7 +184,8 @@ def add_drive(
         _check_distinct([*known, (drive.name, drive)])
         with executor_of(workers, scheduler, claim.work, _places_read(there, added, settings)) as executor:
             run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
-            return ManyDrives(out, _changed(out, there, added, how, run))
+            _begin(run, how.resume)
+            return ManyDrives(out, _changed(out, there, added, how.force, run))
 
 
 def _finished_before(claim: Claim) -> ManyDrives:
@@ -216,26 +216,28 @@ def remove_drive(
     with run_folder.claimed_run(out, is_resumable=True) as claim:
         settings, frame, there = _opened(out)
         stay = {known: folder for known, folder in there.items() if known != name}
-        if len(stay) == len(there) and resume and work_folder.holds_work(claim.work):
+        being_removed = read_record(claim.work / REMOVED)
+        if name not in there and resume and being_removed == {"name": name}:
             return _finished_before(claim)
-        if len(stay) == len(there):
+        if name not in there:
             raise DataError(f"{shown(out)}: holds no drive {name!r}; expected one of {', '.join(there)}")
         if not stay:
             raise DataError(f"{shown(out)}: {name} is its only drive; remove the folder instead")
         with executor_of(workers, scheduler, claim.work, _places_read(stay, [], settings)) as executor:
             run = SeveralDrives(settings, frame, claim.work, executor or InProcess(), progress)
-            return ManyDrives(out, _changed(out, stay, [], HowMapped(force=True, resume=resume), run))
+            _begin(run, resume)
+            write_record({"name": name}, claim.work / REMOVED)
+            return ManyDrives(out, _changed(out, stay, [], True, run))
 
 
 def _changed(
     out: Path,
     there: Mapping[str, Path],
     added: Sequence[Source],
-    how: HowMapped,
+    force: bool,
     run: SeveralDrives,
 ) -> dict[str, Any]:
     """Write the map of drives that were mapped before and of new ones; what is bound in another way is mapped again."""
-    _begin(run, how.resume)
     aligned_to = read_run(out).get("aligned_to")
     align_to = None if aligned_to is None else Path(aligned_to)
     base = None if align_to is None else read_base(align_to, run.frame)
@@ -253,7 +255,7 @@ def _changed(
         source for source in known
         if _correction_of(there[source.name]) != read_correction(str(bound.corrections.get(source.name, "")))[1]
     ]  # fmt: skip
-    failed = map_all([*moved, *added], bound, how.force, run)
+    failed = map_all([*moved, *added], bound, force, run)
     if failed:
         raise DataError(f"{out}: stays as it was; {_first(failed)}")
     new = {source.name: run.work / DRIVES / source.name for source in (*moved, *added)}
@@ -314,6 +316,7 @@ def _begin(run: SeveralDrives, resume: bool) -> None:
         if not resume:
             refuse_locked(run.work / DRIVES)
             work_folder.remove_drives(run.work)
+        (run.work / REMOVED).unlink(missing_ok=True)
         work_folder.make(run.work)
         (run.work / DRIVES).mkdir(exist_ok=True)
         work_folder.remove_damaged_drives(run.work)

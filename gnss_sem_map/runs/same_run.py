@@ -12,10 +12,12 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import SemMapError
 from gnss_sem_map.files import ownership
 from gnss_sem_map.files.run_json import read_run
-from gnss_sem_map.files.untrusted import is_file
+from gnss_sem_map.files.untrusted import is_file, is_folder
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import fingerprints
+from gnss_sem_map.mapping.refining import REFINED
+from gnss_sem_map.runs.point_label_files import has_point_labels
 from gnss_sem_map.runs.run_settings import differing, read_settings
 from gnss_sem_map.runs.source import Source
 from gnss_sem_map.sensor_log import SensorLog
@@ -50,9 +52,26 @@ def is_made_from(
         return False
 
 
-def is_map_of(out: Path, sources: Sequence[Source], settings: Settings, frame: LocalFrame) -> bool:
-    """Whether a folder holds the whole map of these drives, none of which failed."""
-    if not ownership.is_whole(out) or not is_file(out / "run.json"):
+def is_run_of(
+    out: Path, source: Source, settings: Settings, frame: LocalFrame | None, read: str, write_labels: bool
+) -> bool:
+    """Whether a folder holds the whole map of this drive alone, with point labels just if they are to be written.
+
+    `read` is the digest of the drive.
+    """
+    return (
+        _is_whole(out, write_labels)
+        and is_folder(out / REFINED)
+        and not is_folder(out / DRIVES)
+        and is_made_from(out, source, settings, frame, read)
+    )
+
+
+def is_map_of(
+    out: Path, sources: Sequence[Source], settings: Settings, frame: LocalFrame, write_labels: bool
+) -> bool:
+    """Whether a folder holds the whole map of these drives, none of which failed; point labels as in `is_run_of`."""
+    if not _is_whole(out, write_labels):
         return False
     try:
         about = read_run(out)
@@ -67,3 +86,8 @@ def is_map_of(out: Path, sources: Sequence[Source], settings: Settings, frame: L
         )
     except (SemMapError, FactorGraphError, OSError):
         return False
+
+
+def _is_whole(out: Path, write_labels: bool) -> bool:
+    """Whether a folder holds a whole result, with point labels just if they are to be written."""
+    return is_file(out / "run.json") and has_point_labels(out) == write_labels and ownership.is_whole(out)

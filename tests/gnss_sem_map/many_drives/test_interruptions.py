@@ -27,6 +27,7 @@ from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
 from gnss_sem_map.mapping.execution import Task, path_of
@@ -288,16 +289,31 @@ def test_a_run_does_not_begin_anew_while_a_task_of_an_earlier_one_still_writes(
 def test_a_removal_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     made: dict[str, Path], tmp_path: Path
 ) -> None:
-    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
-    (work / "drives/a").mkdir(parents=True)
-    write_list(work)
-    (work / "drives/a/run.json").write_text("{}")
+    out, work = shutil.copytree(made["abc"], tmp_path / "out"), tmp_path / ".out.work"
+    stop_of(lambda: remove_drive(out, "c"), work_folder, "clear")
+    assert_same(out, made["ab"])
     before = (out / "run.json").stat()
+    with pytest.raises(DataError, match="holds no drive 'd'"):
+        remove_drive(out, "d", resume=True)
     assert remove_drive(out, "c", resume=True).about["merged"] == ["a", "b"]
     assert os.path.samestat((out / "run.json").stat(), before)
     assert not work.exists()
     with pytest.raises(DataError, match="holds no drive 'c'"):
         remove_drive(out, "c", resume=True)
+
+
+def test_a_name_that_is_not_in_the_map_leaves_what_another_command_has_done(
+    made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
+) -> None:
+    out, work = shutil.copytree(made["ab"], tmp_path / "out"), tmp_path / ".out.work"
+    stop_of(lambda: add_drive(out, drives.by_name["c"], how), many_drives, "write_drives")
+    mapped_there = work / "drives/c/run.json"
+    before = mapped_there.stat()
+    with pytest.raises(DataError, match="holds no drive 'd'; expected one of a, b"):
+        remove_drive(out, "d", resume=True)
+    assert os.path.samestat(mapped_there.stat(), before)
+    add_drive(out, drives.by_name["c"], replace(how, resume=True))
+    assert_same(out, made["abc"])
 
 
 def test_a_drive_that_was_added_while_another_command_began_stays(

@@ -69,8 +69,9 @@ package: $(TOOLS)
 	$$place/venv/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
 	mkdir $$place/empty; cd $$place/empty; ../venv/bin/gnss-sem-map demo --seconds 3
 
+# With PART='--splits 3 --group 1', a third of them.
 test-slow: $(TOOLS)
-	$(PYTEST) -m slow
+	$(PYTEST) -m slow $(PART)
 
 test-demo: $(TOOLS)
 	$(PYTEST) -m demo

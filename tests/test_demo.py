@@ -97,6 +97,7 @@ def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path)
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_without_torch_the_demo_takes_corrupted_labels_and_says_so(tmp_path: Path) -> None:
     done = demo_without_torch("-o", tmp_path / "demo", "--seconds", "3")
     assert done.returncode == 0, done.stderr
@@ -104,6 +105,7 @@ def test_without_torch_the_demo_takes_corrupted_labels_and_says_so(tmp_path: Pat
     assert "true class images, corrupted" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_corrupted_truth_can_stand_in_for_the_network(
     demo: tuple[Path, Path, str], tmp_path: Path
 ) -> None:
@@ -135,6 +137,7 @@ def test_scores_agree_with_the_independent_scorer(
     assert ours["strict"]["mean_iou"] == theirs["strict"]["mean_iou"]
 
 
+@pytest.mark.slow
 def test_a_run_can_be_scored_again_on_fewer_points(demo: tuple[Path, Path, str]) -> None:
     out, truth, _ = demo
     done = gnss_sem_map("evaluate", out, "--truth", truth, "--restrict-to", truth / "single_frame", "--json")

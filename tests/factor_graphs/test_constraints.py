@@ -75,6 +75,7 @@ def test_stops_and_the_axle_each_improve_an_outage(simulate):
     assert np.mean(gains["vehicle"]) < 0.8
 
 
+@pytest.mark.slow
 def test_what_creeps_as_quietly_as_it_stands_is_not_held_still(simulate):
     """A boat or a lift: an IMU without vibrations, at 0.2 m/s. Held still, it was metres off, or without a solution."""
 

@@ -165,6 +165,7 @@ def test_drives_of_one_track_come_together(motion, sessions):
     assert apart(after) < 0.03
 
 
+@pytest.mark.slow
 def test_what_binding_gains_is_what_the_mean_of_independent_errors_gains(motion):
     """Over many draws: the error of three drives together, and the share of errors inside 90 % ellipsoids."""
     before, after, inside = [], [], []

@@ -78,6 +78,7 @@ def test_the_errors_are_as_large_as_the_covariances_say(simulate):
     assert low < np.mean(values) < high
 
 
+@pytest.mark.slow
 def test_positions_of_an_inertial_unit_that_drift_together_place_the_track_no_better_than_one_of_them(
     simulate,
 ):

@@ -54,6 +54,7 @@ def test_an_imu_three_times_as_noisy_as_said_is_found_out_though_fixes_hide_it(s
     assert abs(np.mean(of_found) - 3) < abs(np.mean(of_believed) - 3)
 
 
+@pytest.mark.slow
 def test_biases_that_walk_faster_than_said_are_told_from_white_noise(simulate):
     """The walk is found to a half, and the white noise, which is as said, is hardly touched."""
     walking = {
@@ -161,6 +162,7 @@ def test_what_lasts_longer_than_the_drive_is_no_correlation_that_it_shows():
     assert correlation_time_shown(np.arange(3.0), ramp[:3]) == 0.0
 
 
+@pytest.mark.slow
 def test_fixes_that_wander_are_told_and_what_is_told_makes_covariances_honest(simulate):
     """Each claims white noise of its standard deviation; of many drives 90 % are in the ellipsoid for 90 %."""
     squares, believed = [], []

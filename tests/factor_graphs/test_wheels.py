@@ -174,6 +174,7 @@ def test_outages_are_better_with_wheels_even_where_they_slip(simulate, slips):
     assert np.mean(np.concatenate(squares) < quantile(0.9, 2)) > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_the_drift_of_a_bad_imu_is_not_taken_for_slip(simulate):
     off = {"without": [], "with": []}

@@ -141,6 +141,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[P
     return make
 
 
+@pytest.mark.slow
 def test_some_mistakes_in_a_simulated_drive_are_named(simulated, layouts_of, trial, tmp_path: Path) -> None:
     some = MISTAKES[::IN_CI]
     wrong = list(missed(some, layouts_of(*simulated(SPOILED_SEED, camera=CAMERA)), tmp_path, trial))

@@ -194,6 +194,7 @@ def test_of_several_drives_the_last_that_saw_a_voxel_counts(tmp_path: Path) -> N
     np.testing.assert_allclose(times, last, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_they_survive_what_is_done_with_runs(tmp_path: Path) -> None:
     drives = street_drives.write(tmp_path / "drives")
     how, out = HowMapped(drives.labels, force=True), tmp_path / "out"

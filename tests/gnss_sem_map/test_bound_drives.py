@@ -128,6 +128,7 @@ def test_a_day_that_is_added_moves_the_first_one_as_a_run_of_both_does(
     assert products(out)[f"drives/{days[0].name}/trajectory.tum"] == alone["trajectory.tum"]
 
 
+@pytest.mark.slow
 def test_a_drive_is_not_added_where_one_that_it_moves_is_gone(days: list[Path], tmp_path: Path) -> None:
     date = tmp_path / days[0].parent.name
     shutil.copytree(days[0].parent, date)
@@ -140,6 +141,7 @@ def test_a_drive_is_not_added_where_one_that_it_moves_is_gone(days: list[Path], 
     assert products(out) == before
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_left_out_moves_no_other(
     days: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,6 +183,7 @@ def test_tracks_are_grouped_by_where_they_come_near() -> None:
     assert groups_of({}) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_gaps", [True, False])
 def test_drives_that_meet_where_neither_has_a_fix_are_bound(
     has_gaps: bool, days: list[Path], both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -230,6 +233,7 @@ def write_base(drive: Path, path: Path) -> None:
     las.write(path)
 
 
+@pytest.mark.slow
 def test_a_drive_is_held_onto_a_cloud_that_stands(days: list[Path], tmp_path: Path) -> None:
     write_base(days[0], tmp_path / "base.laz")
     made = run_drives(days[1:], tmp_path / "out", Settings(), HOW, align_to=tmp_path / "base.laz")
@@ -302,6 +306,7 @@ def test_the_viewer_shows_what_changed_and_all_of_it_stays_when_the_map_is_refin
     assert {name: found.get(name) for name in expected} == expected
 
 
+@pytest.mark.slow
 def test_drives_whose_equations_have_no_solution_stay_as_they_are_and_are_named(
     days: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -208,8 +208,10 @@ def live(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("moment", "before"),
-    [({"die_at_question": 7}, 6), ({"die_before_chunk": 2}, 12)],
-    ids=["asking", "mapping"],
+    [
+        pytest.param({"die_at_question": 7}, 6, id="asking"),
+        pytest.param({"die_before_chunk": 2}, 12, id="mapping", marks=pytest.mark.slow),
+    ],
 )
 def test_a_resumed_run_asks_the_network_for_no_image_twice(
     moment: dict[str, int], before: int, small_drive: Street, live: Path, tmp_path: Path

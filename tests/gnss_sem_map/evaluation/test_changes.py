@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 import scenes
 from numpy.typing import NDArray
 
@@ -108,6 +109,7 @@ def test_a_street_that_stays_as_it_was_has_not_changed(tmp_path: Path) -> None:
     assert changes_between(first, RawMap(half, first.evidence)) == []
 
 
+@pytest.mark.slow
 def test_what_the_other_day_cannot_see_has_not_changed(tmp_path: Path) -> None:
     """A car behind a house is in one map by chance, and the other day looks at the house."""
     before, after = session(tmp_path / "a"), session(tmp_path / "b")
@@ -118,6 +120,7 @@ def test_what_the_other_day_cannot_see_has_not_changed(tmp_path: Path) -> None:
     assert changes_between(RawMap(fused, before.evidence), after) == []
 
 
+@pytest.mark.slow
 def test_somebody_who_walked_by_is_no_change(tmp_path: Path) -> None:
     assert changes_between(session(tmp_path / "a", (WALKER,)), session(tmp_path / "b")) == []
 

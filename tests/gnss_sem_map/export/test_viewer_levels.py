@@ -37,6 +37,7 @@ def levels(tmp_path: Path) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     }
 
 
+@pytest.mark.slow
 def test_a_map_above_the_budget_has_levels_of_which_each_shows_the_most_hit_of_the_voxels_it_joins(
     town: SemanticMap, tmp_path: Path
 ) -> None:

@@ -75,6 +75,7 @@ look.class_names = ["road", "other"]
 """
 
 
+@pytest.mark.slow
 def test_a_drive_that_kills_its_workers_is_left_out(
     drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -124,6 +124,7 @@ def test_adding_that_was_stopped_leaves_the_map_and_is_resumed(
     assert calls == []
 
 
+@pytest.mark.slow
 def test_a_finished_drive_is_resumed_only_when_it_was_mapped_in_the_same_way(
     drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,6 +160,7 @@ def test_what_is_damaged_of_an_interrupted_run_is_made_again(
     assert_same(out, made["ab"])
 
 
+@pytest.mark.slow
 def test_a_changed_byte_of_a_large_file_of_a_finished_drive_is_found(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,6 +175,7 @@ def test_a_changed_byte_of_a_large_file_of_a_finished_drive_is_found(
     assert_same(out, made["ab"])
 
 
+@pytest.mark.slow
 def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -187,7 +190,7 @@ def test_adding_that_was_stopped_when_the_map_was_there_is_resumed_too(
     assert not work.exists()
 
 
-@pytest.mark.parametrize("names", ["a", "ab"])
+@pytest.mark.parametrize("names", ["a", pytest.param("ab", marks=pytest.mark.slow)])
 def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     names: str, made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -218,6 +221,7 @@ def test_a_run_that_was_stopped_when_the_map_was_there_does_nothing_twice(
     assert calls == list(names)
 
 
+@pytest.mark.slow
 def test_commands_find_the_result_that_a_killed_one_had_moved_away(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -316,6 +320,7 @@ def test_a_name_that_is_not_in_the_map_leaves_what_another_command_has_done(
     assert_same(out, made["abc"])
 
 
+@pytest.mark.slow
 def test_a_drive_that_was_added_while_another_command_began_stays(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -331,6 +336,7 @@ def test_a_drive_that_was_added_while_another_command_began_stays(
     assert_same(out, made["abc"])
 
 
+@pytest.mark.slow
 def test_a_finished_drive_is_mapped_again_when_what_it_was_read_from_has_changed(
     how: HowMapped, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -98,6 +98,7 @@ def test_a_map_from_which_a_drive_was_taken_is_that_of_the_others(
         remove_drive(out, "b")
 
 
+@pytest.mark.slow
 def test_a_map_of_many_drives_that_is_refined_again_keeps_its_drives(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:
@@ -146,6 +147,7 @@ def labels_of(drive: Path) -> dict[str, bytes]:
     return {path.relative_to(drive).as_posix(): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_every_drive_has_the_point_labels_of_the_map_of_all(
     made: dict[str, Path], drives: Drives, how: HowMapped, tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ def save(
 WEIGHTS = np.random.default_rng(3).normal(size=(6, 3))
 
 
+@pytest.mark.slow
 def test_an_exported_refinenet_gives_what_torch_gives(tmp_path: Path) -> None:
     network = LightWeightRefineNet(6, "mobilenet_v2", width=16, depth_head=False).eval()
     names = ("road", "sidewalk", "car", "building", "vegetation", "sky")

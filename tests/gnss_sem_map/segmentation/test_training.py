@@ -152,6 +152,7 @@ def test_a_folder_that_holds_a_run_is_no_place_for_a_training(streets: Any, tmp_
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [MARKER, "run.json"]
 
 
+@pytest.mark.slow
 def test_it_learns_the_streets_and_the_file_opens_as_a_segmenter(streets: Any, tmp_path: Path) -> None:
     plan = CALM.model_copy(update={"steps": 240, "validate_every": 80, "batch_size": 4, "warmup_steps": 5})
     report = train(**streets, out=tmp_path, label_set=URBAN, settings=plan, device="cpu")

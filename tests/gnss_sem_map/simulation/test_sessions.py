@@ -160,6 +160,7 @@ def test_another_day_has_other_traffic_errors_and_noise(days: list[Simulation]) 
     assert one.morning_ns - zero.morning_ns == 86_400 * 10**9
 
 
+@pytest.mark.slow
 def test_changes_between_two_later_days_are_those_of_the_way_back_reversed() -> None:
     there, back = changes_between(0, 1, 2), changes_between(0, 2, 1)
     places = [

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 CPU_MS_PER_SCAN = 90.4
 """Of a core, with labels from files, for the points of `POINTS_PER_SCAN`."""
 POINTS_PER_SCAN = 105_000
-PEAK_MB = 845
+PEAK_MB = 841
 """Of a process that maps."""
-TRAJECTORY_MB_PER_HOUR = 1050
+TRAJECTORY_MB_PER_HOUR = 1100
 """Of the process that smooths, beside that."""
 
 

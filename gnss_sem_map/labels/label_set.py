@@ -23,13 +23,28 @@ from gnss_sem_map.files.structured import read_yaml
 from gnss_sem_map.files.untrusted import is_file, shown
 
 OTHER = "other"
-"""Name of the class for everything that is none of the map's classes."""
+"""Name of the class for everything that is none of the map's classes; in labels it is c, the number of these."""
+OTHER_COLOUR, OTHER_SEMANTIC_KITTI_ID, OTHER_ASPRS_CODE = (140, 130, 110), 99, 66
+"""Of `other` in exports, as the classes have theirs; 99 is SemanticKITTI's other-object, 66 a user code of LAS."""
 
 SHIPPED_CLASS_SETS = ("urban",)
 """The other files in `labels/` are taxonomies."""
 
 UNLABELLED = -1
 """Label of a voxel or point without a class."""
+
+
+@dataclass(frozen=True, eq=False)
+class Legend:
+    """Names, colours and codes of k answers; a label is an index into them."""
+
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]
+    """(k, 3) RGB."""
+    semantic_kitti_ids: NDArray[np.uint32]
+    """(k,) raw ids for `.label` files."""
+    asprs_codes: NDArray[np.uint8]
+    """(k,) LAS classification codes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +71,10 @@ class LabelSet:
                 " expected 2 to 64 different names, none of them 'other'"
             )
         ids = self.semantic_kitti_ids.tolist()
-        if 0 in ids or len(set(ids)) != count:
+        if {0, OTHER_SEMANTIC_KITTI_ID} & set(ids) or len(set(ids)) != count:
             raise ConfigError(
                 f"class set {self.name!r}: found semantic_kitti_id {ids}, expected a different one for every class,"
-                " none of them 0, which is a point without a class"
+                f" none of them 0, which is a point without a class, or {OTHER_SEMANTIC_KITTI_ID}, which is `other`"
             )
         for source, table in self.sources.items():
             unknown = sorted(set(table.values()) - set(self.names))
@@ -68,6 +83,16 @@ class LabelSet:
                     f"class set {self.name!r}: the table of {source!r} maps to {unknown},"
                     f" expected one of {list(self.names)}"
                 )
+
+    @cached_property
+    def legend(self) -> Legend:
+        """All that a map may say of a voxel: the classes and, last, `other`."""
+        return Legend(
+            (*self.names, OTHER),
+            np.vstack([self.colours, np.array(OTHER_COLOUR, np.uint8)]),
+            np.append(self.semantic_kitti_ids, np.uint32(OTHER_SEMANTIC_KITTI_ID)),
+            np.append(self.asprs_codes, np.uint8(OTHER_ASPRS_CODE)),
+        )
 
     def index(self, name: str) -> int:
         """Index of a class; raises ConfigError with the most similar name for an unknown one."""

@@ -23,7 +23,7 @@ from gnss_sem_map.mapping.map_alignment import MapMatch, NoMatch, match_maps
 from gnss_sem_map.mapping.raw_map import MAP, open_raw
 from gnss_sem_map.voxels import attributes, tiles
 from gnss_sem_map.voxels.attributes import ATTRIBUTES, Attributes, combined, open_attributes
-from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HEIGHT_UNITS, HITS_LIMIT
+from gnss_sem_map.voxels.kernels import EVIDENCE_LIMIT, HEIGHT_UNITS, HITS_LIMIT, OF_IMAGES
 from gnss_sem_map.voxels.map_json import read_frame
 from gnss_sem_map.voxels.semantic_map import SemanticMap
 from gnss_sem_map.voxels.tiles import indices_by_tile
@@ -198,6 +198,9 @@ def into_frame(
     np.add.at(hits, places, voxels.hits)
     if (evidence < -EVIDENCE_LIMIT).any() or (hits > HITS_LIMIT).any():
         raise DataError("cannot merge these maps: a voxel's evidence would overflow 32 bits")
+    of_images = None if voxels.of_images is None else np.zeros((len(keys), OF_IMAGES), np.int32)
+    if of_images is not None:
+        np.add.at(of_images, places, voxels.of_images)
     heights = None if voxels.heights is None else np.zeros(len(keys), np.int64)
     if heights is not None:
         np.add.at(heights, places, _moved_heights(voxels, p_target, keys[places]))
@@ -208,6 +211,7 @@ def into_frame(
         evidence.astype(np.int32),
         hits.astype(np.uint32),
         heights,
+        of_images,
     )
 
 

@@ -4,8 +4,8 @@ All are module-level functions (numba caches only those), release the GIL, and a
 do not depend on order, so any order of scans and any number of threads give the same bits. The tests hold a numpy
 version of each.
 
-A voxel is one row of a table: int64 key, c int32 log-likelihood sums, uint32 hits, and in a word the int64 sum of
-heights (40 bytes for five classes). Attributes may follow (`attribute_table`). Rows are in the order in which voxels
+A voxel is one row of a table: int64 key, c int32 log-likelihood sums, two int32 sums of image observations, uint32 hits,
+and in a word the int64 sum of heights (48 bytes for five classes). Attributes may follow (`attribute_table`). Rows are in the order in which voxels
 are first seen, so those of one place are near each other in memory (`hash_table`).
 """
 
@@ -39,6 +39,8 @@ STEPS_ON = 8
 """So many rows on, walking is quicker than searching."""
 FIRST_SUM = 2
 """Column of the first sum in the int32 view of a row (the key fills the two before it)."""
+OF_IMAGES = 2
+"""Sums beside the log-likelihoods: image observations, and their probabilities of `other` in 1/255."""
 
 
 @intrinsic
@@ -98,16 +100,16 @@ def unpack_keys(keys, indices):
 
 @njit(cache=True, nogil=True)
 def fuse(
-    rows, ints, bytes_, slots, count, start, keys, pixels, heights, observations, levels, moments_us, classes
+    rows, ints, bytes_, slots, count, start, keys, pixels, heights, observations, levels, moments_us, sums
 ):  # fmt: skip
     """Add the points of a scan from `start` on (eq. 6, as a sum of logarithms), until the table is full.
 
-    `pixels[i]` is the row of `observations` (p, c) of point i, or -1 without a pixel; `classes` are the columns, as a
+    `pixels[i]` is the row of `observations` (p, k) of point i, or -1 without a pixel; `sums` are its columns, as a
     tuple, so that their number is known at compile time; `heights` (n,) are those of the points in 1 / HEIGHT_UNITS of
     a voxel's edge. Attributes are noted if there are `levels` and `moments_us` (n,). Returns the number of voxels and
     the first point that is not added yet, or -1 - i for a point i whose voxel overflows.
     """
-    hits, room = FIRST_SUM + len(classes), room_in(rows, slots)
+    hits, room = FIRST_SUM + len(sums), room_in(rows, slots)
     names, size = rows[:, 0], len(slots)
     height_at = hits // 2 + 1
     starts, observed = run_starts(keys, start), np.flatnonzero(pixels >= 0)
@@ -134,7 +136,7 @@ def fuse(
             note(rows, ints, bytes_, row, levels, moments_us, first, end)
         while next_observed < len(observed) and observed[next_observed] < end:
             pixel, lowest = pixels[observed[next_observed]], int64(0)
-            for c in range(len(classes)):
+            for c in range(len(sums)):
                 ints[row, FIRST_SUM + c] += observations[pixel, c]
                 lowest = min(lowest, int64(ints[row, FIRST_SUM + c]))
             if lowest < -EVIDENCE_LIMIT:
@@ -177,12 +179,13 @@ def run_starts(keys, start):
 def log_likelihoods(
     probabilities, log_table, log_percent, floor_percent, answers, abstain, classes, observations
 ):  # fmt: skip
-    """Log-likelihoods of each pixel, to be added to the sums of a voxel (eq. 6): `observations` (p, c) in 2^-10 nat.
+    """What each pixel adds to the sums of a voxel: `observations` (p, c + 2), log-likelihoods in 2^-10 nat (eq. 6) first.
 
     `probabilities` (p, c + 1) uint8: those of the map's `classes`, a tuple of columns, are renormalised without
     `other`, floored, and renormalised again, all in integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table.
     Of `answers` (c + 1, c), or (0, c) without a confusion model, the row of the predicted class is added, `other`
-    included. With `abstain`, a pixel with the predicted class `other` is ignored.
+    included. With `abstain`, a pixel with the predicted class `other` is ignored. The last two columns are 1 unless the
+    pixel is void, and its probability of `other`.
     """
     other = len(classes)
     for i in range(len(observations)):
@@ -190,6 +193,8 @@ def log_likelihoods(
         for c in range(len(classes)):
             observations[i, c] = 0
             total += probabilities[i, c]
+        observations[i, other] = total + probabilities[i, other] > 0
+        observations[i, other + 1] = probabilities[i, other]
         if len(answers) > 0 or abstain:
             for c in range(1, other + 1):
                 if probabilities[i, c] > probabilities[i, answer]:
@@ -211,7 +216,8 @@ def log_likelihoods(
 
 @njit(cache=True, nogil=True)
 def merge(
-    keys_a, evidence_a, hits_a, heights_a, keys_b, evidence_b, hits_b, heights_b, keys, evidence, hits, heights
+    keys_a, evidence_a, of_images_a, hits_a, heights_a, keys_b, evidence_b, of_images_b, hits_b, heights_b,
+    keys, evidence, of_images, hits, heights,
 ):  # fmt: skip
     """Add two maps, both sorted by key; returns the number of voxels of the result, or -1 on overflow."""
     a, b, to = 0, 0, 0
@@ -231,6 +237,8 @@ def merge(
             if nats < -EVIDENCE_LIMIT:
                 return -1
             evidence[to, c] = nats
+        for c in range(of_images.shape[1]):
+            of_images[to, c] = (of_images_a[a, c] if from_a else 0) + (of_images_b[b, c] if from_b else 0)
         a, b, to = a + from_a, b + from_b, to + 1
     return to
 

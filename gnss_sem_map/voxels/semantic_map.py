@@ -21,7 +21,7 @@ class State(IntEnum):
     OBSERVED = 1
     """Label of the fused images."""
     INFERRED = 2
-    """Not visible in any image; label inferred from its surroundings."""
+    """Not visible in any image; label of the geometric classifier, from shape and intensity."""
     REFINED = 3
     """Label of the images, changed by refinement."""
     REMOVED = 4
@@ -51,7 +51,7 @@ class SemanticMap:
 
     voxels: VoxelMap
     labels: NDArray[np.int8]
-    """(v,) class index, -1 unlabelled."""
+    """(v,) class index, c for `other`, which is none of the c classes, -1 unlabelled."""
     confidence: NDArray[np.float32]
     """(v,) probability of the label; 0 where unlabelled."""
     states: NDArray[np.uint8]

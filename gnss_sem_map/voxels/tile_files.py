@@ -33,7 +33,9 @@ REASON = "reason"
 """Column of maps in which voxels were removed."""
 HEIGHTS = "heights"
 """Column of maps that know how high the surface in a voxel lies."""
-BY_DIFFERENCE = ("key", "hits", HEIGHTS, "label", "state", HITS_REMOVED, REASON)
+OF_IMAGES = ("observations", "other")
+"""Columns of maps that know how many images show a voxel, and the sum of their probabilities of `other` in 1/255."""
+BY_DIFFERENCE = ("key", "hits", HEIGHTS, "label", "state", HITS_REMOVED, REASON, *OF_IMAGES)
 """Columns that are stored as differences. Sums and confidences are the same in many voxels, and their bytes as they are
 pack better: without this a tile takes 20 % more."""
 Tile = tuple[int, int]
@@ -73,7 +75,7 @@ def read(
     Without the sums of log-likelihoods, it takes half the time.
     """
     needed = *(_sums_of(label_set) if with_sums else ()), "label", "confidence", "state"
-    columns = _read(path, about, label_set, needed, (HITS_REMOVED, HEIGHTS, REASON))
+    columns = _read(path, about, label_set, needed, (HITS_REMOVED, HEIGHTS, REASON, *(OF_IMAGES if with_sums else ())))
     removed, reasons = columns.get(HITS_REMOVED), columns.get(REASON)
     return SemanticMap(
         voxels=_voxels_of(columns, tile, voxel_size_m, label_set),
@@ -89,7 +91,7 @@ def read_voxels(
     path: Path, tile: Tile, about: dict[str, Any], voxel_size_m: float, label_set: LabelSet
 ) -> VoxelMap:
     """As `read`, without what is decided about the voxels: two thirds of the time."""
-    columns = _read(path, about, label_set, _sums_of(label_set), (HEIGHTS,))
+    columns = _read(path, about, label_set, _sums_of(label_set), (HEIGHTS, *OF_IMAGES))
     return _voxels_of(columns, tile, voxel_size_m, label_set)
 
 
@@ -120,7 +122,7 @@ def _read(
 
 def _check(columns: dict[str, NDArray[Any]], classes: int) -> None:
     """Raise ValueError for labels and confidences that cannot be."""
-    if "label" in columns and not ((columns["label"] >= -1) & (columns["label"] < classes)).all():
+    if "label" in columns and not ((columns["label"] >= -1) & (columns["label"] <= classes)).all():
         raise ValueError("it has labels of no class")
     if "confidence" in columns and not ((columns["confidence"] >= 0) & (columns["confidence"] <= 1)).all():
         raise ValueError("it has confidences beyond 0..1")
@@ -148,6 +150,8 @@ def _columns_of(voxels: VoxelMap) -> dict[str, NDArray[Any]]:
     columns: dict[str, NDArray[Any]] = {"key": local_keys(voxels.keys)}
     columns |= dict(zip(_sums_of(voxels.label_set), voxels.evidence.T, strict=True))
     columns |= {"hits": voxels.hits}
+    if voxels.of_images is not None:
+        columns |= dict(zip(OF_IMAGES, voxels.of_images.T, strict=True))
     return columns if voxels.heights is None else columns | {HEIGHTS: voxels.heights}
 
 
@@ -200,6 +204,7 @@ def _voxels_of(
 ) -> VoxelMap:
     heights = columns.get(HEIGHTS)
     sums = [columns[name] for name in _sums_of(label_set) if name in columns]
+    of_images = [columns[name] for name in OF_IMAGES if name in columns]
     return VoxelMap(
         voxel_size_m,
         label_set,
@@ -207,6 +212,7 @@ def _voxels_of(
         np.stack(sums, axis=1, dtype=np.int32) if sums else np.empty((len(columns["key"]), 0), np.int32),
         columns["hits"].astype(np.uint32),
         None if heights is None else heights.astype(np.int64),
+        np.stack(of_images, axis=1, dtype=np.int32) if len(of_images) == len(OF_IMAGES) else None,
     )
 
 

@@ -24,7 +24,7 @@ from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.voxels import tile_files
 from gnss_sem_map.voxels.blocks import Block, bounds_of, tiles_around
-from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET
+from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK, AXIS_OFFSET, OF_IMAGES
 from gnss_sem_map.voxels.map_json import MAP_JSON, describe, name_of, read_description, read_frame, tile_of
 from gnss_sem_map.voxels.reuse import Made
 from gnss_sem_map.voxels.semantic_map import SemanticMap
@@ -249,7 +249,13 @@ def joined_voxels(parts: Sequence[VoxelMap], voxel_size_m: float, label_set: Lab
     hits = np.concatenate([np.empty(0, np.uint32), *(part.hits for part in parts)])
     heights = [part.heights for part in parts if part.heights is not None]
     of_all = np.concatenate([np.empty(0, np.int64), *heights])[order] if len(heights) == len(parts) else None
-    return VoxelMap(voxel_size_m, label_set, keys[order], evidence, hits[order], of_all)
+    of_images = [part.of_images for part in parts if part.of_images is not None]
+    are_known = len(of_images) == len(parts)
+    observations = np.concatenate([np.empty((0, OF_IMAGES), np.int32), *of_images])
+    return VoxelMap(
+        voxel_size_m, label_set, keys[order], evidence, hits[order], of_all,
+        observations.take(order, axis=0) if are_known else None,
+    )  # fmt: skip
 
 
 def joined(parts: Sequence[SemanticMap], voxel_size_m: float, label_set: LabelSet) -> SemanticMap:

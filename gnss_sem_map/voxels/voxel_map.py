@@ -25,6 +25,7 @@ from gnss_sem_map.voxels.kernels import (
     AXIS_OFFSET,
     FIRST_SUM,
     HEIGHT_UNITS,
+    OF_IMAGES,
     UNITS_PER_NAT,
 )
 
@@ -64,11 +65,17 @@ class VoxelMap:
     """(v,) LiDAR points in the voxel."""
     heights: NDArray[np.int64] | None = None
     """(v,) sums of the points' heights over the bottom of their voxel, in 1/256 of its edge; None where unknown."""
+    of_images: NDArray[np.int32] | None = None
+    """(v, 2) image observations, and the sum of their probabilities of `other` in 1/255; None where unknown."""
 
     def __post_init__(self) -> None:
         v, c = len(self.keys), len(self.label_set.names)
         if self.heights is not None and self.heights.shape != (v,):
             raise DataError(f"voxel map: found {v} keys and heights {self.heights.shape}; expected ({v},)")
+        if self.of_images is not None and self.of_images.shape != (v, OF_IMAGES):
+            raise DataError(
+                f"voxel map: found {v} keys and image observations {self.of_images.shape}; expected ({v}, {OF_IMAGES})"
+            )
         if self.evidence.shape not in ((v, c), (v, 0)) or self.hits.shape != (v,):
             raise DataError(
                 f"voxel map: found {v} keys, evidence {self.evidence.shape}, hits {self.hits.shape};"
@@ -83,7 +90,7 @@ class VoxelMap:
     @staticmethod
     def words(label_set: LabelSet) -> int:
         """Width of a row: the key, the sums and hits two to a word, and the heights."""
-        return (FIRST_SUM + len(label_set.names) + 1 + 1) // 2 + 1
+        return (FIRST_SUM + len(label_set.names) + OF_IMAGES + 1 + 1) // 2 + 1
 
     def __add__(self, other: VoxelMap) -> VoxelMap:
         """Sum of the evidence of both maps per voxel; raises DataError for another voxel size or class set."""
@@ -95,21 +102,22 @@ class VoxelMap:
         room, c = len(self) + len(other), self.evidence.shape[1]
         keys, evidence = np.empty(room, np.int64), np.empty((room, c), np.int32)
         hits, heights = np.empty(room, np.uint32), np.empty(room, np.int64)
+        of_images = np.empty((room, OF_IMAGES), np.int32)
         count = kernels.merge(
-            self.keys, self.evidence, self.hits, self._known_heights,
-            other.keys, other.evidence, other.hits, other._known_heights,
-            keys, evidence, hits, heights,
+            self.keys, self.evidence, self._known_of_images, self.hits, self._known_heights,
+            other.keys, other.evidence, other._known_of_images, other.hits, other._known_heights,
+            keys, evidence, of_images, hits, heights,
         )  # fmt: skip
         if count < 0:
             raise DataError("cannot add these maps: a voxel's evidence would overflow 32 bits")
-        are_known = self.heights is not None and other.heights is not None
         return VoxelMap(
             self.voxel_size_m,
             self.label_set,
             keys[:count],
             evidence[:count],
             hits[:count],
-            heights[:count] if are_known else None,
+            None if self.heights is None or other.heights is None else heights[:count],
+            None if self.of_images is None or other.of_images is None else of_images[:count],
         )
 
     def __sub__(self, part: VoxelMap) -> VoxelMap:
@@ -124,13 +132,20 @@ class VoxelMap:
             raise DataError("cannot subtract a map with other evidence; were both of one run?")
         kept = np.delete(np.arange(len(self)), gone)
         evidence, hits, heights = self.evidence.take(kept, axis=0), self.hits[kept], self._known_heights[kept]
+        of_images = self._known_of_images.take(kept, axis=0)
         places = np.searchsorted(kept, rows[stays])
         evidence[places] -= part.evidence[stays]
         hits[places] -= part.hits[stays]
         heights[places] -= part._known_heights[stays]
-        are_known = self.heights is not None and part.heights is not None
+        of_images[places] -= part._known_of_images[stays]
         return VoxelMap(
-            self.voxel_size_m, self.label_set, self.keys[kept], evidence, hits, heights if are_known else None
+            self.voxel_size_m,
+            self.label_set,
+            self.keys[kept],
+            evidence,
+            hits,
+            None if self.heights is None or part.heights is None else heights,
+            None if self.of_images is None or part.of_images is None else of_images,
         )
 
     def __getitem__(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> VoxelMap:
@@ -146,6 +161,7 @@ class VoxelMap:
             self.evidence.take(places, axis=0),
             self.hits[places],
             None if self.heights is None else self.heights[places],
+            None if self.of_images is None else self.of_images.take(places, axis=0),
         )
 
     @cached_property
@@ -170,6 +186,16 @@ class VoxelMap:
     @property
     def _known_heights(self) -> NDArray[np.int64]:
         return np.zeros(len(self), np.int64) if self.heights is None else self.heights
+
+    @property
+    def _known_of_images(self) -> NDArray[np.int32]:
+        return np.zeros((len(self), OF_IMAGES), np.int32) if self.of_images is None else self.of_images
+
+    @property
+    def other_share(self) -> NDArray[np.float32]:
+        """(v,) mean probability of `other` in the images; 0 where none shows the voxel, or it is unknown."""
+        observations, mass = self._known_of_images.T
+        return np.asarray(mass / (255 * np.maximum(observations, 1)), np.float32)
 
     @property
     def _sums(self) -> NDArray[np.int32]:
@@ -232,6 +258,7 @@ class VoxelTable:
         self._floor_percent = round(100 * probability_floor)
         self._words = VoxelMap.words(label_set) + (attribute_table.WORDS if with_attributes else 0)
         self._columns = tuple(range(len(label_set.names)))
+        self._sums = tuple(range(len(label_set.names) + OF_IMAGES))
         self._table, self._knows_heights = HashTable(self._words, SMALLEST_TABLE), True
         share = 1.0 if answers is None else 1.0 - ANSWER_SHARE
         self._log_table = log_table(len(label_set.names), self._floor_percent, share)
@@ -261,7 +288,7 @@ class VoxelTable:
             classes = np.zeros((0, len(self._columns) + 1), np.uint8)
         if heights is None:
             self._knows_heights, heights = False, np.zeros(len(keys), np.uint8)
-        observations = np.empty((len(classes), len(self._columns)), np.int32)
+        observations = np.empty((len(classes), len(self._sums)), np.int32)
         kernels.log_likelihoods(
             classes, self._log_table, self._log_percent, self._floor_percent, self._answers, self._abstain,
             self._columns, observations,
@@ -269,7 +296,7 @@ class VoxelTable:
         done = 0
         while done < len(keys):
             self._table.count, done = kernels.fuse(
-                *self._views, len(self), done, keys, pixels, heights, observations, *seen, self._columns
+                *self._views, len(self), done, keys, pixels, heights, observations, *seen, self._sums
             )
             if done < 0:
                 voxel = unpack(keys[[-1 - done]])[0]
@@ -308,14 +335,16 @@ class VoxelTable:
         """The voxels so far, sorted by key."""
         rows = self._table.filled
         order = np.argsort(rows[:, 0])
-        ints, end = rows.view(np.int32), FIRST_SUM + len(self._columns)
+        ints, last = rows.view(np.int32), FIRST_SUM + len(self._columns)
+        end = last + OF_IMAGES
         return VoxelMap(
             self.voxel_size_m,
             self.label_set,
             keys=rows[order, 0],
-            evidence=ints[order, FIRST_SUM:end],
+            evidence=ints[order, FIRST_SUM:last],
             hits=ints[order, end].astype(np.uint32),
             heights=rows[order, end // 2 + 1] if self._knows_heights else None,
+            of_images=ints[order, last:end],
         )
 
     def attributes(self) -> tuple[NDArray[Any], ...]:

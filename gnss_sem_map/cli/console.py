@@ -137,13 +137,13 @@ def print_merged(about: dict[str, Any], out: Path) -> None:
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """One table: accuracy and IoU per class before and after refinement, then the single figures."""
+    """Accuracy and IoU per class of what a camera saw, before and after refinement, then the single figures."""
     from rich.console import Console
     from rich.table import Table
 
-    raw, refined = (metrics["semantics"][stage] for stage in ("raw", "refined"))
+    raw, refined = metrics["semantics"]["raw"], metrics["semantics"]["refined"]["seen"]
     table = Table(
-        title="Semantics, % of labelled points",
+        title="Semantics, % of the points that a camera saw",
         caption="accuracy: share of the points labelled with the class that belong to it (eq. 14; precision)",
     )
     table.add_column("class")
@@ -164,10 +164,11 @@ def print_metrics(metrics: dict[str, Any]) -> None:
 
 
 def _single_figures(metrics: dict[str, Any]) -> Iterator[str]:
-    raw, refined, moving = *(metrics["semantics"][stage] for stage in ("raw", "refined")), metrics["dynamic"]
+    everywhere, moving = metrics["semantics"]["refined"], metrics["dynamic"]
     yield (
-        f"coverage        {_percent(raw['coverage'])} % raw, {_percent(refined['coverage'])} % refined,"
-        " of the points whose true class the map has"
+        f"all points      coverage {_percent(everywhere['coverage'])} %,"
+        f" strict mean IoU {_percent(everywhere['strict']['mean_iou'])} %, open {_percent(everywhere['open'])} %;"
+        f" wrong {_percent(everywhere['wrong'])} % of those called one of the classes"
     )
     yield (
         f"moving vehicles removed {_percent(moving['DA'])} %, static kept {_percent(moving['SA'])} %,"

@@ -79,7 +79,7 @@ def _points(
     true = tables.truth[entries[seen.valid] & 0xFFFF].astype(np.int64)
     row = voxels.indices_of(seen.keys)
     labels = seen.labels.astype(np.int64)
-    use = (true >= 0) & (labels >= 0) & (row >= 0)
+    use = (true >= 0) & (true < len(voxels.label_set.names)) & (labels >= 0) & (row >= 0)
     return true[use], labels[use], row[use]
 
 

@@ -5,6 +5,8 @@ Points are counted first and divided last, so that counts of scans, drives and m
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.labels.label_set import LabelSet, taxonomy
+from gnss_sem_map.labels.label_set import OTHER, LabelSet, taxonomy
 
 MOVING_IDS = range(252, 260)
 """SemanticKITTI raw ids of moving objects; the vehicles among them map to the class `vehicle`."""
@@ -27,27 +29,30 @@ class Tables:
     """Tables from raw SemanticKITTI ids to classes."""
 
     truth: NDArray[np.int16]
-    """(65536,) class index; -1 where a point with this truth is not counted at all."""
+    """(65536,) class index; c: `other`; -1: not known, a point with this truth is not counted at all."""
     prediction: NDArray[np.int16]
-    """(65536,) class index; c: unlabelled; -1: not an id that a prediction may hold."""
+    """(65536,) class index; c: `other`; c + 1: unlabelled; -1: not an id that a prediction may hold."""
     label_set: LabelSet
 
     @classmethod
     def of(cls, label_set: LabelSet) -> Tables:
-        """The tables of a class set (strict mapping: wall, fence, terrain and the like are not counted)."""
-        count = len(label_set.names)
-        truth = taxonomy("semantic_kitti").lookup(label_set, "id", RAW_IDS)
-        truth[(truth < 0) | (truth == count)] = -1
-        prediction = np.full(RAW_IDS, -1, np.int16)
-        prediction[label_set.semantic_kitti_ids] = np.arange(count)
-        prediction[0] = count
+        """The tables of a class set (strict mapping: fence, parking, terrain and the like are `other`)."""
+        truth = np.maximum(taxonomy("semantic_kitti").lookup(label_set, "id", RAW_IDS), -1)
+        prediction, answers = np.full(RAW_IDS, -1, np.int16), label_set.legend.semantic_kitti_ids
+        prediction[answers] = np.arange(len(answers))
+        prediction[0] = len(answers)
         return cls(truth, prediction, label_set)
+
+    def has_class(self, prediction: NDArray[np.uint32]) -> NDArray[np.bool_]:
+        """Which `.label` entries (n,) are one of the classes, neither `other` nor unlabelled."""
+        predicted = self.prediction[prediction & 0xFFFF]
+        return (predicted >= 0) & (predicted < len(self.label_set.names))
 
 
 def confusion(
     prediction: NDArray[np.uint32], truth: NDArray[np.uint32], tables: Tables, where: str
 ) -> NDArray[np.int64]:
-    """Counts (c, c + 1) of one scan: rows true class, columns predicted class, last column unlabelled.
+    """Counts (c + 1, c + 2) of one scan: rows true class, then `other`; columns predicted, then `other`, unlabelled.
 
     Both are `.label` entries (low 16 bits: raw id). Raises DataError for different lengths or an unknown prediction.
     """
@@ -59,10 +64,11 @@ def confusion(
     if (predicted < 0).any():
         bad = np.unique(prediction[predicted < 0] & 0xFFFF)[:5].tolist()
         raise DataError(
-            f"{where}: found ids {bad}, expected 0 or one of {tables.label_set.semantic_kitti_ids.tolist()}"
+            f"{where}: found ids {bad},"
+            f" expected 0 or one of {tables.label_set.legend.semantic_kitti_ids.tolist()}"
         )
     true = tables.truth[truth & 0xFFFF]
-    columns = len(tables.label_set.names) + 1
+    columns = len(tables.label_set.names) + 2
     cells = true[true >= 0].astype(np.int64) * columns + predicted[true >= 0]
     return np.bincount(cells, minlength=(columns - 1) * columns).reshape(columns - 1, columns)
 
@@ -71,36 +77,49 @@ def semantics(counts: NDArray[np.int64], label_set: LabelSet) -> dict[str, Any]:
     """Accuracy TP / (TP + FP) and IoU TP / (TP + FP + FN) per class and on average, and coverage, all in 0..1.
 
     The figures are over labelled points, with the coverage beside them: the labelled share of the points whose true
-    class the set has. Under `strict` an unlabelled point counts as a false negative of its class. A class without truth
-    is left out of the mean; one that is never predicted counts as 0. Accuracy (elsewhere called precision) uses
-    labelled points only, so its strict mean differs in one case: a class without any labelled point is left out of the
-    mean, but counts as 0 in the strict one.
+    class the set has; `other` is no label here. Under `strict` an unlabelled point counts as a false negative of its
+    class. A class without truth is left out of the mean; one that is never predicted counts as 0. Accuracy (elsewhere
+    called precision) uses labelled points only, so its strict mean differs in one case: a class without any labelled
+    point is left out of the mean, but counts as 0 in the strict one.
+
+    Four figures count true `other` as well. `open`: mean IoU as under `strict`, where a point of true `other` that is
+    called a class is a false positive. `wrong`: of the points called a class, the share with another truth. `answered`:
+    the share of all points that are called a class or `other`. `other`: accuracy and IoU of `other`.
     """
-    labelled = counts[:, :-1]
-    observed = _figures(labelled, labelled.sum(axis=1), label_set)
-    strict = _figures(labelled, counts.sum(axis=1), label_set)
+    c, true_points, hits = len(label_set.names), counts.sum(axis=1), np.diag(counts)
+    labelled = counts[:c, :c]
+    called, called_anywhere = labelled.sum(axis=0), counts[:, :-1].sum(axis=0)
+    observed = _figures(hits[:c], called, labelled.sum(axis=1), label_set.names)
+    strict = _figures(hits[:c], called, true_points[:c], label_set.names)
+    of_all = _figures(hits[:c], called_anywhere[:c], true_points[:c], label_set.names)
+    of_other = _figures(hits[c:], called_anywhere[c:], true_points[c:], [OTHER])
+    with_class = int(called_anywhere[:c].sum())
     return observed | {
-        "coverage": _share(int(labelled.sum()), int(counts.sum())),
-        "points": int(counts.sum()),
+        "coverage": _share(int(labelled.sum()), int(true_points[:c].sum())),
+        "points": int(true_points[:c].sum()),
         "strict": {name: strict[name] for name in ("mean_accuracy", "mean_iou")},
+        "open": of_all["mean_iou"],
+        "wrong": _share(with_class - int(hits[:c].sum()), with_class),
+        "answered": _share(int(called_anywhere.sum()), int(counts.sum())),
+        "other": of_other["classes"][OTHER],
     }
 
 
 def _figures(
-    labelled: NDArray[np.int64], true_points: NDArray[np.int64], label_set: LabelSet
+    hits: NDArray[np.int64],
+    predicted: NDArray[np.int64],
+    true_points: NDArray[np.int64],
+    names: Sequence[str],
 ) -> dict[str, Any]:
-    hits = np.diag(labelled).astype(float)
-    predicted = labelled.sum(axis=0)
-    with np.errstate(invalid="ignore"):
-        accuracy = np.where(predicted > 0, hits / np.maximum(predicted, 1), 0.0)
-        iou = hits / np.maximum(predicted + true_points - hits, 1)
+    accuracy = np.where(predicted > 0, hits / np.maximum(predicted, 1), 0.0)
+    iou = hits / np.maximum(predicted + true_points - hits, 1)
     present = true_points > 0
     return {
         "mean_accuracy": float(accuracy[present].mean()) if present.any() else None,
         "mean_iou": float(iou[present].mean()) if present.any() else None,
         "classes": {
             name: {"accuracy": float(accuracy[i]), "iou": float(iou[i])} if present[i] else None
-            for i, name in enumerate(label_set.names)
+            for i, name in enumerate(names)
         },
     }
 
@@ -120,7 +139,7 @@ def dynamic_counts(
     moving = np.isin(ids, list(MOVING_IDS))
     names = tables.label_set.names
     # a class set without vehicles: none is counted as one
-    vehicle = tables.truth[ids] == (names.index("vehicle") if "vehicle" in names else len(names))
+    vehicle = tables.truth[ids] == (names.index("vehicle") if "vehicle" in names else RAW_IDS)
     row = np.where(moving, 0, np.where(vehicle, 1, 2))
     counted = np.where(moving, vehicle, ids > 1)  # 0 unlabelled, 1 outlier
     cells = 2 * row[counted] + (removed[counted] != 0)
@@ -148,33 +167,45 @@ def calibration_counts(
     truth: NDArray[np.uint32],
     tables: Tables,
     looks: NDArray[np.uint8],
+    seen: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Counts (groups, bins, 3) of one scan by the looks at their voxel and by confidence: points, points that are
-    right, sum of confidences. `looks` (n,) falls into the groups of `LOOKS`.
+    """Counts (2, 2, groups, bins, 3) of one scan, of the points called a class: points, points that are right, sum of
+    confidences. Axes: not `seen` (n,) by a camera or seen; true class of the set or true `other`; group of `LOOKS` that
+    `looks` (n,) at the voxel falls into; confidence.
     """
     true, predicted = tables.truth[truth & 0xFFFF], tables.prediction[prediction & 0xFFFF]
-    use = (true >= 0) & (predicted >= 0) & (predicted < len(tables.label_set.names))
-    sure = confidence[use].astype(np.float64)
-    bins = np.minimum((sure * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
-    right = (true == predicted)[use].astype(np.float64)
-    group = np.maximum(np.searchsorted(LOOKS, looks[use], side="right") - 1, 0)
-    shape = (len(LOOKS), CALIBRATION_BINS)
-    cells = group * CALIBRATION_BINS + bins
-    columns = [
-        np.bincount(cells, weights, len(LOOKS) * CALIBRATION_BINS)
-        for weights in (np.ones_like(sure), right, sure)
-    ]
+    use = (true >= 0) & tables.has_class(prediction)
+    true, sure = true[use], confidence[use].astype(np.float64)
+    cells = (
+        seen[use].astype(np.int64),
+        (true == len(tables.label_set.names)).astype(np.int64),
+        np.maximum(np.searchsorted(LOOKS, looks[use], side="right") - 1, 0),
+        np.minimum((sure * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1),
+    )
+    shape = (2, 2, len(LOOKS), CALIBRATION_BINS)
+    cell, right = np.ravel_multi_index(cells, shape), (true == predicted[use]).astype(np.float64)
+    columns = [np.bincount(cell, weights, math.prod(shape)) for weights in (np.ones_like(sure), right, sure)]
     return np.asarray(np.stack(columns, axis=1).reshape(*shape, 3), np.float64)
 
 
 def calibration(counts: NDArray[np.float64]) -> dict[str, Any]:
     """Expected calibration error: mean of |share right - mean confidence| over bins, weighted by points.
 
-    `bins`: the reliability curve, of every bin with points their number, mean confidence and share that is right.
-    `by_looks`: the same for the points in voxels of so many LiDAR points and more, up to the next group.
+    `ece` is over the points whose true class the set has; in `ece_open`, a point of true `other` that is called a class
+    counts as not right. `ece_unseen` and `ece_open_unseen` are of the points that no camera saw. `bins`: the curve of
+    reliability, of every bin with points their number, mean confidence and share that is right. `by_looks`: the same
+    for the points in voxels of so many LiDAR points and more, up to the next group.
     """
-    groups = {str(low): _reliability(group) for low, group in zip(LOOKS, counts, strict=True) if group.any()}
-    return _reliability(counts.sum(axis=0)) | {"by_looks": groups}
+    by_looks = counts[:, 0].sum(axis=0)
+    groups = {
+        str(low): _reliability(group) for low, group in zip(LOOKS, by_looks, strict=True) if group.any()
+    }
+    return _reliability(by_looks.sum(axis=0)) | {
+        "ece_open": _reliability(counts.sum(axis=(0, 1, 2)))["ece"],
+        "ece_unseen": _reliability(counts[0, 0].sum(axis=0))["ece"],
+        "ece_open_unseen": _reliability(counts[0].sum(axis=(0, 1)))["ece"],
+        "by_looks": groups,
+    }
 
 
 def _reliability(counts: NDArray[np.float64]) -> dict[str, Any]:

@@ -61,7 +61,8 @@ def score_run(
     out, truth = Path(out), Path(truth)
     _check_scorable(out)
     label_set = label_set or open_label_set(config.load(out / "config.yaml").classes)
-    metrics = read_json(out / "metrics.json") | _score_points(out, truth, label_set, restrict_to)
+    metrics = read_json(out / "metrics.json")
+    metrics |= count_points(out, truth, label_set, restrict_to).figures(label_set)
     path = truth / "trajectory_lidar.tum"
     if is_file(path):
         reference = _in_frame_of(out, read_tum(path), truth / "world.json")
@@ -96,43 +97,49 @@ def _check_scorable(out: Path) -> None:
         )
 
 
-def _score_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None) -> dict[str, Any]:
+def count_points(out: Path, truth: Path, label_set: LabelSet, restrict_to: Path | None = None) -> Counts:
+    """What is counted of the points of a run folder; counts of several runs add up. Raises DataError."""
     tables = metrics.Tables.of(label_set)
 
-    def count(scan: tuple[str, Path]) -> _Counts:
+    def count(scan: tuple[str, Path]) -> Counts:
         name, known = scan
         return _count_scan(out, name, _true_ids(known, name, restrict_to), tables)
 
     counted = prefetch(count, _scans(out / "labels", truth_folder(truth)), threads())
-    total = reduce(_Counts.plus, (counts for _, counts in counted))
-    return {
-        "semantics": {
-            "raw": metrics.semantics(total.raw, label_set),
-            "refined": metrics.semantics(total.refined, label_set),
-        },
-        "dynamic": metrics.dynamic(total.moved),
-        "calibration": metrics.calibration(total.sure),
-    }
+    return reduce(Counts.plus, (counts for _, counts in counted))
 
 
-class _Counts(NamedTuple):
+class Counts(NamedTuple):
     """Of one scan, or of several; see `metrics`."""
 
     raw: NDArray[np.int64]
     refined: NDArray[np.int64]
+    seen: NDArray[np.int64]
+    """The part of `refined` in voxels that the images labelled."""
     moved: NDArray[np.int64]
     sure: NDArray[np.float64]
 
-    def plus(self, other: _Counts) -> _Counts:
-        return _Counts(
-            self.raw + other.raw,
-            self.refined + other.refined,
-            self.moved + other.moved,
-            self.sure + other.sure,
+    def plus(self, other: Counts) -> Counts:
+        """The sum."""
+        return Counts(*(mine + theirs for mine, theirs in zip(self, other, strict=True)))
+
+    def figures(self, label_set: LabelSet) -> dict[str, Any]:
+        """As in `metrics.json`, without the trajectory."""
+        refined, seen, unseen = (
+            metrics.semantics(counts, label_set)
+            for counts in (self.refined, self.seen, self.refined - self.seen)
         )
+        return {
+            "semantics": {
+                "raw": metrics.semantics(self.raw, label_set),
+                "refined": refined | {"seen": seen, "unseen": unseen},
+            },
+            "dynamic": metrics.dynamic(self.moved),
+            "calibration": metrics.calibration(self.sure),
+        }
 
 
-def _count_scan(out: Path, name: str, true: NDArray[np.uint32], tables: metrics.Tables) -> _Counts:
+def _count_scan(out: Path, name: str, true: NDArray[np.uint32], tables: metrics.Tables) -> Counts:
     where = f"{out / 'labels' / name}.label"
     predicted = read_labels(out / "labels" / f"{name}.label")
     before = read_labels(out / "labels_raw" / f"{name}.label")
@@ -145,8 +152,10 @@ def _count_scan(out: Path, name: str, true: NDArray[np.uint32], tables: metrics.
     looks = read_looks(out / "looks" / f"{name}.bin")
     if len(looks) != len(predicted):
         raise DataError(f"{where}: found {len(looks)} counts of looks for {len(predicted)} labels")
-    sure = metrics.calibration_counts(confidence, predicted, true, tables, looks)
-    return _Counts(raw, refined, moved, sure)
+    is_seen = tables.has_class(before)
+    seen = metrics.confusion(predicted[is_seen], true[is_seen], tables, where)
+    sure = metrics.calibration_counts(confidence, predicted, true, tables, looks, is_seen)
+    return Counts(raw, refined, seen, moved, sure)
 
 
 def _true_ids(known: Path, name: str, restrict_to: Path | None) -> NDArray[np.uint32]:

@@ -42,8 +42,8 @@ from gnss_sem_map.voxels import tiles
 
 URBAN = open_label_set("urban")
 TABLES = Tables.of(URBAN)
-IDS = np.append(URBAN.semantic_kitti_ids, 0).astype(np.uint32)
-"""Raw id of every class; -1, unlabelled, is the last."""
+IDS = np.append(URBAN.legend.semantic_kitti_ids, 0).astype(np.uint32)
+"""Raw id of every class and `other`; -1, unlabelled, is the last."""
 SINGLE, PAPER, PLAIN, DEFAULT, CALIBRATED = (
     "single frame",
     "eq. 6, floor 1 %",
@@ -80,7 +80,7 @@ class Score:
         """Strict accuracy and IoU, per class and on average, and the calibration error."""
         found = metrics.semantics(self.confusion, URBAN)
         hits, true = np.diag(self.confusion), self.confusion.sum(axis=1)
-        union = np.maximum(true + self.confusion[:, :-1].sum(axis=0) - hits, 1)
+        union = np.maximum(true + self.confusion[:5, :-1].sum(axis=0) - hits, 1)
         return found["strict"] | {
             "coverage": found["coverage"],
             "iou": {name: float(hits[i] / union[i]) for i, name in enumerate(URBAN.names) if true[i]},
@@ -104,14 +104,20 @@ def single_frame(excerpt: Excerpt, drive: Drive) -> Labels:
 
 def score(predicted: Labels, confidence: dict[str, NDArray[np.float32]], truth: Path, only: Labels) -> Score:
     """Counts over all scans, of the points that their own image labels."""
-    total = Score(np.zeros((5, 6), np.int64), np.zeros((metrics.CALIBRATION_BINS, 3)))
+    total = Score(
+        np.zeros((6, 7), np.int64), np.zeros((2, 2, len(metrics.LOOKS), metrics.CALIBRATION_BINS, 3))
+    )
     for name, path in label_files(truth).items():
         if name not in predicted:
             continue
-        true = np.where(only[name] & 0xFFFF != 0, read_labels(path), 0).astype(np.uint32)
+        is_seen = only[name] & 0xFFFF != 0
+        true, one_look = (
+            np.where(is_seen, read_labels(path), 0).astype(np.uint32),
+            np.ones(len(is_seen), np.uint8),
+        )
         total += Score(
             metrics.confusion(predicted[name], true, TABLES, name),
-            metrics.calibration_counts(confidence[name], predicted[name], true, TABLES),
+            metrics.calibration_counts(confidence[name], predicted[name], true, TABLES, one_look, is_seen),
         )
     return total
 

@@ -325,10 +325,10 @@ def strict_counts(drive: Drive, truth: Path, single_frame: Path) -> dict[str, ND
         "paper": refine(raw, PAPER)[0],
     }
     counts = {
-        name: np.zeros((len(URBAN.names), len(URBAN.names) + 1), np.int64)
+        name: np.zeros((len(URBAN.names) + 1, len(URBAN.names) + 2), np.int64)
         for name in ("single image", *stages)
     }
-    ids = np.append(URBAN.semantic_kitti_ids, 0).astype("<u4")
+    ids = np.append(URBAN.legend.semantic_kitti_ids, 0).astype("<u4")
     for seen in labelled_scans(drive):
         true = np.fromfile(truth / f"{seen.scan.name}.label", "<u4")[seen.valid]
         alone = np.fromfile(single_frame / f"{seen.scan.name}.label", "<u4")[seen.valid]

@@ -188,10 +188,10 @@ def test_a_run_tells_the_points_of_its_refined_map_apart_and_no_others(told: Tol
 def test_on_a_simulated_street_two_of_five_points_on_the_wrong_side_of_a_kerb_come_right(
     told: Told, street: Path
 ) -> None:
-    tables, ids = Tables.of(URBAN), np.append(URBAN.semantic_kitti_ids, 0).astype(np.uint32)
+    tables, ids = Tables.of(URBAN), np.append(URBAN.legend.semantic_kitti_ids, 0).astype(np.uint32)
     wrong = {}
     for setting in ("on", "off"):
-        counts = np.zeros((5, 6), np.int64)
+        counts = np.zeros((6, 7), np.int64)
         for name, (_, refined) in told[setting].items():
             truth = read_labels(street / "truth" / "labels" / f"{name}.label")
             counts += confusion(ids[refined.labels], truth, tables, name)

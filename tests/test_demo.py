@@ -41,7 +41,11 @@ def test_the_demo_leaves_every_figure(demo: tuple[Path, Path, str]) -> None:
         assert set(figures) >= {"mean_accuracy", "mean_iou", "coverage", "classes"}
         assert list(figures["classes"]) == ["road", "sidewalk", "vehicle", "building", "vegetation"]
         assert 0 < figures["mean_iou"] <= figures["mean_accuracy"] <= 1
-    assert metrics["semantics"]["refined"]["mean_iou"] > metrics["semantics"]["raw"]["mean_iou"]
+    refined = metrics["semantics"]["refined"]
+    assert refined["mean_iou"] > metrics["semantics"]["raw"]["mean_iou"]
+    assert refined["seen"]["points"] + refined["unseen"]["points"] == refined["points"]
+    assert refined["unseen"]["coverage"] < refined["coverage"] < refined["seen"]["coverage"]
+    assert 0 < refined["open"] <= refined["strict"]["mean_iou"] <= refined["mean_iou"]
     assert set(metrics["dynamic"]) >= {"SA", "DA", "AA"}
     assert metrics["trajectory"]["ate_m"] < 2.0
     for part in ("position", "orientation"):  # one short drive is one sample of three degrees of freedom

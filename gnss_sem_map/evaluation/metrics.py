@@ -46,7 +46,7 @@ class Tables:
     def has_class(self, prediction: NDArray[np.uint32]) -> NDArray[np.bool_]:
         """Which `.label` entries (n,) are one of the classes, neither `other` nor unlabelled."""
         predicted = self.prediction[prediction & 0xFFFF]
-        return (predicted >= 0) & (predicted < len(self.label_set.names))
+        return np.asarray((predicted >= 0) & (predicted < len(self.label_set.names)))
 
 
 def confusion(

@@ -121,7 +121,13 @@ class Counts(NamedTuple):
 
     def plus(self, other: Counts) -> Counts:
         """The sum."""
-        return Counts(*(mine + theirs for mine, theirs in zip(self, other, strict=True)))
+        return Counts(
+            self.raw + other.raw,
+            self.refined + other.refined,
+            self.seen + other.seen,
+            self.moved + other.moved,
+            self.sure + other.sure,
+        )
 
     def figures(self, label_set: LabelSet) -> dict[str, Any]:
         """As in `metrics.json`, without the trajectory."""

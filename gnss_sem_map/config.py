@@ -15,6 +15,7 @@ from gnss_sem_map.dynamics.motion_state import MotionSettings
 from gnss_sem_map.errors import ConfigError
 from gnss_sem_map.files.structured import not_finite, parse_yaml, read_yaml
 from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.geometric_classifier.training import GeometricClassifierSettings
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.scans.lidar_odometry import TrajectorySettings
 from gnss_sem_map.scans.projection import LabellingSettings
@@ -30,6 +31,7 @@ PAPER: dict[str, float | bool] = {
     "refinement.geometric_prior.enabled": False,
     "refinement.systematic_error.rate": 0.0,
     "refinement.potts_mrf.enabled": False,
+    "geometric_classifier.enabled": False,
     "refinement.decision.temperature": 1.0,
     "refinement.levels.enabled": False,
     "refinement.kerbs.enabled": False,
@@ -37,7 +39,7 @@ PAPER: dict[str, float | bool] = {
 """What `fusion: paper` sets. The floor is the least that keeps one observation from deciding for ever."""
 
 
-FILES = (("calibration",), ("classes",), ("delivery", "geoid"))
+FILES = (("calibration",), ("classes",), ("geometric_classifier", "model"), ("delivery", "geoid"))
 """Settings that name a file; classes without an ending are a shipped set."""
 
 
@@ -85,6 +87,10 @@ class Settings(BaseModel):
     refinement: RefinementSettings = Field(
         default_factory=RefinementSettings, description="Batch refinement, step by step."
     )
+    geometric_classifier: GeometricClassifierSettings = Field(
+        GeometricClassifierSettings(),
+        description="Classes by shape and intensity, where no camera looked, and beside what it saw.",
+    )
     delivery: DeliverySettings = Field(DeliverySettings(), description="Coordinates of exported files.")
 
     @model_validator(mode="before")
@@ -110,7 +116,8 @@ class Settings(BaseModel):
     def files(self) -> list[Path]:
         """The files that are named."""
         classes = Path(self.classes) if Path(self.classes).suffix else None
-        return [file for file in (self.calibration, classes, self.delivery.geoid) if file is not None]
+        named = self.calibration, classes, self.geometric_classifier.model, self.delivery.geoid
+        return [file for file in named if file is not None]
 
     def changed(self, *overrides: str) -> Settings:
         """These settings with some `section.name=value` changed; raises ConfigError."""

@@ -29,6 +29,7 @@ from gnss_sem_map.files.work_folder import SWEEPS
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.machine import one_blas_thread
 from gnss_sem_map.mapping import fingerprints
+from gnss_sem_map.mapping.classifying import fit_classifiers
 from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, pattern_sweeps
@@ -283,6 +284,8 @@ def refine(
     Of an `earlier` run, and of the folder `work` of an interrupted one, tiles that were refined from the same are
     taken. Tiles are tasks of `executor`, by default in this process.
     """
+    with stats.stage("classifier"):
+        stats.warnings += fit_classifiers(folder, settings, executor)
     with stats.stage("refinement"):
         raw = open_raw(folder, open_label_set(settings.classes))
         return refine_map(raw, folder, settings, progress, earlier, executor=executor, work=work)

@@ -43,6 +43,7 @@ COMMANDS = (
     segmentation.train,
     evaluation.evaluate,
     evaluation.calibrate,
+    evaluation.fit_classifier,
     evaluation.check,
     inspection.inspect,
     simulation.simulate,

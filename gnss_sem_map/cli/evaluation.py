@@ -1,4 +1,4 @@
-"""Commands that measure: `evaluate`, `calibrate`, `check`."""
+"""Commands that measure: `evaluate`, `calibrate`, `fit-classifier`, `check`."""
 
 from __future__ import annotations
 
@@ -84,6 +84,27 @@ def calibrate(
         f"{points} points of {len(found.drives)} drives, temperature {found.temperature:.2f};"
         f" now use --set calibration={out}"
     )
+
+
+def fit_classifier(
+    run_folders: Annotated[
+        list[Path], typer.Argument(help="Folders of finished runs with labels of images.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Classifier file to write.")] = Path(
+        "classifier.npz"
+    ),
+) -> None:
+    """Fit one geometric classifier to many runs; use it with --set geometric_classifier.model=FILE."""
+    from gnss_sem_map.files.atomic import replacing
+    from gnss_sem_map.runs.classifier_fitting import check_replaceable
+    from gnss_sem_map.runs.classifier_fitting import fit_classifier as fit
+
+    check_replaceable(out)
+    with progress_bars() as progress:
+        fitted, drives = fit(run_folders, progress)
+    with replacing(out) as file:
+        file.write(fitted.to_bytes())
+    typer.echo(f"fitted to {drives} drives; now use --set geometric_classifier.model={out}")
 
 
 def check(

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
+from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.work_folder import writing_to
 from gnss_sem_map.mapping import fingerprints
@@ -99,16 +100,26 @@ def map_range(drive: Drive, store: ChunkStore, numbers: range, progress: Progres
         shutil.rmtree(waiting, ignore_errors=True)
 
 
+def without_images(settings: Settings) -> str:
+    """What a map shows without labels of images, and how to get labels from elsewhere."""
+    if settings.geometric_classifier.enabled and settings.geometric_classifier.model is not None:
+        return "all classes are those of the geometric classifier"
+    return (
+        f"{GEOMETRY_ONLY}; a classifier of drives with labels would name it (--set geometric_classifier.model=FILE of"
+        " `gnss-sem-map fit-classifier`)"
+    )
+
+
 def _warn(drive: Drive, stats: RunStats) -> None:
     if drive.log.images and not drive.log.cameras:
         stats.warnings.append(
             f"{drive.log.name}: no camera is described, so its {len(drive.log.images)} images are not used:"
-            f" {GEOMETRY_ONLY}"
+            f" {without_images(drive.settings)}"
         )
     elif drive.segmenter is None:
-        stats.warnings.append(f"no segmenter: {GEOMETRY_ONLY}")
+        stats.warnings.append(f"no segmenter: {without_images(drive.settings)}")
     elif not drive.log.cameras:
-        stats.warnings.append(f"{drive.log.name} has no images: {GEOMETRY_ONLY}")
+        stats.warnings.append(f"{drive.log.name} has no images: {without_images(drive.settings)}")
     for one in drive.by_lidar if drive.settings.dynamics.enabled else ():
         if not one.is_too_sparse:
             continue
@@ -125,7 +136,7 @@ def _check(drive: Drive, stats: RunStats) -> None:
         raise DataError(f"{drive.log.name}: none of {drive.log.scan_count} scans can be used{why}")
     if drive.segmenter is not None and drive.log.cameras and not stats.counts["points labelled"]:
         why = _first_reason(stats, "labels")
-        stats.warnings.append(f"no point got a label, and {GEOMETRY_ONLY}{why}")
+        stats.warnings.append(f"no point got a label, and {without_images(drive.settings)}{why}")
 
 
 def _first_reason(stats: RunStats, what: str) -> str:

@@ -198,8 +198,9 @@ def into_frame(
     np.add.at(hits, places, voxels.hits)
     if (evidence < -EVIDENCE_LIMIT).any() or (hits > HITS_LIMIT).any():
         raise DataError("cannot merge these maps: a voxel's evidence would overflow 32 bits")
-    of_images = None if voxels.of_images is None else np.zeros((len(keys), OF_IMAGES), np.int32)
-    if of_images is not None:
+    of_images = None
+    if voxels.of_images is not None:
+        of_images = np.zeros((len(keys), OF_IMAGES), np.int32)
         np.add.at(of_images, places, voxels.of_images)
     heights = None if voxels.heights is None else np.zeros(len(keys), np.int64)
     if heights is not None:

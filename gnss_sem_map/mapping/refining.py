@@ -12,7 +12,7 @@ import base64
 import hashlib
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache, partial, reduce
 from operator import add
@@ -24,16 +24,24 @@ import numpy as np
 
 from gnss_sem_map.config import Settings
 from gnss_sem_map.dynamics.visibility import origins_of
+from gnss_sem_map.geometric_classifier import features
 from gnss_sem_map.labels import sensor_model
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.mapping import evidence
+from gnss_sem_map.mapping.classifying import drives_of, geometric_evidence
 from gnss_sem_map.mapping.execution import Executor, InProcess, path_of
 from gnss_sem_map.mapping.raw_map import MAP, RawMap, open_raw
 from gnss_sem_map.mapping.tile_tasks import block_of, folder_of_tiles, make_tiles, on_blocks
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.refinement import crumbs, free_space, kerb_points
-from gnss_sem_map.refinement.by_block import halo_m, refine_block, sums_halo_m, sums_of
+from gnss_sem_map.refinement.by_block import (
+    geometry_halo_m,
+    halo_m,
+    refine_block,
+    sums_halo_m,
+    sums_of,
+)
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
 from gnss_sem_map.refinement.kerb_points import Kerbs
 from gnss_sem_map.refinement.state import Evidence
@@ -147,14 +155,32 @@ class _Refinement:
         said = [self.settings.refinement.model_dump_json(), label_set, halo]
         model = opened_sensor_model(self.settings)
         of_all = [said, None if model is None else repr(model.to_yaml())]
-        tiles_in_halo = math.ceil(halo / (voxel_size_m * (1 << TILE_BITS)))
         found = {}
         for block in self._blocks:
-            near = [name_of(tile) for tile in tiles_around(block, tiles_in_halo)]
+            near = [name_of(tile) for tile in self._tiles_within(block, halo)]
             found[block] = digest(
                 [*of_all, block, [[of_layer.get(name) for name in near] for of_layer in sums]]
             )
         return found
+
+    def _classifier_digests(self) -> dict[Block, list[str]]:
+        """What the classifiers of the drives in and around each block are made from."""
+        if not self.settings.geometric_classifier.enabled:
+            return {block: [] for block in self._blocks}
+        size = self.raw.fused.voxel_size_m
+        halo = geometry_halo_m(self.settings.refinement, size) + features.reach_m(size)
+        drives = [
+            (set(files_of(drive.folder / MAP)), drive.digest) for drive in drives_of(self.run, self.settings)
+        ]
+        found = {}
+        for block in self._blocks:
+            near = {name_of(tile) for tile in self._tiles_within(block, halo)}
+            found[block] = sorted(made_from for tiles, made_from in drives if tiles & near)
+        return found
+
+    def _tiles_within(self, block: Block, halo_m: float) -> Iterator[Tile]:
+        edge_m = self.raw.fused.voxel_size_m * (1 << TILE_BITS)
+        return tiles_around(block, math.ceil(halo_m / edge_m))
 
     def _sums(self, around: Mapping[Block, str]) -> dict[Block, Sums]:
         """What every block adds to the figures of the map."""
@@ -178,6 +204,7 @@ class _Refinement:
 
     def _made_from(self, around: Mapping[Block, str], figures: Figures) -> dict[Block, str]:
         """Digest of all that decides each block."""
+        classifiers = self._classifier_digests()
         poses = np.concatenate([np.empty((0, 4, 4)), *self.raw.evidence.poses.values()])
         images = np.concatenate([np.empty((0, 32), np.uint8), *self.raw.evidence.image_digests.values()])
         at = origins_of(poses)[:, :2]
@@ -192,7 +219,7 @@ class _Refinement:
             # to 1 um: poses that were saved as quaternions come back with other last bits; + 0.0 makes -0.0 a 0.0
             keyframes = hashlib.sha256((poses[near].round(6) + 0.0).tobytes())
             keyframes.update(images[near].tobytes())
-            found[block] = digest([around[block], asdict(figures), keyframes.hexdigest()])
+            found[block] = digest([around[block], asdict(figures), keyframes.hexdigest(), classifiers[block]])
         return found
 
     def _made(self, made_from: Mapping[Block, str], said: Mapping[Block, Any]) -> dict[Tile, Made]:
@@ -224,6 +251,7 @@ class _Inputs:
         self.raw = open_raw(Path(run), open_label_set(opened.classes))
         self.halo = halo_m(self.steps, self.raw.fused.voxel_size_m)
         self.sums_halo = sums_halo_m(self.steps, self.raw.fused.voxel_size_m)
+        self.drives = drives_of(Path(run), opened) if opened.geometric_classifier.enabled else []
 
     def beside(self, block: Block, around: VoxelMap) -> Evidence:
         """What is known beside the voxels `around` a block, those of its halo and maybe more."""
@@ -233,7 +261,11 @@ class _Inputs:
         if len(indices) and self.steps.free_space.enabled:
             box = (np.stack(limits_of(indices)) + 0.5) * moved.voxel_size_m
             keyframes = self.raw.evidence.keyframes_near(box, self.steps.free_space.farthest_m)
-        return Evidence(moved, self.model, keyframes)
+        geometry = None
+        if self.steps.geometric_labels.enabled:
+            margin = geometry_halo_m(self.steps, around.voxel_size_m)
+            geometry = geometric_evidence(self.drives, block, margin)
+        return Evidence(moved, self.model, keyframes, geometry)
 
 
 @lru_cache(1)

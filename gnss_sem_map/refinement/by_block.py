@@ -49,6 +49,12 @@ def halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
     )
 
 
+def geometry_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
+    """How far around a block the geometric classifier is asked, m."""
+    names = [step.name for step in STEPS]
+    return _reach_from(names.index("geometric_labels"), settings, voxel_size_m)
+
+
 def sums_halo_m(settings: RefinementSettings, voxel_size_m: float) -> float:
     """How far around a block voxels are read for its sums, m."""
     return height_above_ground.REACH_M + _sums_reach_m(settings, voxel_size_m)

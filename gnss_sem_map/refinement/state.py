@@ -16,7 +16,7 @@ from gnss_sem_map.labels.sensor_model import LabelCalibration
 from gnss_sem_map.refinement.figures import Figures
 from gnss_sem_map.refinement.height_above_ground import height_over_ground
 from gnss_sem_map.refinement.kerb_points import Kerbs
-from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT, find
 from gnss_sem_map.voxels.semantic_map import Reason, SemanticMap, State
 from gnss_sem_map.voxels.tile_files import Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap, best_classes
@@ -41,6 +41,37 @@ class NotApplicable(Exception):
 
 
 @dataclass(frozen=True, eq=False)
+class GeometricEvidence:
+    """What geometric classifiers say of voxels; that of several drives is added in whole numbers."""
+
+    keys: NDArray[np.int64]
+    """(v,) sorted."""
+    sums: NDArray[np.int32]
+    """(v, c + 1) log probabilities in 2^-10 nat, `other` last."""
+    drives: NDArray[np.int32]
+    """(v,) that say it."""
+
+    def __add__(self, other: GeometricEvidence) -> GeometricEvidence:
+        keys = np.union1d(self.keys, other.keys)
+        sums, drives = np.zeros((len(keys), self.sums.shape[1]), np.int32), np.zeros(len(keys), np.int32)
+        for one in (self, other):
+            places = np.searchsorted(keys, one.keys)
+            sums[places] += one.sums
+            drives[places] += one.drives
+        return GeometricEvidence(keys, sums, drives)
+
+    def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Mean log probabilities (n, c + 1) of voxels by their sorted keys, nat; NaN where no drive says anything."""
+        places = np.empty(len(keys), np.int64)
+        find(self.keys, keys, places)
+        found = np.full((len(keys), self.sums.shape[1]), np.nan, np.float32)
+        known = places >= 0
+        of_known = places[known]
+        found[known] = self.sums[of_known] / (np.float32(UNITS_PER_NAT) * self.drives[of_known, None])
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """What is known beside the map itself; None for what is not."""
 
@@ -50,6 +81,8 @@ class Evidence:
     """Where the classes were found to stand, in place of rules, and a temperature."""
     keyframes: Keyframes | None = None
     """Scans that say which space is free; only with poses sharp enough for it."""
+    geometry: GeometricEvidence | None = None
+    """What geometric classifiers say of the shape and intensity of voxels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,13 +23,13 @@ from gnss_sem_map.refinement import (
     decision,
     discount,
     free_space,
+    geometric_labels,
     geometric_prior,
     kerbs,
     levels,
     potts_mrf,
     removed_layer,
     systematic_error,
-    unobserved,
     vehicles,
 )
 from gnss_sem_map.refinement.count_grid import CountGridSettings
@@ -37,6 +37,7 @@ from gnss_sem_map.refinement.crumbs import CrumbSettings
 from gnss_sem_map.refinement.decision import DecisionSettings
 from gnss_sem_map.refinement.discount import DiscountSettings
 from gnss_sem_map.refinement.free_space import FreeSpaceSettings
+from gnss_sem_map.refinement.geometric_labels import GeometricLabelSettings
 from gnss_sem_map.refinement.geometric_prior import GeometricPriorSettings
 from gnss_sem_map.refinement.kerbs import KerbSettings
 from gnss_sem_map.refinement.levels import LevelSettings
@@ -44,7 +45,6 @@ from gnss_sem_map.refinement.potts_mrf import PottsSettings
 from gnss_sem_map.refinement.removed_layer import RemovedLayerSettings
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings, VehicleObject
 from gnss_sem_map.refinement.systematic_error import SystematicErrorSettings
-from gnss_sem_map.refinement.unobserved import UnobservedSettings
 from gnss_sem_map.refinement.vehicles import VehicleSettings
 
 
@@ -74,9 +74,10 @@ class RefinementSettings(BaseModel):
     potts_mrf: PottsSettings = Field(
         default=PottsSettings(), description="Neighbouring voxels as evidence for each other."
     )
-    unobserved: UnobservedSettings = Field(
-        default=UnobservedSettings(),
-        description="Labels for voxels that no camera saw, from their neighbours; they are marked as inferred.",
+    geometric_labels: GeometricLabelSettings = Field(
+        default=GeometricLabelSettings(),
+        description="What the geometric classifier says: it corrects what images saw, and labels what no camera saw,"
+        " which is marked as inferred.",
     )
     decision: DecisionSettings = Field(
         default=DecisionSettings(), description="The most probable class, and its confidence."
@@ -127,7 +128,7 @@ STEPS = tuple(
         count_grid,
         vehicles,
         potts_mrf,
-        unobserved,
+        geometric_labels,
         decision,
         levels,
         kerbs,

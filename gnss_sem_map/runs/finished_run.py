@@ -365,10 +365,11 @@ def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:
 
 def _check_same_map(before: Settings, after: Settings) -> None:
     """Raise ConfigError if settings other than those of the refinement differ."""
-    same = after.model_copy(update={"refinement": before.refinement, "delivery": before.delivery})
+    free = ("refinement", "geometric_classifier", "delivery")
+    same = after.model_copy(update={name: getattr(before, name) for name in free})
     differ = differing(same, before)
     if differ:
         raise ConfigError(
-            f"refine: {', '.join(differ)} differ from those of the run; refine changes those of refinement and"
-            " delivery: run the drive again"
+            f"refine: {', '.join(differ)} differ from those of the run; refine changes those of {', '.join(free)}:"
+            " run the drive again"
         )

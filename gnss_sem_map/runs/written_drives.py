@@ -85,6 +85,7 @@ def write_drives(
             "changes": [change.about(label_set) for change in changes or ()],
             "map": about_map(folder, refined.report),
         }
+        about["warnings"] += stats.warnings
         return write_merged(folder, settings, about, run.progress)
 
 

@@ -4,9 +4,10 @@ All are module-level functions (numba caches only those), release the GIL, and a
 do not depend on order, so any order of scans and any number of threads give the same bits. The tests hold a numpy
 version of each.
 
-A voxel is one row of a table: int64 key, c int32 log-likelihood sums, two int32 sums of image observations, uint32 hits,
-and in a word the int64 sum of heights (48 bytes for five classes). Attributes may follow (`attribute_table`). Rows are in the order in which voxels
-are first seen, so those of one place are near each other in memory (`hash_table`).
+A voxel is one row of a table: int64 key, c int32 log-likelihood sums, two int32 sums of image observations, uint32
+hits, and in a word the int64 sum of heights (48 bytes for five classes). Attributes may follow (`attribute_table`).
+Rows are in the order in which voxels are first seen, so those of one place are near each other in memory
+(`hash_table`).
 """
 
 from __future__ import annotations
@@ -179,7 +180,7 @@ def run_starts(keys, start):
 def log_likelihoods(
     probabilities, log_table, log_percent, floor_percent, answers, abstain, classes, observations
 ):  # fmt: skip
-    """What each pixel adds to the sums of a voxel: `observations` (p, c + 2), log-likelihoods in 2^-10 nat (eq. 6) first.
+    """What each pixel adds to the sums of a voxel: `observations` (p, c + 2), in 2^-10 nat (eq. 6) first.
 
     `probabilities` (p, c + 1) uint8: those of the map's `classes`, a tuple of columns, are renormalised without
     `other`, floored, and renormalised again, all in integers: q = max(100 p, floor sum(p)); ln(q / sum(q)) by table.

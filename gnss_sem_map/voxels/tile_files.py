@@ -75,7 +75,9 @@ def read(
     Without the sums of log-likelihoods, it takes half the time.
     """
     needed = *(_sums_of(label_set) if with_sums else ()), "label", "confidence", "state"
-    columns = _read(path, about, label_set, needed, (HITS_REMOVED, HEIGHTS, REASON, *(OF_IMAGES if with_sums else ())))
+    columns = _read(
+        path, about, label_set, needed, (HITS_REMOVED, HEIGHTS, REASON, *(OF_IMAGES if with_sums else ()))
+    )
     removed, reasons = columns.get(HITS_REMOVED), columns.get(REASON)
     return SemanticMap(
         voxels=_voxels_of(columns, tile, voxel_size_m, label_set),

@@ -1,0 +1,147 @@
+"""Boosted trees of one depth as arrays: fitted by scikit-learn, walked by a compiled loop, saved without pickles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from gnss_sem_map.errors import DataError
+
+DEPTH = 4
+INNER, LEAVES = (1 << DEPTH) - 1, 1 << DEPTH
+"""Nodes of a whole tree: the children of node n are 2 n + 1 and 2 n + 2."""
+ROUNDS, LEARNING_RATE, LEAST_IN_LEAF = 40, 0.1, 100
+"""Few labels are independent of each other, as views of one surface err alike: small trees of many voxels."""
+SHARE_OF_FEATURES = 0.5
+"""Of each split."""
+BINS = 63
+SEED = 0
+ROWS_AT_ONCE = 256
+"""Voxels that walk through a tree one after another, while it and their features are in the cache."""
+MOST_TREES = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class BoostedTrees:
+    """Trees whose leaves add up to scores: of k classes in turn, or the log odds of the second of two classes."""
+
+    classes: NDArray[np.int8]
+    """(k,) that it was fitted to, in ascending order."""
+    baseline: NDArray[np.float32]
+    """(s,) scores before the first tree; s is k, or 1 for two classes."""
+    features: NDArray[np.int16]
+    """(t, 15) column that an inner node looks at."""
+    thresholds: NDArray[np.float32]
+    """(t, 15): up to it one goes left. Infinite where the tree that was fitted ends earlier."""
+    leaves: NDArray[np.float32]
+    """(t, 16) what a leaf adds."""
+
+    @classmethod
+    def fit(
+        cls, features: NDArray[np.float32], classes: NDArray[np.int8], weights: NDArray[np.float64]
+    ) -> BoostedTrees:
+        """Fit them to the classes (r,) of rows (r, f), two different ones at least.
+
+        Histogram gradient boosting (Ke et al. 2017, as scikit-learn has it), in one thread: so it gives the same bits
+        on any number of cores.
+        """
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        model = HistGradientBoostingClassifier(
+            max_iter=ROUNDS, max_depth=DEPTH, max_leaf_nodes=LEAVES, learning_rate=LEARNING_RATE,
+            min_samples_leaf=LEAST_IN_LEAF, max_features=SHARE_OF_FEATURES, max_bins=BINS, early_stopping=False,
+            random_state=SEED,
+        )  # fmt: skip
+        with threadpool_limits(1):
+            model.fit(features, classes, sample_weight=weights)
+        trees = [_whole(tree.nodes) for of_round in model._predictors for tree in of_round]
+        columns, thresholds, leaves = map(np.stack, zip(*trees, strict=True))
+        baseline = model._baseline_prediction.ravel().astype(np.float32)
+        return cls(model.classes_.astype(np.int8), baseline, columns, thresholds, leaves)
+
+    def scores(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Sums of baseline and trees (v, s) of rows (v, f)."""
+        scores = np.tile(self.baseline, (len(features), 1))
+        _walk(features, self.features, self.thresholds, self.leaves, scores)
+        return scores
+
+    def check(self, features: int, classes: int) -> None:
+        """Raise DataError unless these are trees for so many features and classes, in arrays as the fields say."""
+        kinds = (np.int8, np.float32, np.int16, np.float32, np.float32)
+        arrays: tuple[NDArray[Any], ...] = (
+            self.classes, self.baseline, self.features, self.thresholds, self.leaves,
+        )  # fmt: skip
+        if (
+            any(array.dtype != kind for array, kind in zip(arrays, kinds, strict=True))
+            or self.classes.ndim != 1
+        ):
+            raise DataError("its arrays have other types")
+        trees, known = len(self.leaves), self.classes
+        scores = 1 if len(known) == 2 else len(known)
+        shapes = (scores,), (trees, INNER), (trees, INNER), (trees, LEAVES)
+        if (
+            tuple(array.shape for array in arrays[1:]) != shapes
+            or not 0 < trees <= MOST_TREES
+            or trees % scores
+        ):
+            raise DataError("its arrays are no trees of one depth")
+        if len(known) < 2 or (np.diff(known) <= 0).any() or known[0] < 0 or known[-1] >= classes:
+            raise DataError("its trees are of other classes")
+        if (self.features < 0).any() or (self.features >= features).any() or np.isnan(self.thresholds).any():
+            raise DataError("its trees look at features that are none")
+        if not (np.isfinite(self.leaves).all() and np.isfinite(self.baseline).all()):
+            raise DataError("its leaves are not finite")
+
+
+def _whole(nodes: NDArray[Any]) -> tuple[NDArray[np.int16], NDArray[np.float32], NDArray[np.float32]]:
+    """A tree of scikit-learn, in which every path has the same length: where it ended, all go left."""
+    columns, thresholds = np.zeros(INNER, np.int16), np.full(INNER, np.inf, np.float32)
+    leaves = np.zeros(LEAVES, np.float32)
+    there = {0: 0}  # place in the whole tree -> place in `nodes`
+    for place in range(INNER + LEAVES):
+        if place not in there:
+            continue
+        node = nodes[there[place]]
+        if place >= INNER:
+            leaves[place - INNER] = node["value"]
+        elif node["is_leaf"]:
+            there[2 * place + 1] = there[place]
+        else:
+            columns[place], thresholds[place] = node["feature_idx"], _rounded_down(node["num_threshold"])
+            there[2 * place + 1], there[2 * place + 2] = int(node["left"]), int(node["right"])
+    return columns, thresholds, leaves
+
+
+def _rounded_down(threshold: float) -> np.float32:
+    """The largest float32 that is not above: a float32 is on the same side of both."""
+    rounded = np.float32(threshold)
+    return np.nextafter(rounded, np.float32(-np.inf)) if rounded > threshold else rounded
+
+
+@njit(cache=True, nogil=True)
+def _walk(rows, features, thresholds, leaves, scores):
+    """Every row goes through every tree; without branches, which would be guessed wrong half of the time."""
+    columns, here = scores.shape[1], np.empty((rows.shape[1], ROWS_AT_ONCE), np.float32)
+    total = np.empty(ROWS_AT_ONCE, np.float32)
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        count = min(ROWS_AT_ONCE, len(rows) - first)
+        for i in range(count):
+            for f in range(rows.shape[1]):
+                here[f, i] = rows[first + i, f]
+        for column in range(columns):
+            for i in range(count):
+                total[i] = scores[first + i, column]
+            for tree in range(column, len(leaves), columns):
+                for i in range(count):
+                    node = 0
+                    for _ in range(DEPTH):
+                        goes_right = here[features[tree, node], i] > thresholds[tree, node]
+                        node = 2 * node + 1 + goes_right
+                    total[i] += leaves[tree, node - INNER]
+            for i in range(count):
+                scores[first + i, column] = total[i]

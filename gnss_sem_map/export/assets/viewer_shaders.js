@@ -29,7 +29,7 @@ vec3 ramped(float t) {
 }
 void main() {
   bool bead = int(about.x) >= firstLine;
-  bool unlabelled = !bead && (int(about.x) == firstLine - 1 || float(about.y) < 255.0 * leastConfidence - 0.5);
+  bool unlabelled = !bead && (int(about.x) == firstLine - 1 || float(about.y) < 255.0 * leastConfidence - 0.01);
   vec4 entry = palette[unlabelled ? firstLine - 1 : int(about.x)];
   centre = (cell + 0.5) * scale + corner;
   vec3 seen = centre * axes;

@@ -238,7 +238,7 @@ def test_labels_below_the_least_confidence_are_shown_as_a_map_without_them_is(
     np.testing.assert_array_equal(*pictures)
     written(tmp_path, street, None)
     browser.open((tmp_path / "viewer.html").as_uri() + "#at=30,0,0,60,10,40&hide=")
-    assert (browser.screenshot() != pictures[0]).any(axis=2).mean() > 0.05
+    assert (browser.screenshot() != pictures[0]).any(axis=2).mean() > 0.02
     browser.run(
         "const slider = document.getElementById('least'); slider.value = 0.7;"
         "slider.dispatchEvent(new Event('input')); draw();"

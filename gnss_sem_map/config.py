@@ -44,7 +44,7 @@ FILES = (("calibration",), ("classes",), ("geometric_classifier", "model"), ("de
 
 
 class DeliverySettings(BaseModel):
-    """Coordinates of the files that a map is exported to; the map itself stays in its own frame."""
+    """Coordinates and labels of the files that a map is exported to; the map itself stays as it is."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -55,6 +55,9 @@ class DeliverySettings(BaseModel):
         None,
         description="Grid of geoid heights as PROJ reads it (.tif, .gtx): heights are orthometric; null: they are"
         " above the WGS 84 ellipsoid.",
+    )
+    min_confidence: float = Field(
+        0.0, ge=0, le=1, description="Voxels whose label is less sure than this are written as unlabelled."
     )
 
 
@@ -91,7 +94,9 @@ class Settings(BaseModel):
         GeometricClassifierSettings(),
         description="Classes by shape and intensity, where no camera looked, and beside what it saw.",
     )
-    delivery: DeliverySettings = Field(DeliverySettings(), description="Coordinates of exported files.")
+    delivery: DeliverySettings = Field(
+        DeliverySettings(), description="Coordinates and least confidence of exported files."
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -78,12 +78,18 @@ def export(
     ] = None,
     crs: Crs = None,
     geoid: Geoid = None,
+    min_confidence: Annotated[
+        float | None,
+        typer.Option(
+            help="Voxels whose label is less sure than this (0 to 1) are written as unlabelled; default: 0."
+        ),
+    ] = None,
 ) -> None:
-    """Write the refined map of a run in some formats; in other coordinates into a folder of their own."""
+    """Write the refined map of a run in some formats; in other coordinates, or cut, into a folder of their own."""
     from gnss_sem_map.runs.finished_run import Run
 
     finished = Run.open(run)
-    settings = delivered_in(finished.settings, crs, geoid)
+    settings = delivered_in(finished.settings, crs, geoid, min_confidence)
     with progress_bars() as progress:
         files = finished.export(
             [name.strip() for name in formats.split(",")], out, settings.delivery, progress

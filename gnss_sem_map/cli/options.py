@@ -78,13 +78,20 @@ def settings_of(
     return delivered_in(config.load(file, overrides or ()), crs, geoid)
 
 
-def delivered_in(settings: Settings, crs: int | None, geoid: Path | None) -> Settings:
-    """Settings with the coordinates that are given; raises ConfigError for those that no map can have."""
+def delivered_in(
+    settings: Settings, crs: int | None, geoid: Path | None, min_confidence: float | None = None
+) -> Settings:
+    """Settings with the coordinates and the least confidence that are given; raises ConfigError for impossible ones."""
+    from gnss_sem_map.config import DeliverySettings, parse
     from gnss_sem_map.export.georeference import check_delivery
 
-    new = {"crs": crs, "geoid": None if geoid is None else geoid.resolve()}
+    new = {
+        "crs": crs,
+        "geoid": None if geoid is None else str(geoid.resolve()),
+        "min_confidence": min_confidence,
+    }
     given = {name: value for name, value in new.items() if value is not None}
-    delivery = settings.delivery.model_copy(update=given)
+    delivery = parse(DeliverySettings, (), settings.delivery.model_dump(mode="json") | given, "delivery")
     check_delivery(delivery.crs, delivery.geoid)
     return settings.model_copy(update={"delivery": delivery})
 

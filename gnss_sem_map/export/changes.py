@@ -38,7 +38,7 @@ class Change:
     def about(self, label_set: LabelSet) -> dict[str, Any]:
         """In words and numbers, for run.json, the report and the file."""
         thing = self.thing
-        name = label_set.names[thing.label] if thing.label >= 0 else "unknown"
+        name = label_set.legend.names[thing.label] if thing.label >= 0 else "unknown"
         return {
             "change": "appeared" if thing.appeared else "vanished",
             "class": name,

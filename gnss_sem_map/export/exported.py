@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.georeference import Georeference
+from gnss_sem_map.labels.label_set import UNLABELLED
 from gnss_sem_map.voxels.attributes import Attributes, TiledAttributes
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tile_files import Tile
@@ -67,6 +68,25 @@ class Exported:
         return Extent.of(self.map)
 
 
+def sure_part(tiled_map: TiledMap, min_confidence: float) -> TiledMap:
+    """The map in which voxels whose label is less sure than `min_confidence` (0 to 1) have none."""
+    if min_confidence == 0:
+        return tiled_map
+
+    def read_tile(tile: Tile) -> SemanticMap:
+        piece = tiled_map.read_tile(tile)
+        unsure = piece.confidence < np.float32(min_confidence)
+        return replace(
+            piece,
+            labels=np.where(unsure, np.int8(UNLABELLED), piece.labels),
+            confidence=np.where(unsure, np.float32(0), piece.confidence),
+            # without its inferred label, it is what no camera saw
+            states=np.where(unsure & piece.inferred, np.uint8(State.UNOBSERVED), piece.states),
+        )
+
+    return replace(tiled_map, read_tile=read_tile)
+
+
 @dataclass(frozen=True, eq=False)
 class Extent:
     """Which voxels files show, and how far these reach.
@@ -79,7 +99,9 @@ class Extent:
     has_labels: bool
     """Whether any of those has a label; if not, all of them are visible."""
     labels: NDArray[np.int64]
-    """(c + 1,) drawable voxels of every class, and those without."""
+    """(c + 2,) drawable voxels of every class, of `other`, and those without."""
+    inferred: int
+    """Drawable voxels that no camera saw, of which the class is inferred."""
     count: int
     """Visible voxels."""
     low: NDArray[np.int64]
@@ -91,10 +113,11 @@ class Extent:
 
     @classmethod
     def of(cls, tiled_map: TiledMap) -> Extent:
-        classes = len(tiled_map.label_set.names)
+        classes, inferred = len(tiled_map.label_set.legend.names), 0
         labelled, standing, removed = _Sums(classes), _Sums(classes), _Sums(classes)
         for piece in tiled_map:
             was_removed = piece.states == State.REMOVED
+            inferred += int(np.count_nonzero(piece.inferred))
             indices = piece.voxels.indices
             for sums, chosen in ((labelled, piece.shown), (standing, ~was_removed), (removed, was_removed)):
                 places = np.flatnonzero(chosen)
@@ -105,6 +128,7 @@ class Extent:
             has_standing=standing.count > 0,
             has_labels=labelled.count > 0,
             labels=drawable.labels,
+            inferred=inferred,
             count=visible.count,
             low=visible.low,
             high=visible.high,

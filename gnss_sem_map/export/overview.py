@@ -17,6 +17,9 @@ MOST_CELLS = 800
 AREA_CELL_M = 1.0
 NO_LABEL, NOTHING = (205, 209, 217), (255, 255, 255)
 """Colours of pixels, RGB."""
+CUTS = np.linspace(0, 0.95, 20).astype(np.float32)
+"""Confidences below which a label may be left out."""
+ORIGINS = ("observed", "inferred", "without a class")
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +30,18 @@ class Overview:
     hits: NDArray[np.int64]
     """(rows, columns) LiDAR points of the voxels that were not removed."""
     labels: NDArray[np.int8]
-    """(rows, columns) the class of most labelled voxels; -1: only unlabelled ones, -2: none."""
+    """(rows, columns) the class of most labelled voxels, c for `other`; -1: only unlabelled ones, -2: none."""
     area_m2: float
     """Of the squares with a voxel that was not removed, with edges of about `AREA_CELL_M`."""
     not_looked_at: float
     """Share of these LiDAR points in voxels that no labelled image shows."""
     undecided: float
     """Share of those in voxels that images show, but to which they give no class."""
+    origins: dict[str, float]
+    """Share of the voxels that were not removed: observed, inferred, and without a class."""
+    kept: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
+    """Of all, and of what no camera saw if any of it is inferred: for the `CUTS` that leave some label, the share of
+    the LiDAR points that keep it, and its mean confidence in these."""
     confidence: dict[str, tuple[int, float]]
     """Class: labelled voxels and their mean confidence."""
     colours: dict[str, str]
@@ -51,10 +59,11 @@ def overview_of(tiled: TiledMap) -> Overview | None:
     shift = max(0, int(np.ceil(np.log2((high - low).max() / MOST_CELLS))))
     columns, rows = ((high - low) >> shift) + 1
     area_shift = max(0, round(np.log2(AREA_CELL_M / tiled.voxel_size_m)))
-    names, colours = tiled.label_set.names, tiled.label_set.colours
+    names, colours = tiled.label_set.legend.names, tiled.label_set.legend.colours
     votes = np.zeros((len(names) + 1, rows * columns), np.int32)
     hits, squares, without = np.zeros(rows * columns), 0, np.zeros(2)
     classes, looks = np.zeros((len(names), 2)), np.zeros((len(LOOKS), 2))
+    origins, unseen, cut = np.zeros(3), 0.0, np.zeros((2, len(CUTS), 2))
     for piece in tiled:
         stands = piece.states != State.REMOVED
         places, labels = piece.voxels.indices[stands, :2].astype(np.int64), piece.labels[stands]
@@ -69,6 +78,12 @@ def overview_of(tiled: TiledMap) -> Overview | None:
         known, sure = labels >= 0, piece.confidence[stands]
         was_seen = piece.states[stands] != State.UNOBSERVED
         without += weights[~known & ~was_seen].sum(), weights[~known & was_seen].sum()
+        inferred = piece.inferred[stands]
+        origins += [np.count_nonzero(mask) for mask in (known & ~inferred, inferred, ~known)]
+        unseen += weights[inferred | ~was_seen].sum()
+        for sums, mask in zip(cut, (known, inferred), strict=True):
+            groups = np.searchsorted(CUTS, sure[mask], side="right") - 1
+            sums += _sums(groups, sure[mask], len(CUTS), weights[mask])
         classes += _sums(labels[known], sure[known], len(classes))
         groups = np.searchsorted(LOOKS, weights[known], side="right") - 1
         looks += _sums(groups, sure[known], len(looks))
@@ -83,6 +98,12 @@ def overview_of(tiled: TiledMap) -> Overview | None:
         area_m2=squares * (tiled.voxel_size_m * (1 << area_shift)) ** 2,
         not_looked_at=not_looked_at,
         undecided=undecided,
+        origins=dict(zip(ORIGINS, (origins / max(origins.sum(), 1.0)).tolist(), strict=True)),
+        kept={
+            name: _kept(sums, total)
+            for name, sums, total in (("all", cut[0], hits.sum()), ("not seen by a camera", cut[1], unseen))
+            if sums.any()
+        },
         confidence=dict(zip(names, map(_mean, classes), strict=True)),
         colours={name: "#" + bytes(rgb).hex() for name, rgb in zip(names, colours, strict=True)},
         by_looks=dict(zip(LOOKS, map(_mean, looks), strict=True)),
@@ -104,9 +125,22 @@ def label_pixels(overview: Overview) -> NDArray[np.uint8]:
     return table[overview.labels]
 
 
-def _sums(groups: NDArray[np.integer], values: NDArray[np.float32], count: int) -> NDArray[np.float64]:
-    """(count, 2): values of every group, and their sum."""
-    return np.stack([np.bincount(groups, minlength=count), np.bincount(groups, values, count)], axis=1)
+def _sums(
+    groups: NDArray[np.integer],
+    values: NDArray[np.float32],
+    count: int,
+    weights: NDArray[np.float64] | float = 1.0,
+) -> NDArray[np.float64]:
+    """(count, 2): number of values of every group, and their sum, both weighted."""
+    weights = weights * np.ones(len(values))
+    return np.stack([np.bincount(groups, each, count) for each in (weights, weights * values)], axis=1)
+
+
+def _kept(sums: NDArray[np.float64], total: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`Overview.kept`, of the points and the sums of their confidence (k, 2) from every cut to the next."""
+    points, confidence = np.cumsum(sums[::-1], axis=0)[::-1].T
+    some = points > 0
+    return points[some] / total, confidence[some] / points[some]
 
 
 def _filled(cells: NDArray[np.float64]) -> tuple[slice, slice]:

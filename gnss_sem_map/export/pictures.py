@@ -53,8 +53,10 @@ then wide shadows."""
 UNLABELLED_BY_DAY, UNLABELLED_BY_NIGHT = (214, 217, 222), (72, 80, 97)
 UNLABELLED_ALONE = (150, 158, 172)
 """Used in a map without labels."""
+WHITE_OF_INFERRED = 0.35
+"""So much white is mixed into the colour of what no camera saw and of which the class is inferred."""
 
-Colour = NDArray[np.uint8] | tuple[int, int, int]
+Colour = NDArray[np.uint8 | np.float64] | tuple[int, int, int]
 
 _MATPLOTLIB = Lock()
 """Its figures may not be drawn by two threads at once."""
@@ -63,16 +65,16 @@ _MATPLOTLIB = Lock()
 def write_topview(exported: Exported, path: Path | str) -> None:
     """Draw the map from above as PNG, coloured by class, with legend, scale bar, north arrow and the tracks.
 
-    North is up; of every column the highest labelled voxel is seen, light grey where no camera saw any; what is
-    high darkens what lies beside it. Small maps get several pixels per voxel, large ones several voxels per pixel.
-    Raises DataError for an empty map or when the file cannot be written.
+    North is up; of every column the highest labelled voxel is seen, light grey where none has a label; what is inferred
+    is lighter, and what is high darkens what lies beside it. Small maps get several pixels per voxel, large ones
+    several voxels per pixel. Raises DataError for an empty map or when the file cannot be written.
     """
     view = top_view(exported, LONGEST_SIDE_PX)
     label_set = exported.map.label_set
     zoom = max(1, LONGEST_SIDE_PX // max(view.labels.shape))
     image = np.repeat(np.repeat(_seen_from_above(view, label_set), zoom, axis=0), zoom, axis=1)
-    counts = np.bincount(view.labels[view.labels != NOTHING] + 1, minlength=1 + len(label_set.names))
-    entries = _legend_entries(np.roll(counts, -1), label_set, UNLABELLED_BY_DAY)
+    counts = np.bincount(view.labels[view.labels != NOTHING] + 1, minlength=1 + len(label_set.legend.names))
+    entries = _legend_entries(np.roll(counts, -1), bool(view.inferred.any()), label_set, UNLABELLED_BY_DAY)
     if exported.tracks:
         entries.append(("track, from the dot", (0, 0, 0)))
     columns = (max(image.shape[1], NARROWEST_PX) - SCALE_BAR_PX - 100) // ENTRY_PX[0]
@@ -92,30 +94,43 @@ def write_topview(exported: Exported, path: Path | str) -> None:
 
 def _seen_from_above(view: TopView, label_set: LabelSet) -> NDArray[np.uint8]:
     """(rows, columns, 3) RGB: the class colours, lighter with height, darker beside something higher."""
-    # labels -2 (nothing) and -1 (unlabelled) count from the end
+    # -2 (nothing) and -1 (unlabelled) count from the end
     unlabelled = UNLABELLED_BY_DAY if (view.labels >= 0).any() else UNLABELLED_ALONE
-    palette = np.vstack([label_set.colours, (255, 255, 255), unlabelled]) / 255
+    palette = np.vstack([_class_colours(label_set), (255, 255, 255), unlabelled]) / 255
+    numbers = view.labels + np.int16(len(label_set.legend.names)) * view.inferred
     low, high = np.nanpercentile(view.heights, [2, 98])
     lightness = np.clip((view.heights - low) / max(high - low, 1.0), 0, 1)
     shade = (0.85 + 0.2 * lightness) * np.exp(-0.25 * hollows(-view.heights, reach=1, most=3.0))
     shade[view.labels == NOTHING] = 1.0
     image = np.empty((*view.labels.shape, 3), np.uint8)
     for channel, colours in enumerate(palette.T):  # all at once would take hundreds of MB
-        image[..., channel] = np.rint(255 * np.clip(colours[view.labels] * shade, 0, 1))
+        image[..., channel] = np.rint(255 * np.clip(colours[numbers] * shade, 0, 1))
     return image
 
 
+def _class_colours(label_set: LabelSet) -> NDArray[np.float64]:
+    """(2 c + 2, 3) RGB of the classes and `other` as cameras saw them, and then, lighter, inferred."""
+    return np.vstack([label_set.legend.colours, _lighter(label_set.legend.colours)])
+
+
+def _lighter(colours: Colour) -> NDArray[np.float64]:
+    return (1 - WHITE_OF_INFERRED) * np.asarray(colours) + WHITE_OF_INFERRED * 255
+
+
 def _legend_entries(
-    counts: NDArray[np.int64], label_set: LabelSet, unlabelled: Colour
+    counts: NDArray[np.int64], has_inferred: bool, label_set: LabelSet, unlabelled: Colour
 ) -> list[tuple[str, Colour]]:
-    """Name and colour of the classes of which there are any; `counts` (c + 1,), the last of what has no label."""
+    """Name and colour of the classes of which there are any; `counts` (c + 2,), the last of what has no label."""
+    legend = label_set.legend
     entries: list[tuple[str, Colour]] = [
         (name, colour)
-        for name, colour, count in zip(label_set.names, label_set.colours, counts[:-1], strict=True)
+        for name, colour, count in zip(legend.names, legend.colours, counts[:-1], strict=True)
         if count
     ]
+    if has_inferred:
+        entries.append(("lighter: inferred", _lighter(entries[0][1])))
     if counts[-1]:
-        entries.append(("no camera saw it", unlabelled) if entries else ("no labels", UNLABELLED_ALONE))
+        entries.append(("no class", unlabelled) if entries else ("no labels", UNLABELLED_ALONE))
     return entries
 
 
@@ -208,16 +223,16 @@ def write_perspective(exported: Exported, path: Path | str, camera: Camera | Non
         camera = _best_behind(exported) if exported.tracks else _from_the_south(exported)
     colours = colours_by_night(exported)
     image = lit_view(exported, colours, camera)
-    entries = _legend_entries(extent.labels, label_set, colours[-2])
+    entries = _legend_entries(extent.labels, extent.inferred > 0, label_set, colours[-2])
     if exported.tracks:
         entries.append(("track", TRACK_COLOUR))
     _write_png(np.vstack([image, _legend(image.shape[1], entries)]), path)
 
 
 def colours_by_night(exported: Exported) -> NDArray[np.uint8]:
-    """(c + 2, 3) RGB before a dark sky: of the classes, of no label, and of the tracks."""
+    """(2 c + 4, 3) RGB before a dark sky: of the classes seen and inferred, of no label, and of the tracks."""
     unlabelled = UNLABELLED_BY_NIGHT if exported.extent.labels[:-1].any() else UNLABELLED_ALONE
-    return np.vstack([exported.map.label_set.colours, unlabelled, TRACK_COLOUR]).astype(np.uint8)
+    return np.vstack([_class_colours(exported.map.label_set), unlabelled, TRACK_COLOUR]).astype(np.uint8)
 
 
 def _behind(T_map_imu: NDArray[np.float64]) -> Camera:
@@ -291,14 +306,14 @@ def driven_m(trajectory: Trajectory) -> NDArray[np.float64]:
 def lit_view(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     """(h, w, 3) RGB: shaded cubes with ambient occlusion and distance fog, nearest tiles first.
 
-    The palette holds the colours of the classes, of no label, and of the tracks.
+    The palette is that of `colours_by_night`.
     """
     distance = float(np.linalg.norm(camera.target - camera.eye))
     fine = replace(
         camera, width_px=SUPERSAMPLING * camera.width_px, height_px=SUPERSAMPLING * camera.height_px
     )
     picture, tiled_map, reach_m = Picture.empty(fine), exported.map, 10 * distance
-    unlabelled, track = len(palette) - 2, len(palette) - 1
+    unlabelled, track, inferred = len(palette) - 2, len(palette) - 1, len(palette) // 2 - 1
     for driven in exported.tracks:
         beads = _beads(driven)
         draw_cubes(
@@ -308,7 +323,8 @@ def lit_view(exported: Exported, palette: NDArray[np.uint8], camera: Camera) -> 
     for tile in sorted((tile for tile in distances if distances[tile] < reach_m), key=distances.__getitem__):
         piece = tiled_map.read_tile(tile)
         chosen = exported.extent.drawable(piece)
-        numbers = np.where(piece.labels < 0, unlabelled, piece.labels)[chosen].astype(np.int32)
+        numbers = piece.labels + np.int32(inferred) * piece.inferred
+        numbers = np.where(piece.labels < 0, unlabelled, numbers)[chosen].astype(np.int32)
         centres, half_m = piece.voxels.centres[chosen], tiled_map.voxel_size_m / 2
         order = _nearest_first(centres, camera.eye, reach_m)
         draw_cubes(picture, fine, centres[order], half_m, numbers[order], camera.eye, reach_m)

@@ -50,7 +50,7 @@ EXTRA_BYTES = (
 
 def colours(labels: NDArray[np.int8], label_set: LabelSet) -> NDArray[np.uint8]:
     """Colours of labels (v,), grey where there is none: (v, 3) RGB."""
-    palette = np.vstack([label_set.colours, UNLABELLED_COLOUR]).astype(np.uint8)
+    palette = np.vstack([label_set.legend.colours, UNLABELLED_COLOUR]).astype(np.uint8)
     return palette[labels]  # -1 is the last row
 
 
@@ -90,7 +90,7 @@ def _ply_header(tiled_map: TiledMap, count: int) -> bytes:
             "comment origin (WGS 84, ellipsoidal height):"
             f" lat_deg {frame.lat_deg:.10f} lon_deg {frame.lon_deg:.10f} alt_m {frame.alt_m:.4f}"
         )
-    lines += [f"comment label {i}: {_plain(name)}" for i, name in enumerate(label_set.names)]
+    lines += [f"comment label {i}: {_plain(name)}" for i, name in enumerate(label_set.legend.names)]
     lines += [f"comment label {PLY_UNLABELLED}: unlabelled", f"element vertex {count}"]
     lines += [f"property {PLY_TYPES[PLY_VERTEX[name].str]} {name}" for name in PLY_VERTEX.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
@@ -105,12 +105,12 @@ def write_laz(exported: Exported, path: Path | str) -> None:
     """Write the map as LAZ (LAS 1.4, point format 7): every voxel that was not removed.
 
     Coordinates are those of the delivery (see `Georeference`), and a text in the header says which; a map without a
-    frame stays in its own metres, without a CRS. `classification` holds the class set's ASPRS codes, 0 where no camera
-    looked and 1 where looking gave no class; colours are those of the classes. Extra bytes: `sem_label` (SemanticKITTI
-    raw id), `confidence`, `hits`, `state`. `gps_time` (adjusted standard GPS time, s) is when the last point of the
-    voxel was measured, `intensity` the median of its points, 65535 for 1; both are 0 where they are not known, see
-    `voxels.attributes`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4 R15 (coordinate system
-    as OGC WKT 1).
+    frame stays in its own metres, without a CRS. `classification` holds the class set's ASPRS codes, 66 for `other`, 0
+    where no camera looked and 1 where looking gave no class; colours are those of the classes. Extra bytes: `sem_label`
+    (SemanticKITTI raw id, 99 for `other`), `confidence`, `hits`, `state`. `gps_time` (adjusted standard GPS time, s) is
+    when the last point of the voxel was measured, `intensity` the median of its points, 65535 for 1; both are 0 where
+    they are not known, see `voxels.attributes`. Raises DataError when the file cannot be written. Source: ASPRS LAS 1.4
+    R15 (coordinate system as OGC WKT 1).
     """
     _write_points(exported, path, removed=False)
 
@@ -174,9 +174,10 @@ def las_header(
         header.vlrs.append(
             laspy.VLR("LASF_Spec", TEXT_AREA, "CRS and heights", _plain(georeference.words).encode())
         )
-    lookup, codes = ClassificationLookupVlr(), label_set.asprs_codes
-    for code in np.unique(codes).tolist():
-        lookup[code] = "/".join(_plain(label_set.names[i]) for i in np.flatnonzero(codes == code))[:15]
+    lookup, legend = ClassificationLookupVlr(), label_set.legend
+    for code in np.unique(legend.asprs_codes).tolist():
+        named = np.flatnonzero(legend.asprs_codes == code)
+        lookup[code] = "/".join(_plain(legend.names[i]) for i in named)[:15]
     header.vlrs.append(lookup)
     return header
 
@@ -217,8 +218,8 @@ def labelled_points(
     points.red, points.green, points.blue = 257 * colours(labels, label_set).T.astype(np.uint16)  # to 16 bit
     points.return_number[:] = 1
     points.number_of_returns[:] = 1
-    points.classification = np.where(labels < 0, UNCLASSIFIED, label_set.asprs_codes[labels])
-    points.sem_label = np.where(labels < 0, 0, label_set.semantic_kitti_ids[labels])
+    points.classification = np.where(labels < 0, UNCLASSIFIED, label_set.legend.asprs_codes[labels])
+    points.sem_label = np.where(labels < 0, 0, label_set.legend.semantic_kitti_ids[labels])
     return points
 
 

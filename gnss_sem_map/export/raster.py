@@ -41,7 +41,9 @@ class TopView:
     north: float
     """m, map frame: upper edge of row 0."""
     labels: NDArray[np.int8]
-    """(rows, columns) class; -1 unlabelled, -2 no voxel."""
+    """(rows, columns) class, c for `other`; -1 unlabelled, -2 no voxel."""
+    inferred: NDArray[np.bool_]
+    """(rows, columns) whether no camera saw that voxel and its class is inferred."""
     heights: NDArray[np.float32]
     """(rows, columns) m, map frame: top of the voxel that is seen; NaN where there is none."""
 
@@ -53,11 +55,11 @@ def top_view(exported: Exported, longest_side: int) -> TopView:
     many as keep the longer side within `longest_side` cells. Raises DataError for a map without voxels.
     """
     cells, voxel_m = _Cells.of(exported.extent, longest_side), exported.map.voxel_size_m
-    labels, rank = _seen_in_rows(exported, cells, 0, cells.rows)
+    labels, rank, inferred = _seen_in_rows(exported, cells, 0, cells.rows)
     tops = np.where(rank > ABOVE_ALL // 2, rank - ABOVE_ALL, rank)
     heights = np.where(labels == NOTHING, np.float32(np.nan), tops * np.float64(voxel_m)).astype(np.float32)
     cell_m = cells.per_cell * voxel_m
-    return TopView(cell_m, cells.west * cell_m, cells.north * cell_m, labels, heights)
+    return TopView(cell_m, cells.west * cell_m, cells.north * cell_m, labels, inferred, heights)
 
 
 @dataclass(frozen=True)
@@ -82,27 +84,29 @@ class _Cells:
 
 def _seen_in_rows(
     exported: Exported, cells: _Cells, first: int, end: int
-) -> tuple[NDArray[np.int8], NDArray[np.int32]]:
-    """Rows [first, end) of a view: label and rank of the voxel that is seen; only the tiles of these rows are read.
+) -> tuple[NDArray[np.int8], NDArray[np.int32], NDArray[np.bool_]]:
+    """Rows [first, end) of a view: label and rank of the voxel that is seen, and whether it is inferred.
 
-    The rank is the top of the voxel, in voxels, and more by `ABOVE_ALL` where it is visible: the highest rank is seen.
+    Only the tiles of these rows are read. The rank is the top of the voxel, in voxels, and more by `ABOVE_ALL` where it
+    is visible: the highest rank is seen.
     """
     shape = (max(0, end - first), cells.columns)
     labels, rank = np.full(shape, NOTHING, np.int8), np.full(shape, -ABOVE_ALL, np.int32)
+    inferred = np.zeros(shape, np.bool_)
     low_y, high_y = (cells.north - end) * cells.per_cell, (cells.north - first) * cells.per_cell
     for tile in exported.map.tiles:
         if tile[1] << TILE_BITS >= high_y or (tile[1] + 1) << TILE_BITS <= low_y:
             continue
         piece, extent = exported.map.read_tile(tile), exported.extent
         _look(
-            piece.voxels.indices, piece.labels, extent.drawable(piece), extent.visible(piece),
-            cells.per_cell, cells.west, cells.north - 1 - first, labels, rank,
+            piece.voxels.indices, piece.labels, piece.inferred, extent.drawable(piece), extent.visible(piece),
+            cells.per_cell, cells.west, cells.north - 1 - first, labels, rank, inferred,
         )  # fmt: skip
-    return labels, rank
+    return labels, rank, inferred
 
 
 @njit(cache=True, nogil=True)
-def _look(indices, labels, drawable, visible, per_cell, west, north, seen, rank):
+def _look(indices, labels, inferred, drawable, visible, per_cell, west, north, seen, rank, seen_inferred):
     """Look at voxels from above: of equal ranks in a cell the last is seen."""
     for i in range(len(indices)):
         row, column = north - indices[i, 1] // per_cell, indices[i, 0] // per_cell - west
@@ -110,16 +114,16 @@ def _look(indices, labels, drawable, visible, per_cell, west, north, seen, rank)
             continue
         here = indices[i, 2] + 1 + ABOVE_ALL * visible[i]
         if here >= rank[row, column]:
-            rank[row, column], seen[row, column] = here, labels[i]
+            rank[row, column], seen[row, column], seen_inferred[row, column] = here, labels[i], inferred[i]
 
 
 def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
     """Write the top view as a cloud-optimised GeoTIFF of class indices in the CRS of the delivery.
 
-    uint8 with a colour table: 254 is mapped but unlabelled, 255 no data; tags name the classes. Every pixel takes
-    the cell under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide, or more
-    where the raster would exceed 10,000 on a side. Raises DataError for an empty map, for one without a georeference,
-    or when the file cannot be written.
+    uint8 with a colour table: c is `other`, 254 is mapped but unlabelled, 255 no data; tags name the classes. Every
+    pixel takes the cell under its centre, so the grid's convergence and scale are respected. Pixels are one voxel wide,
+    or more where the raster would exceed 10,000 on a side. Raises DataError for an empty map, for one without a
+    georeference, or when the file cannot be written.
     """
     import rasterio
     import rasterio.shutil
@@ -140,7 +144,7 @@ def write_topview_geotiff(exported: Exported, path: Path | str) -> None:
             for corner, block in _blocks(exported, cells, grid, georeference):
                 tiff.write(block, 1, window=tuple(zip(corner, np.add(corner, block.shape), strict=True)))
             tiff.write_colormap(1, _colour_table(label_set))
-            tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.names)})
+            tiff.update_tags(1, **{f"class_{i}": name for i, name in enumerate(label_set.legend.names)})
             tiff.build_overviews(_overviews(grid), Resampling.mode)
         # the driver for cloud-optimised files writes no blocks, it only puts those of another file in order
         with rasterio.MemoryFile() as ordered, replacing(path) as file:
@@ -195,7 +199,7 @@ def _blocks(
         end = min(i + BLOCKS_AT_ONCE, len(rows) - 1)
         first = max(0, int(corners[i : end + 1, :, 0].min()) - 1)
         last = min(cells.rows, int(corners[i : end + 1, :, 0].max()) + 2)
-        labels, _ = _seen_in_rows(exported, cells, first, last)
+        labels, _, _ = _seen_in_rows(exported, cells, first, last)
         for k, j in np.ndindex(end - i, len(columns) - 1):
             corner = int(rows[i + k]), int(columns[j])
             shape = int(rows[i + k + 1]) - corner[0], int(columns[j + 1]) - corner[1]
@@ -219,7 +223,7 @@ def _resampled(
 
 
 def _colour_table(label_set: LabelSet) -> dict[int, tuple[Any, ...]]:
-    table = {i: (*rgb, 255) for i, rgb in enumerate(label_set.colours.tolist())}
+    table = {i: (*rgb, 255) for i, rgb in enumerate(label_set.legend.colours.tolist())}
     return {**table, GEOTIFF_UNLABELLED: (*UNLABELLED_COLOUR, 255), GEOTIFF_NODATA: (0, 0, 0, 0)}
 
 

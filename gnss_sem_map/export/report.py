@@ -36,6 +36,7 @@ ENOUGH_POINTS = 200
 MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
 TITLES = {"accuracy": "accuracy", "iou": "IoU"}
+LIGHTER = " Lighter: no camera saw it, its class is inferred."
 MAPS = {"map": "before refinement", "refined": "after refinement"}
 
 
@@ -58,13 +59,15 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "facts": _facts(run),
         "verdict": verdict_of(run, metrics, refined, list(tracks.values())),
         "pictures": {name: _picture(folder / name) for name in PICTURES},
-        "captions": PICTURES,
+        "captions": _captions(refined),
         "overviews": list(_coarse_pictures(overviews)),
         "legend": [] if refined is None else list(_legend(refined)),
         "warnings": [str(warning) for warning in run.get("warnings", ())],
         "map_figures": {key: about_map[key] for key in ("voxels", "points", "points_removed") if key in about_map},
         "calibration": _shares(metrics.get("calibration", {})),
         "looks": [] if refined is None else list(_looks(refined)),
+        "origins": {} if refined is None else {f"voxels {name}": percent(x) for name, x in refined.origins.items()},
+        "kept": None if refined is None else _kept(refined),
         "reliability": _reliability(metrics.get("calibration", {})),
         "dynamic": _shares(metrics.get("dynamic", {})),
         "path": _path(tracks, moved),
@@ -132,6 +135,13 @@ def _picture(path: Path) -> str:
     return png(path.read_bytes()) if is_file(path) else ""
 
 
+def _captions(refined: Overview | None) -> dict[str, str]:
+    """Of the pictures; of those of the map they say what lighter means where some of it is."""
+    if refined is None or not refined.origins["inferred"]:
+        return PICTURES
+    return {name: text + LIGHTER * (name != "trajectory.png") for name, text in PICTURES.items()}
+
+
 def _coarse_pictures(overviews: Mapping[str, Overview]) -> Iterator[tuple[str, str]]:
     """Source and caption of the coverage and of the classes before and after refinement."""
     if overviews:
@@ -159,6 +169,22 @@ def _group(low: int) -> str:
     """The group of `LOOKS` with this lower end, in words."""
     end = next((each - 1 for each in LOOKS if each > low), None)
     return f"{low} and more" if end is None else f"{low}" if end == low else f"{low} to {end}"
+
+
+def _kept(refined: Overview) -> Chart | None:
+    """How sure the labels are that are left when less sure ones are cut; None for a map without labels."""
+    if not refined.kept:
+        return None
+    curves: list[Curve] = [
+        (name, css, x, y) for css, (name, (x, y)) in zip("ba", refined.kept.items(), strict=False)
+    ]
+    lowest = min(float(y.min()) for _, y in refined.kept.values())
+    return chart(
+        "What a least confidence of 0, 0.05, ... 0.95 (from right to left) leaves: the share of the LiDAR points that"
+        " keep a label, and the expected accuracy of these, which is their mean confidence.",
+        "share with a label", "expected accuracy", curves, (0, 1), (min(0.9, int(10 * lowest) / 10), 1), width=420,
+        height=340, has_legend=True,
+    )  # fmt: skip
 
 
 def _reliability(calibration: Mapping[str, Any]) -> Chart | None:

@@ -92,7 +92,7 @@ def features_of(tiled_map: TiledMap, georeference: Georeference) -> Iterator[Fea
         )
         if name in names
     ]
-    ground = np.zeros(len(names) + 1, np.uint8)
+    ground = np.zeros(len(names) + 1, np.uint8)  # the last is of `other`, and of -1
     for i, name in enumerate(GROUND, 1):
         if name in names:
             ground[names.index(name)] = i

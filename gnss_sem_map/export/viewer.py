@@ -56,12 +56,12 @@ def write_viewer(
     """Write the map as an HTML page that works from file://, some 2 MB per million voxels.
 
     Classes, the tracks, removed and unlabelled voxels are layers to switch, and so are the boxes of `changes` (rows of
-    `Change.about`); colours show class, height, confidence or where the class comes from; a click tells what a voxel or
-    a box is, and with `georeference` where on Earth. The address of the page follows the view. Up to `most_voxels` the
-    page holds the map. Above, voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of
-    the page's name (`viewer/` beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map
-    is read tile by tile.
-    Raises DataError for an empty map, when that folder exists, and when a file cannot be written.
+    `Change.about`); colours show class (lighter where it is inferred), height, confidence or where the class comes
+    from; labels less sure than a chosen confidence are shown as unlabelled; a click tells what a voxel or a box is, and
+    with `georeference` where on Earth. The address of the page follows the view. Up to `most_voxels` the page holds the
+    map. Above, voxels are joined by 2 x 2 x 2 until they fit, and the finer levels lie in a folder of the page's name
+    (`viewer/` beside `viewer.html`); without it the page shows the coarse voxels, and says so. The map is read tile by
+    tile. Raises DataError for an empty map, when that folder exists, and when a file cannot be written.
     """
     path = Path(path)
     if not path.suffix:
@@ -69,7 +69,7 @@ def write_viewer(
     if not tiled_map.tiles:
         raise DataError(NO_VOXELS)
     with adding_folder(path.with_suffix("")) as folder:
-        levels = _Levels(folder, most_voxels, len(tiled_map.label_set.names))
+        levels = _Levels(folder, most_voxels, len(tiled_map.label_set.legend.names))
         visit_nodes(tiled_map, levels.add, most_voxels)
         if not levels.in_page:
             raise DataError(NO_VOXELS)
@@ -91,8 +91,8 @@ class _Levels:
         self._voxels: Counter[int] = Counter()
         self._listed: list[tuple[int, list[int]]] = []
         self.counts = np.zeros(classes + 1, np.int64)
-        """Voxels of each class and without a label, without the removed ones."""
-        self.removed = 0
+        """Voxels of each class, of `other` and without a label, without the removed ones."""
+        self.removed = self.inferred = 0
 
     def add(self, node: Node) -> None:
         if not len(node):
@@ -101,6 +101,7 @@ class _Levels:
             stands = node.states != State.REMOVED
             self.counts += np.bincount(node.labels[stands], minlength=len(self.counts))
             self.removed += int(np.count_nonzero(~stands))
+            self.inferred += int(np.count_nonzero(node.states == State.INFERRED))
         height = node.cells[:, 2]
         listed = [node.level, *node.corner, int(height.min()), int(height.max()), *node.quadrants]
         self._listed.append((node.level, listed))
@@ -182,6 +183,7 @@ def _meta(
         "count": count,
         "unlabelled": int(levels.counts[-1]),
         "removed": levels.removed,
+        "inferred": levels.inferred,
         "origin": origin.tolist(),
         "level": level,
         "nodes": levels.listed,
@@ -195,10 +197,10 @@ def _meta(
         "classes": [
             {"name": name, "colour": colour, "count": count}
             for name, colour, count in zip(
-                tiled_map.label_set.names,
-                tiled_map.label_set.colours.tolist(),
-                levels.counts.tolist(),
-                strict=False,
+                tiled_map.label_set.legend.names,
+                tiled_map.label_set.legend.colours.tolist(),
+                levels.counts[:-1].tolist(),
+                strict=True,
             )
         ],
     }
@@ -239,5 +241,5 @@ def _indices(nodes: list[Node], axis: int) -> NDArray[np.int32]:
 def _framed(nodes: list[Node], label_set: LabelSet) -> NDArray[np.bool_]:
     """The voxels that the first view frames: those with a label, else those that stand, else all."""
     stands = np.concatenate([node.states != State.REMOVED for node in nodes])
-    shown = stands & np.concatenate([node.labels < len(label_set.names) for node in nodes])
+    shown = stands & np.concatenate([node.labels < len(label_set.legend.names) for node in nodes])
     return shown if shown.any() else stands if stands.any() else ~stands

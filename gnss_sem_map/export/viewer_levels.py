@@ -33,7 +33,7 @@ class Node:
     cells: NDArray[np.int16]
     """(v, 3) column and row in the square, and height above the lowest that a tile can hold, in voxels of the level."""
     labels: NDArray[np.uint8]
-    """(v,) class; the number of classes stands for no label."""
+    """(v,) class, c for `other`, c + 1 for no label."""
     confidence: NDArray[np.uint8]
     """(v,) 0 to 255."""
     states: NDArray[np.uint8]
@@ -81,7 +81,7 @@ def _of_tile(corner: Tile, piece: SemanticMap) -> Node:
     keys = local_keys(piece.voxels.keys)
     x, y, z = keys >> (TILE_BITS + Z_BITS), keys >> Z_BITS & (COLUMNS - 1), keys & ((1 << Z_BITS) - 1)
     order = np.argsort(morton_codes(x, y, z))  # no two are equal
-    labels = np.where(piece.labels < 0, len(piece.voxels.label_set.names), piece.labels)
+    labels = np.where(piece.labels < 0, len(piece.voxels.label_set.legend.names), piece.labels)
     ranks = piece.shown.astype(np.uint64) << np.uint64(32) | piece.voxels.hits
     return Node(
         level=0,

@@ -162,8 +162,8 @@ def align(
 
 
 def _is_static(voxels: VoxelMap) -> NDArray[np.bool_]:
-    names = voxels.label_set.names
-    return np.asarray(voxels.labels != (names.index(PARKED) if PARKED in names else len(names)))
+    parked = [label for label, name in enumerate(voxels.label_set.names) if name == PARKED]
+    return np.isin(voxels.labels, parked, invert=True)
 
 
 def _overlap(voxels: VoxelMap, p_map: NDArray[np.float64]) -> float:

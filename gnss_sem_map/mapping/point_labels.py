@@ -36,7 +36,7 @@ class PointLabels:
     """Labels of every original point of one scan, by one map; or of every voxel, and of none at the end."""
 
     labels: NDArray[np.int8]
-    """(n,) class index, -1 unknown."""
+    """(n,) class index, c for `other`, -1 unknown."""
     confidence: NDArray[np.float32]
     """(n,) probability of that class, 0 if unknown."""
     removed: NDArray[np.bool_]

@@ -178,8 +178,8 @@ class MapState:
 
     @cached_property
     def told(self) -> NDArray[np.int8]:
-        """What the map tells of every voxel (v,): its class, -1 where nothing is known, c where it is removed."""
-        return np.where(self.is_removed, np.int8(len(self.voxels.label_set.names)), self.labels)
+        """What the map tells of every voxel (v,): its label, -1 where nothing is known, c + 1 where it is removed."""
+        return np.where(self.is_removed, np.int8(len(self.voxels.label_set.legend.names)), self.labels)
 
     def without(self, gone: NDArray[np.bool_], reason: Reason) -> MapState:
         """The decided map with these voxels (v,) removed; of those that were, the reason stays."""

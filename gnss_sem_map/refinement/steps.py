@@ -247,7 +247,7 @@ def _changes(before: MapState, after: MapState, own: NDArray[np.bool_] | None) -
     """How many voxels went from which class to which; a voxel that is new in the map was what its evidence says."""
     if after.scores is before.scores and after.decided is before.decided and after.removed is before.removed:
         return {}
-    names = [*after.voxels.label_set.names, "removed", "unlabelled"]  # -1, unlabelled, is the last
+    names = [*after.voxels.label_set.legend.names, "removed", "unlabelled"]  # -1, unlabelled, is the last
     source, target = before.told, after.told
     if len(source) < len(target):
         assert after.decided is not None

@@ -79,7 +79,7 @@ def about_map(folder: Path, report: RefinementReport) -> dict[str, Any]:
     """What is in the maps of a run folder, for run.json."""
     places = {"raw": MAP, "refined": REFINED}
     maps = {name: tiles.open_map(folder / place, with_sums=False) for name, place in places.items()}
-    names = maps["raw"].label_set.names
+    names = maps["raw"].label_set.legend.names
     labelled = {name: np.zeros(len(names), np.int64) for name in maps}
     voxels = points = removed = 0
     for name, tiled in maps.items():

@@ -275,8 +275,8 @@ class Run:
     ) -> list[Path]:
         """Write the map in formats (`laz`, `ply`, ...; see `export.formats`), into the run or the folder `to`.
 
-        `delivery`: in other coordinates than those of the run, into a folder of their own. Raises ConfigError for an
-        unknown format or CRS, and DataError for files that are there already.
+        `delivery`: in other coordinates than those of the run, or with another least confidence, into a folder of
+        their own. Raises ConfigError for an unknown format or CRS, and DataError for files that are there already.
         """
         known = {each.name: each for each in FORMATS}
         chosen = list(formats)
@@ -302,10 +302,11 @@ class Run:
         return files
 
     def _exported(self, delivery: DeliverySettings | None, is_inside: bool = False) -> Exported:
-        """What is exported, in these coordinates; of files inside the run they are those of the run."""
+        """What is exported, delivered so; files inside the run are delivered as the run says."""
         if is_inside and delivery not in (None, self.settings.delivery):
             raise ConfigError(
-                "export: other coordinates than those of the run need a folder of their own: -o DIR"
+                "export: other coordinates, or another least confidence, than those of the run need a folder of their"
+                " own: -o DIR"
             )
         about, delivery = self.about, delivery or self.settings.delivery
         check_delivery(delivery.crs, delivery.geoid)

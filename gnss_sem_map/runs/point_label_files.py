@@ -86,7 +86,7 @@ def _label(
         maps = [tiles.open_map(run / MAP, label_set), refined]
     else:
         shutil.copytree(drive.known_raw, folder / RAW_LABELS, dirs_exist_ok=True)
-    ids = np.append(label_set.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
+    ids = np.append(label_set.legend.semantic_kitti_ids, 0).astype("<u4")  # the label -1 finds the last
     beside = evidence.read(folder, label_set)
     for one in drive.log.by_lidar:
         moving = beside.moving_points_of(one.lidar)
@@ -100,7 +100,7 @@ def _label(
 def _write(
     folder: Path, lidar: Path, ids: NDArray[np.uint32], labelled: tuple[Scan, list[PointLabels]]
 ) -> None:
-    """Write the labels of one scan, with these ids of the classes and, at the end, of none."""
+    """Write the labels of one scan, with these ids of the classes, of `other` and, at the end, of none."""
     scan, (*raw, after) = labelled
     label_file, other_file = lidar / f"{scan.name}.label", lidar / f"{scan.name}.bin"
     if raw:

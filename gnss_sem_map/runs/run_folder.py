@@ -18,7 +18,7 @@ from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.dynamics.movers import movers_of
 from gnss_sem_map.evaluation.preflight.findings import Preflight
-from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.exported import Exported, sure_part
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.georeference import Georeference, check_delivery
 from gnss_sem_map.export.movers import DriveOfMovers, write_movers
@@ -204,6 +204,7 @@ def exported_of(
 ) -> Exported:
     """What is exported of a run folder; without `label_set`, the classes are those that its map names."""
     refined = tiles.open_map(folder / REFINED, label_set, with_sums=False)
+    refined = sure_part(refined, delivery.min_confidence)
     return Exported(refined, tracks, title, changes, delivery.crs, delivery.geoid, open_attributes(folder))
 
 

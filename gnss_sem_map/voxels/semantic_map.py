@@ -108,6 +108,11 @@ class SemanticMap:
         return np.asarray((self.labels >= 0) & (self.states != State.REMOVED))
 
     @property
+    def inferred(self) -> NDArray[np.bool_]:
+        """(v,) mask of the labelled voxels that no camera saw, of which the label is inferred."""
+        return np.asarray((self.labels >= 0) & (self.states == State.INFERRED))
+
+    @property
     def told_reasons(self) -> NDArray[np.uint8]:
         """(v,) of `Reason`: NONE where the map does not tell."""
         return np.zeros(len(self), np.uint8) if self.reasons is None else self.reasons

@@ -18,6 +18,7 @@ import pytest
 from street import Street
 
 from gnss_sem_map import Run, Settings, pipeline, run
+from gnss_sem_map.cli.options import delivered_in
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.files.output_folder import locked, new_folder
@@ -25,9 +26,11 @@ from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
-from gnss_sem_map.refinement.steps import RefinementSettings
+from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.runs import calibrating, merged_run
+from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.merged_run import merge_run_folders
+from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import State
 
@@ -317,6 +320,51 @@ def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, sm
         _ = merged.trajectory
     with pytest.raises(DataError, match="is merged of a and b, expected a run of one drive for relabelling"):
         merged.relabel(f"labels:{small_drive.labels}")
+
+
+def test_points_of_other_have_its_id_and_run_json_counts_its_voxels(finished: Run, tmp_path: Path) -> None:
+    other = len(finished.label_set.names)
+    refined = finished.map()
+    labels = np.where(
+        (refined.labels < 0) & (refined.states != State.REMOVED), np.int8(other), refined.labels
+    )
+    for name in ("map", "evidence"):
+        shutil.copytree(finished.folder / name, tmp_path / name)
+    tiles.write(replace(refined, labels=labels), tmp_path / "refined", finished.frame)
+    drive = LabelledDrive(tmp_path, finished.drive(), finished.trajectory, finished.folder / "labels_raw")
+    write_point_labels(tmp_path, [drive], None, finished.settings)
+    before, after = (
+        np.concatenate([np.fromfile(file, "<u4") for file in sorted((folder / "labels").glob("*.label"))])
+        for folder in (finished.folder, tmp_path)
+    )
+    assert (after == 99).sum() > 100
+    assert (before[after == 99] == 0).all()
+    counted = about_map(tmp_path, RefinementReport(()))["labelled"]
+    assert counted["refined"]["other"] == (labels == other).sum()
+    assert counted["raw"]["other"] == 0
+
+
+def test_less_sure_labels_are_left_out_of_a_file_in_a_folder_of_its_own(
+    finished: Run, tmp_path: Path
+) -> None:
+    cut = DeliverySettings(min_confidence=0.9)
+    with pytest.raises(ConfigError, match="need a folder of their own"):
+        finished.export(["laz"], delivery=cut)
+    [file] = finished.export(["laz"], tmp_path / "sure", cut)
+    whole, sure = laspy.read(finished.folder / "map.laz"), laspy.read(file)
+    kept = np.asarray(whole["confidence"]) >= np.float32(0.9)
+    assert 0 < kept.sum() < len(kept)
+    np.testing.assert_array_equal(sure["sem_label"], np.where(kept, whole["sem_label"], 0))
+    np.testing.assert_array_equal(sure["hits"], whole["hits"])
+
+
+@pytest.mark.parametrize("wrong", ["1.5", "-0.1", "nan"])
+def test_a_least_confidence_beyond_0_to_1_is_one_line(wrong: str, finished: Run) -> None:
+    with pytest.raises(
+        ConfigError, match=r"^delivery: min_confidence: .*(less|greater) than|finite"
+    ) as error:
+        delivered_in(finished.settings, None, None, float(wrong))
+    assert "\n" not in str(error.value)
 
 
 def test_a_moved_point_that_a_scan_lacks_is_an_error(finished: Run, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ const gl = canvas.getContext("webgl2", { antialias: false, preserveDrawingBuffer
 const MOST_BEADS = 500000;
 // Pairs of corners of a box, the lower four first.
 const EDGES = [0, 1, 2, 3].flatMap(i => [[i, (i + 1) % 4], [i + 4, (i + 1) % 4 + 4], [i, i + 4]]);
-const classes = meta.classes.length;  // then one entry for unlabelled, and those of lines
+const classes = meta.classes.length;  // `other` is the last; then one entry for unlabelled, and those of lines
 const edges = ({ corners, text }) => EDGES.map(([i, j]) => ({ points: [corners[i], corners[j]], text }));
 const boxLayer = (name, colour, boxes) => ({ name, colour, count: boxes.length, lines: boxes.flatMap(edges) });
 const lineLayers = [
@@ -26,7 +26,7 @@ const lineLayers = [
 const layers = [...meta.classes, { name: "unlabelled", colour: [150, 150, 150], count: meta.unlabelled },
                 ...lineLayers];
 const visible = layers.map(() => true), rows = [];
-let showRemoved = false, mode = 0, frameAsked = false;
+let showRemoved = false, leastConfidence = 0, mode = 0, frameAsked = false;
 // on a screen that is higher than wide, from farther away
 const far = Math.max(1, innerHeight / innerWidth);
 const camera = { azimuth: -0.6, elevation: 0.65, distance: far * meta.view.distance, target: [...meta.view.target] };
@@ -194,6 +194,7 @@ function draw() {
   gl.uniform3fv(cubes.at("ramp"), flat(RAMP));
   gl.uniform3fv(cubes.at("origins"), flat(ORIGIN_COLOURS));
   gl.uniform2fv(cubes.at("heights"), meta.heights);
+  gl.uniform1f(cubes.at("leastConfidence"), leastConfidence);
   gl.uniform1i(cubes.at("mode"), mode);
   gl.uniform1i(cubes.at("firstLine"), classes + 1);
   gl.uniform1i(cubes.at("removed"), showRemoved ? 1 : 0);
@@ -281,6 +282,7 @@ function listen() {
   }, { passive: false });
   addEventListener("resize", redraw);
   document.querySelector("select").addEventListener("change", event => { colourBy(event.target.value); redraw(); });
+  document.getElementById("least").addEventListener("input", event => { cutAt(+event.target.value); redraw(); });
   document.getElementById("measure").addEventListener("change", event => measure(event.target.checked));
 }
 
@@ -331,7 +333,15 @@ function colourBy(name) {
   ramp.hidden = mode !== 1 && mode !== 2;
   ramp.style.background = `linear-gradient(90deg, ${RAMP.map(c => `rgb(${c})`)})`;
   document.getElementById("origins").hidden = mode !== 3;
+  document.getElementById("lighter").hidden = mode !== 0 || !meta.inferred;
   rows.forEach(update => update());
+}
+
+// Labels that are less sure are shown as unlabelled.
+function cutAt(confidence) {
+  const slider = document.getElementById("least");
+  slider.value = leastConfidence = Math.min(1, Math.max(0, confidence || 0));
+  slider.nextSibling.textContent = leastConfidence.toFixed(2);
 }
 
 async function main() {

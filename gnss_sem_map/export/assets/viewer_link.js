@@ -1,6 +1,7 @@
 "use strict";
 // The view in the address, so that it can be sent to somebody: #at=EAST,NORTH,UP,DISTANCE,AZIMUTH,ELEVATION (metres of
-// the map, degrees) &colour=height &hide=building,vegetation &removed. Each part may be left out.
+// the map, degrees) &colour=height &hide=building,vegetation &least=0.5 (confidence) &removed. Each part may be left
+// out.
 
 const WRITE_AFTER_MS = 300;  // browsers refuse an address that changes with every frame
 let writing = 0;
@@ -15,7 +16,7 @@ function link() {
   const angles = [camera.azimuth, camera.elevation].map(radians => (radians * 180 / Math.PI).toFixed(2));
   const hidden = layers.filter((_, i) => !visible[i]).map(({ name }) => encodeURIComponent(name));
   return `#at=${[...lengths, ...angles]}&colour=${document.querySelector("select").value}&hide=${hidden}`
-    + (showRemoved ? "&removed" : "");
+    + (leastConfidence ? `&least=${leastConfidence}` : "") + (showRemoved ? "&removed" : "");
 }
 
 function followLink() {
@@ -23,6 +24,7 @@ function followLink() {
   const hidden = (parts.get("hide") ?? (meta.classes.some(({ count }) => count) ? "unlabelled" : "")).split(",");
   layers.forEach(({ name }, i) => { visible[i] = !hidden.includes(name); });
   showRemoved = parts.has("removed");
+  cutAt(Number(parts.get("least")));
   const numbers = (parts.get("at") ?? "").split(",").map(Number);
   if (numbers.length === 6 && numbers.every(Number.isFinite)) {
     const [distance, azimuth, elevation] = numbers.slice(3);

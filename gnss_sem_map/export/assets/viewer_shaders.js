@@ -2,7 +2,8 @@
 // The two passes of the viewer. First, every voxel is a point sprite in which the fragment shader meets the exact
 // cube; then hollows are darkened (eye-dome lighting). Lengths are in voxels, x east, y north, z up.
 
-const NEAR = 1, FAR = 2e7, LINE_HALF = 0.3, REMOVED = 4;
+const NEAR = 1, FAR = 2e7, LINE_HALF = 0.3, INFERRED = 2, REMOVED = 4;
+const WHITE_OF_INFERRED = 0.35;  // as in the pictures
 
 const VERTEX = `#version 300 es
 precision highp float;
@@ -11,9 +12,9 @@ layout(location = 1) in uvec4 about;  // class, confidence, origin
 uniform mat3 axes;                    // columns: right, up, forward
 uniform vec3 corner;                  // of the node, from the eye
 uniform vec2 size;
-uniform float focal, largest, scale, eyeHeight;
+uniform float focal, largest, scale, eyeHeight, leastConfidence;
 uniform uint before;                  // voxels of the nodes that were drawn before
-uniform vec4 palette[69];             // rgb and whether it is shown
+uniform vec4 palette[70];             // rgb and whether it is shown
 uniform vec3 ramp[5], origins[6];
 uniform vec2 heights;
 uniform int mode, firstLine;
@@ -27,8 +28,9 @@ vec3 ramped(float t) {
   return mix(ramp[i], ramp[i + 1], s - float(i));
 }
 void main() {
-  vec4 entry = palette[about.x];
-  bool bead = int(about.x) >= firstLine, unlabelled = int(about.x) == firstLine - 1;
+  bool bead = int(about.x) >= firstLine;
+  bool unlabelled = !bead && (int(about.x) == firstLine - 1 || float(about.y) < 255.0 * leastConfidence - 0.01);
+  vec4 entry = palette[unlabelled ? firstLine - 1 : int(about.x)];
   centre = (cell + 0.5) * scale + corner;
   vec3 seen = centre * axes;
   extent = bead ? ${LINE_HALF} : 0.5 * scale;
@@ -42,6 +44,7 @@ void main() {
   colour = bead || mode == 0 || (unlabelled && mode == 2) ? entry.rgb
          : mode == 1 ? ramped((centre.z + eyeHeight - heights.x) / (heights.y - heights.x))
          : mode == 2 ? ramped(float(about.y) / 255.0) : origins[about.z];
+  if (mode == 0 && !unlabelled && about.z == ${INFERRED}u) colour = mix(colour, vec3(1.0), ${WHITE_OF_INFERRED});
   if (gone) colour = origins[${REMOVED}];
   pixels = 3.4641 * extent * focal / ahead;
   gl_PointSize = clamp(pixels * 1.1 + 1.0, 1.5, largest);

@@ -15,7 +15,7 @@ from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 VOXEL_M = 0.2
 LABELS = open_label_set()
-ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION = range(5)
+ROAD, SIDEWALK, VEHICLE, BUILDING, VEGETATION, OTHER = range(6)
 
 
 def semantic_map(
@@ -26,8 +26,9 @@ def semantic_map(
     labels = np.asarray(labels, np.int8)[first]
     rng = np.random.default_rng(7)
     evidence = np.zeros((len(keys), len(classes.names)), np.int32)
-    evidence[labels >= 0] = -2000
-    evidence[np.arange(len(keys))[labels >= 0], labels[labels >= 0]] = -100
+    of_class = np.flatnonzero((labels >= 0) & (labels < len(classes.names)))
+    evidence[of_class] = -2000
+    evidence[of_class, labels[of_class]] = -100
     hits = rng.integers(1, 500, len(keys)).astype(np.uint32)
     seen = np.where(labels >= 0, State.OBSERVED, State.UNOBSERVED)
     return SemanticMap(
@@ -46,7 +47,7 @@ def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) 
 
 @pytest.fixture(scope="session")
 def street() -> SemanticMap:
-    """60 m of road eastward, kerb, wall in the north, trees, a car, a removed car, unseen ground."""
+    """60 m of road eastward, kerb, wall in the north, trees, a car, a removed car, a lawn, unseen ground."""
     parts = [
         (box((0, 60), (-4, 4), (0, 0.2)), ROAD, State.OBSERVED),
         (box((0, 60), (4, 6), (0, 0.4)), SIDEWALK, State.REFINED),
@@ -54,6 +55,7 @@ def street() -> SemanticMap:
         (box((10, 13), (-9, -6), (0, 5)), VEGETATION, State.INFERRED),
         (box((20, 24), (1.6, 3.6), (0.2, 1.6)), VEHICLE, State.OBSERVED),
         (box((40, 44), (-3, -1.2), (0.2, 1.6)), VEHICLE, State.REMOVED),
+        (box((50, 58), (6, 9), (0, 0.2)), OTHER, State.INFERRED),
         (box((0, 60), (-6, -4), (0, 0.2)), -1, State.UNOBSERVED),
     ]
     return semantic_map(

@@ -1,5 +1,7 @@
 """The overview of a map counts every voxel that stands once and has north on top."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,30 @@ def test_an_overview_of_a_plane_over_four_tiles() -> None:
     assert overview.confidence["road"][0] == 5000
     assert (coverage_pixels(overview)[0, 0] > coverage_pixels(overview)[0, -1]).all()
     assert (label_pixels(overview)[0, 0] == URBAN.colours[building]).all()
+
+
+def test_a_cut_keeps_the_points_of_surer_labels_whose_mean_confidence_is_the_expected_accuracy(
+    street: SemanticMap,
+) -> None:
+    overview = overview_of(in_memory(street))
+    assert overview is not None
+    stands, hits, sure = street.states != State.REMOVED, street.voxels.hits.astype(float), street.confidence
+    unseen = np.isin(street.states, (State.INFERRED, State.UNOBSERVED))
+    for name, of_all in (("all", stands), ("not seen by a camera", unseen)):
+        expected = []
+        for cut in np.linspace(0, 0.95, 20).astype(np.float32):
+            kept = of_all & (street.labels >= 0) & (sure >= cut)
+            expected.append(
+                (hits[kept].sum() / hits[of_all].sum(), np.average(sure[kept], weights=hits[kept]))
+            )
+        np.testing.assert_allclose(np.transpose(overview.kept[name]), expected)
+    seen = replace(street, states=np.where(street.inferred, State.OBSERVED, street.states).astype(np.uint8))
+    observed = overview_of(in_memory(seen))
+    assert observed is not None
+    assert list(observed.kept) == ["all"]
+    shares = [street.shown & ~street.inferred, street.inferred, stands & (street.labels < 0)]
+    assert list(overview.origins.values()) == pytest.approx([mask.sum() / stands.sum() for mask in shares])
+    assert overview.confidence["other"][0] == (street.labels == len(URBAN.names)).sum()
 
 
 def test_what_stands_without_a_class_is_covered_and_told_apart_by_its_reason(street: SemanticMap) -> None:

@@ -1,5 +1,6 @@
 """Pictures show what the map holds, where it is, for a courtyard as for a long drive."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,9 +11,10 @@ from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.pictures import write_perspective, write_topview
+from gnss_sem_map.export.raster import top_view
 from gnss_sem_map.export.render import Camera
 from gnss_sem_map.labels.label_set import open_label_set
-from gnss_sem_map.voxels.semantic_map import SemanticMap
+from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
@@ -66,11 +68,30 @@ def test_the_legend_names_the_classes_that_are_there_and_no_others(
     write_topview(Exported(in_memory(street)), tmp_path / "street.png")
     write_topview(Exported(in_memory(strip(40))), tmp_path / "strip.png")
     swatches = [read(tmp_path / name)[-80:] for name in ("street.png", "strip.png")]
-    colours = open_label_set().colours
+    legend = open_label_set().legend
     shown = [
-        [name for name, c in zip(NAMES, colours, strict=True) if (s == c).all(axis=2).any()] for s in swatches
+        [name for name, c in zip(legend.names, legend.colours, strict=True) if (s == c).all(axis=2).any()]
+        for s in swatches
     ]
-    assert shown == [list(NAMES), ["road", "vegetation"]]
+    assert shown == [[*NAMES, "other"], ["road", "vegetation"]]
+
+
+def test_what_is_inferred_is_lighter_and_nothing_else_changes(street: SemanticMap, tmp_path: Path) -> None:
+    seen = replace(street, states=np.where(street.inferred, State.OBSERVED, street.states).astype(np.uint8))
+    cells = top_view(Exported(in_memory(street)), 1800).inferred
+    assert 0 < cells.sum() < cells.size
+    for write, legend_px in ((write_topview, 122), (write_perspective, 64)):
+        images = []
+        for drawn in (seen, street):
+            write(Exported(in_memory(drawn)), tmp_path / "picture.png")
+            images.append(read(tmp_path / "picture.png")[:-legend_px].astype(int))
+        changed = (images[0] != images[1]).any(axis=2)
+        assert (images[1] >= images[0]).all()
+        assert not (near(images[0], "road") & changed).any()
+        if write is write_topview:
+            assert changed.sum() == 6**2 * cells.sum()  # a cell of the view is so many pixels wide
+        else:
+            assert changed.sum() > 1000
 
 
 def test_the_track_is_drawn_on_the_road_that_it_follows(

@@ -55,7 +55,7 @@ def test_the_ply_holds_what_is_shown_and_reads_back_equal(street: SemanticMap, t
     np.testing.assert_array_equal(vertices["hits"], street.voxels.hits[shown])
     np.testing.assert_array_equal(vertices["state"], street.states[shown])
     rgb = np.column_stack([vertices[c] for c in ("red", "green", "blue")])
-    np.testing.assert_array_equal(rgb, street.voxels.label_set.colours[street.labels[shown]])
+    np.testing.assert_array_equal(rgb, street.voxels.label_set.legend.colours[street.labels[shown]])
 
 
 def test_the_ply_says_its_frame_and_its_classes(
@@ -65,6 +65,7 @@ def test_the_ply_says_its_frame_and_its_classes(
     comments = "\n".join(plyfile.PlyData.read(tmp_path / "map.ply").comments)
     assert "lat_deg 49.0000000000 lon_deg 8.4000000000 alt_m 115.0000" in comments
     assert "label 3: building" in comments
+    assert "label 5: other\n" in comments
 
 
 def test_a_map_that_no_camera_saw_is_still_worth_a_file(street: SemanticMap, tmp_path: Path) -> None:
@@ -109,19 +110,21 @@ def test_every_voxel_is_in_one_of_two_files_and_reads_back_equal(
     assert len(las.points) == len(order) > 100
     labels, states = street.labels[order], street.states[order]
     unlabelled = labels < 0
-    ids = np.where(unlabelled, 0, street.voxels.label_set.semantic_kitti_ids[labels])
-    codes = np.where(unlabelled, 0, street.voxels.label_set.asprs_codes[labels])
+    ids = np.where(unlabelled, 0, street.voxels.label_set.legend.semantic_kitti_ids[labels])
+    codes = np.where(unlabelled, 0, street.voxels.label_set.legend.asprs_codes[labels])
     np.testing.assert_array_equal(las["sem_label"], ids)
     np.testing.assert_array_equal(las.classification, codes)
+    assert (las["sem_label"] == 99).sum() == (las.classification == 66).sum() == (labels == 5).sum()
     np.testing.assert_array_equal(las["confidence"], street.confidence[order])
     np.testing.assert_array_equal(las["hits"], street.voxels.hits[order])
     np.testing.assert_array_equal(las["state"], states)
     np.testing.assert_array_equal(las.user_data, reasons[order])
     np.testing.assert_array_equal(np.asarray(las.withheld), states == State.REMOVED)
     np.testing.assert_array_equal(
-        las.red[~unlabelled] >> 8, street.voxels.label_set.colours[labels[~unlabelled], 0]
+        las.red[~unlabelled] >> 8, street.voxels.label_set.legend.colours[labels[~unlabelled], 0]
     )
     assert las.header.vlrs.get("ClassificationLookupVlr")[0][64] == "vehicle"
+    assert las.header.vlrs.get("ClassificationLookupVlr")[0][66] == "other"
     assert las.header.number_of_points_by_return[0] == len(order)
     assert las.header.creation_date == NOT_DATED
 
@@ -131,7 +134,14 @@ def test_a_code_of_several_classes_has_the_names_of_all() -> None:
     bush = {"name": "bush", "colour": [9, 9, 9], "semantic_kitti_id": 71, "asprs_code": 5}
     header = las_header(open_label_set(urban | {"classes": [*urban["classes"], bush]}), None)
     names = header.vlrs.get("ClassificationLookupVlr")[0].lookups
-    assert names == {5: "vegetation/bush", 6: "building", 11: "road", 64: "vehicle", 65: "sidewalk"}
+    assert names == {
+        5: "vegetation/bush",
+        6: "building",
+        11: "road",
+        64: "vehicle",
+        65: "sidewalk",
+        66: "other",
+    }
 
 
 def test_a_reader_that_knows_no_flags_sees_no_ghost_in_the_map(

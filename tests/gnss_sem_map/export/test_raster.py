@@ -19,6 +19,7 @@ from gnss_sem_map.export.raster import (
     top_view,
     write_topview_geotiff,
 )
+from gnss_sem_map.labels.label_set import OTHER_COLOUR
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 from gnss_sem_map.voxels.tiles import in_memory
 
@@ -95,9 +96,9 @@ def test_resampling_keeps_the_area_of_every_class(street: SemanticMap, tmp_path:
     with rasterio.open(tmp_path / "topview_class.tif") as tiff:
         classes = tiff.read(1)
     labels = top_view(Exported(in_memory(street)), 10_000).labels
-    for label in range(5):
+    for label in range(6):
         assert (classes == label).sum() == pytest.approx((labels == label).sum(), rel=0.02)
-    assert set(np.unique(classes)) == {0, 1, 2, 3, 4, GEOTIFF_UNLABELLED, GEOTIFF_NODATA}
+    assert set(np.unique(classes)) == {0, 1, 2, 3, 4, 5, GEOTIFF_UNLABELLED, GEOTIFF_NODATA}
 
 
 def test_the_geotiff_says_what_its_values_mean(
@@ -110,6 +111,8 @@ def test_the_geotiff_says_what_its_values_mean(
         assert tiff.overviews(1) == [2]
         assert tiff.colormap(1)[3][:3] == tuple(label_set.colours[3])
         assert tiff.tags(1)["class_3"] == "building"
+        assert tiff.colormap(1)[5][:3] == OTHER_COLOUR
+        assert tiff.tags(1)["class_5"] == "other"
         assert tiff.res == pytest.approx((0.2, 0.2))
 
 

@@ -167,6 +167,28 @@ def test_the_date_is_that_of_the_first_scan_where_stamps_are_dates(
     assert (date or "not georeferenced") in text
 
 
+def test_coverage_against_expected_accuracy_has_a_line_of_all_and_one_of_what_is_inferred(
+    street: SemanticMap, tmp_path: Path
+) -> None:
+    stands = street.states != State.REMOVED
+    for name, shown, lines in (
+        ("with", street, ["all", "not seen by a camera"]),
+        ("without", street[~street.inferred], ["all"]),
+        ("unlabelled", street[street.labels < 0], []),
+    ):
+        folder = tmp_path / name
+        tiles.write(shown, folder / "refined", None)
+        (folder / "perspective.png").write_bytes(PNG)
+        page = report(folder, {}, {})
+        text = (folder / "report.html").read_text("utf-8")
+        assert re.findall(r'<polyline class="[ab]" points="[\d., ]+"><title>(.*?)</title>', text) == lines
+        assert ("Lighter: no camera saw it" in text) == (name == "with")
+        assert ">other</span>" in text
+        if name == "with":
+            share = f"{100 * street.inferred.sum() / stands.sum():.1f} %"
+            assert ["voxels inferred", share] in page.rows
+
+
 def test_a_map_without_labels_has_no_rate_of_wrong_ones(tmp_path: Path) -> None:
     about_map = RUN["map"] | {"labelled": {"raw": {"road": 0}, "refined": {"road": 0}}}
     page = report(tmp_path, RUN | {"map": about_map}, {})

@@ -11,7 +11,7 @@ import pytest
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.export.exported import Exported
+from gnss_sem_map.export.exported import Exported, sure_part
 from gnss_sem_map.export.formats import FORMATS
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
@@ -61,8 +61,21 @@ def test_the_extent_is_that_of_the_labelled_voxels_else_of_the_standing_ones_els
     assert extent.count == len(indices)
     np.testing.assert_array_equal([extent.low, extent.high], [indices.min(axis=0), indices.max(axis=0)])
     np.testing.assert_allclose(extent.mean, indices.mean(axis=0))
-    labels = [(whole.labels[drawable] == label).sum() for label in (0, 1, 2, 3, 4, -1)]
+    labels = [(whole.labels[drawable] == label).sum() for label in (0, 1, 2, 3, 4, 5, -1)]
     np.testing.assert_array_equal(extent.labels, labels)
+    assert extent.inferred == whole.inferred.sum()
+
+
+@pytest.mark.parametrize("least", [0.0, 0.7, 1.0])
+def test_a_label_that_is_less_sure_is_none_and_all_else_stays(least: float, street: SemanticMap) -> None:
+    kept = sure_part(tiles.in_memory(street), least).whole()
+    sure = street.confidence >= np.float32(least)
+    np.testing.assert_array_equal(kept.labels, np.where(sure, street.labels, -1))
+    np.testing.assert_array_equal(kept.confidence, np.where(sure, street.confidence, 0))
+    np.testing.assert_array_equal(kept.voxels.hits, street.voxels.hits)
+    differ = kept.states != street.states  # what no camera saw, and is not inferred any more
+    np.testing.assert_array_equal(differ, ~sure & (street.states == State.INFERRED))
+    assert (kept.states[differ] == State.UNOBSERVED).all()
 
 
 PEAK_OF_EACH_FILE = """

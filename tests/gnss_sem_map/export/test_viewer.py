@@ -21,13 +21,14 @@ def test_the_page_holds_every_voxel_with_its_class_confidence_and_state(
     meta, indices, about = decoded(written(tmp_path, street, track))
     rows = np.lexsort(indices.T[::-1])
     np.testing.assert_array_equal(indices[rows], street.voxels.indices)
-    labels = np.where(street.labels < 0, 5, street.labels)
+    labels = np.where(street.labels < 0, 6, street.labels)
     np.testing.assert_array_equal(about[rows, 0], labels)
     np.testing.assert_allclose(about[rows, 1] / 255, street.confidence, atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(about[rows, 2], street.states)
     assert [c["count"] for c in meta["classes"]] == [
-        int((street.labels[street.shown] == i).sum()) for i in range(5)
+        int((street.labels[street.shown] == i).sum()) for i in range(6)
     ]
+    assert meta["inferred"] == street.inferred.sum()
     assert meta["removed"] == (street.states == State.REMOVED).sum()
     (line,) = meta["tracks"]
     path = (np.array(line) + meta["origin"]) * meta["voxel_m"]
@@ -46,7 +47,7 @@ def test_names_cannot_leave_their_place(street: SemanticMap, track: Trajectory, 
     page = written(tmp_path, hostile(street), track, title="</title><script>alert(1)</script>")
     assert len(re.findall("<script", page)) == len(re.findall("</script", page)) == 3
     meta, _, _ = decoded(page)
-    assert tuple(c["name"] for c in meta["classes"]) == hostile(street).voxels.label_set.names
+    assert tuple(c["name"] for c in meta["classes"]) == (*hostile(street).voxels.label_set.names, "other")
 
 
 def test_tiles_without_voxels_are_passed_over(street: SemanticMap, tmp_path: Path) -> None:

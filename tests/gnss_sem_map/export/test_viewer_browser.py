@@ -12,8 +12,10 @@ from viewer_pages import hostile, look_at, written
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.export.exported import sure_part
 from gnss_sem_map.export.georeference import Georeference
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
+from gnss_sem_map.voxels.tiles import in_memory
 
 
 def count(image: np.ndarray, colour: np.ndarray) -> int:
@@ -28,21 +30,22 @@ def test_the_browser_shows_every_class_and_hides_what_is_switched_off(
 ) -> None:
     written(tmp_path, street, track)
     assert browser.open((tmp_path / "viewer.html").as_uri()) == f"ready: {len(street)} voxels"
-    colours = street.voxels.label_set.colours.astype(float)
+    colours = street.voxels.label_set.legend.colours.astype(float)
+    colours[4:] += 0.35 * (255 - colours[4:])  # vegetation and `other` are inferred, so lighter
     before = browser.screenshot()
     assert all(count(before, colour) > 30 for colour in colours)
     boxes = "document.querySelectorAll('#layers input')"
     names = browser.run(
         "return [...document.querySelectorAll('#layers label')].map(l => l.childNodes[2].textContent)"
     )
-    assert names == [*street.voxels.label_set.names, "unlabelled", "track", "removed"]
+    assert names == [*street.voxels.label_set.legend.names, "unlabelled", "track", "removed"]
     browser.run(f"{boxes}[3].click()")
     without = browser.screenshot()
     assert count(without, colours[3]) == 0
     assert count(without, colours[0]) > 0.9 * count(before, colours[0])
     browser.run(f"{boxes}[3].click()")
     np.testing.assert_array_equal(browser.screenshot(), before)
-    browser.run(f"{boxes}[7].click()")
+    browser.run(f"{boxes}[8].click()")
     assert (browser.screenshot() != before).any()
 
 
@@ -204,7 +207,7 @@ def test_the_distance_of_clicks_is_that_of_their_places(
     browser: Browser, street: SemanticMap, tmp_path: Path
 ) -> None:
     written(tmp_path, street, None)
-    browser.open((tmp_path / "viewer.html").as_uri())
+    browser.open((tmp_path / "viewer.html").as_uri() + "#hide=unlabelled,other")  # nothing grey but the line
     browser.run("camera.elevation = 1.5; document.getElementById('measure').click()")
     before = count(browser.screenshot(), np.ones(3))
     places = [(30, 1, 0), (20, 1, 0), (20, -3, 0)]
@@ -224,6 +227,40 @@ def test_the_distance_of_clicks_is_that_of_their_places(
     assert not said_at_the_middle(browser).startswith("distance")
 
 
+def test_labels_below_the_least_confidence_are_shown_as_a_map_without_them_is(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    pictures = []
+    for shown, view in ((street, "&least=0.7"), (sure_part(in_memory(street), 0.7).whole(), "")):
+        written(tmp_path, shown, None)
+        browser.open(f"{(tmp_path / 'viewer.html').as_uri()}#at=30,0,0,60,10,40&hide={view}")
+        pictures.append(browser.screenshot())
+    np.testing.assert_array_equal(*pictures)
+    written(tmp_path, street, None)
+    browser.open((tmp_path / "viewer.html").as_uri() + "#at=30,0,0,60,10,40&hide=")
+    assert (browser.screenshot() != pictures[0]).any(axis=2).mean() > 0.02
+    browser.run(
+        "const slider = document.getElementById('least'); slider.value = 0.7;"
+        "slider.dispatchEvent(new Event('input')); draw();"
+    )
+    np.testing.assert_array_equal(browser.screenshot(), pictures[0])
+    assert browser.run("return link()").endswith("&hide=&least=0.7")
+    for nonsense in ("2", "-1", "x"):
+        browser.run(f"location.hash = '#least={nonsense}'")
+        time.sleep(0.2)
+        assert browser.run("return leastConfidence") == (1 if nonsense == "2" else 0)
+
+
+def test_the_page_says_what_lighter_means_where_something_is(
+    browser: Browser, street: SemanticMap, tmp_path: Path
+) -> None:
+    for shown, is_said in ((street, True), (street[~street.inferred], False)):
+        written(tmp_path, shown, None)
+        browser.open((tmp_path / "viewer.html").as_uri())
+        said = "colourBy('%s'); return !document.getElementById('lighter').hidden"
+        assert [browser.run(said % mode) for mode in ("class", "height")] == [is_said, False]
+
+
 def test_the_address_of_a_view_shows_the_same_picture(
     browser: Browser, street: SemanticMap, track: Trajectory, tmp_path: Path
 ) -> None:
@@ -234,7 +271,7 @@ def test_the_address_of_a_view_shows_the_same_picture(
     browser.run(
         "camera.azimuth = 1; camera.elevation = 0.7; zoom(0.5);"
         "document.querySelectorAll('#layers input')[3].click();"
-        "document.querySelectorAll('#layers input')[7].click();"
+        "document.querySelectorAll('#layers input')[8].click();"
         "document.querySelector('select').value = 'confidence';"
         "document.querySelector('select').dispatchEvent(new Event('change'));"
     )
@@ -246,7 +283,7 @@ def test_the_address_of_a_view_shows_the_same_picture(
     assert (first != seen).any()
     browser.open(link)
     assert browser.run("return [...document.querySelectorAll('#layers input')].map(b => b.checked)") == [
-        True, True, True, False, True, False, True, True,
+        True, True, True, False, True, True, False, True, True,
     ]  # fmt: skip
     assert (browser.screenshot() != seen).any(axis=2).mean() < 0.02
     # pasted into the address of an open page
@@ -274,12 +311,12 @@ def test_every_colour_mode_has_a_legend_of_what_it_shows(
         )
         for mode in ("class", "height", "confidence", "origin")
     }
-    classes, unlabelled, track_and_removed = [True] * 5, [True], [True] * 2
+    classes, unlabelled, track_and_removed = [True] * 6, [True], [True] * 2
     assert shown == {
         "class": [False, False, *classes, *unlabelled, *track_and_removed],
-        "height": [True, False, *[False] * 6, *track_and_removed],
-        "confidence": [True, False, *[False] * 5, *unlabelled, *track_and_removed],
-        "origin": [False, True, *[False] * 6, *track_and_removed],
+        "height": [True, False, *[False] * 7, *track_and_removed],
+        "confidence": [True, False, *[False] * 6, *unlabelled, *track_and_removed],
+        "origin": [False, True, *[False] * 7, *track_and_removed],
     }
     assert browser.run("return document.getElementById('origins').childElementCount") == len(State) - 1
 
@@ -292,7 +329,7 @@ def test_two_fingers_move_the_map_by_as_much_as_they_move(
     look_at(browser, (30, 1, 0), 20)
     browser.run("camera.azimuth = 0; camera.elevation = 1.55; draw()")
     steps = range(0, 61, 10)
-    fingers = [pointer(str(x), "touch", *((x + step, 300) for step in steps)) for x in (250, 550)]
+    fingers = [pointer(str(x), "touch", *((x + step, 300) for step in steps)) for x in (350, 550)]
     browser.ask("/actions", actions=fingers)
     metres = browser.run("return 60 * 20 / (0.9 * innerHeight)")
     east, distance = browser.run(

@@ -45,7 +45,7 @@ def test_a_map_above_the_budget_has_levels_of_which_each_shows_the_most_hit_of_t
     written(tmp_path, town, None, most_voxels=20_000)
     found = levels(tmp_path)
     assert len(found) > 2
-    labels = np.where(town.labels < 0, 5, town.labels).tolist()
+    labels = np.where(town.labels < 0, 6, town.labels).tolist()
     ranks = list(zip(town.shown.tolist(), town.voxels.hits.tolist(), strict=True))
     for level, (indices, about) in found.items():
         best: dict[tuple[int, ...], tuple[tuple[bool, int], set[tuple[int, int]]]] = {}

@@ -12,7 +12,8 @@ from long_street import SIZE_M, keyframes, street
 from gnss_sem_map import refinement
 from gnss_sem_map.refinement.by_block import refine
 from gnss_sem_map.refinement.state import Evidence, MapState
-from gnss_sem_map.refinement.steps import STEPS, RefinementSettings, Step
+from gnss_sem_map.refinement.steps import STEPS, RefinementSettings, Step, do
+from gnss_sem_map.voxels.semantic_map import State
 
 
 def test_a_step_has_one_name_in_file_and_settings() -> None:
@@ -56,6 +57,27 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
             assert (np.asarray(expected) == np.asarray(found)).mean() > 0.999
         else:
             np.testing.assert_array_equal(expected, found)
+
+
+def test_other_in_a_decided_map_stays_other_and_is_told_apart_from_what_is_removed() -> None:
+    voxels, other = street(), len(street().label_set.names)
+    decided = refine(voxels, RefinementSettings.model_validate(OFF))[0]
+    chosen = np.arange(len(voxels)) % 3 == 0
+    labels = np.where(chosen, np.int8(other), decided.labels)
+    states = np.where(chosen, np.uint8(State.INFERRED), decided.states)
+    evidence = Evidence(moved=voxels[:0], keyframes=keyframes())
+    state = replace(MapState.of(voxels, evidence), decided=replace(decided, labels=labels, states=states))
+    gone = {}
+    for step in STEPS[[each.name for each in STEPS].index("decision") + 1 :]:
+        state, report = do(step, state, RefinementSettings())
+        gone[step.name] = report.changes.get(("other", "removed"), 0)
+        assert not {name for pair in report.changes if "other" in pair for name in pair} - {
+            "other",
+            "removed",
+        }
+    assert state.decided is not None
+    np.testing.assert_array_equal(state.labels[chosen], other)
+    assert sum(gone.values()) == np.count_nonzero(state.is_removed & chosen) > 0
 
 
 OFF = {step.name: {"enabled": False} for step in STEPS if step.name not in ("decision", "discount")}

@@ -18,7 +18,6 @@ from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.archives import Archive, open_archive
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.geometric_classifier import features
-from gnss_sem_map.geometric_classifier.road_sidewalk import RoadSidewalkModel
 from gnss_sem_map.geometric_classifier.trees import BoostedTrees
 from gnss_sem_map.labels.label_set import LabelSet
 from gnss_sem_map.voxels.kernels import AXIS_BITS, AXIS_MASK
@@ -58,12 +57,10 @@ class Classifier:
         rows: NDArray[np.float32],
         keys: NDArray[np.int64],
         observed: NDArray[np.bool_],
-        kerbs: RoadSidewalkModel | None,
     ) -> NDArray[np.float32]:
         """ln P(class | shape, intensity) (v, c + 1) of voxels with these features (v, f).
 
-        `observed` (v,): what images show, which the model of the other colour judges. With `kerbs`, the odds of road
-        against sidewalk are multiplied by those of that model.
+        `observed` (v,): what images show, which the model of the other colour judges.
         """
         answers, folds = len(self.names) + 1, folds_of(keys, self.voxel_size_m)
         temperature = np.float32(self.temperature)
@@ -71,7 +68,7 @@ class Classifier:
         cross = np.where((folds == 1)[:, None], *of_folds)
         mean = (of_folds[0] + of_folds[1]) / np.float32(2)
         logs = np.log(np.maximum(np.where(observed[:, None], cross, mean), np.float32(np.exp(LEAST_LOG))))
-        return logs if kerbs is None else kerbs.applied(logs, rows, self.names)
+        return np.asarray(logs, np.float32)
 
     def to_bytes(self, **beside: NDArray[Any]) -> bytes:
         """The file that `read` reads back."""

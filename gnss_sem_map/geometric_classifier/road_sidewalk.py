@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.geometric_classifier import features
 from gnss_sem_map.geometric_classifier.trees import BoostedTrees
+from gnss_sem_map.labels.label_set import LabelSet
+from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
 
 FILE = Path(str(resources.files("gnss_sem_map") / "geometric_classifier" / "road_sidewalk.npz"))
-ROAD, SIDEWALK = "road", "sidewalk"
 COLUMNS = np.array([i for i, name in enumerate(features.NAMES) if name not in features.OF_INTENSITY])
 """Simulated intensities are not those of real streets."""
-MOST_NAT = 3.0
+LIMITS_NAT = np.float32(-3), np.float32(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,19 +35,14 @@ class RoadSidewalkModel:
     weight: float
 
     def applied(
-        self, logs: NDArray[np.float32], rows: NDArray[np.float32], names: tuple[str, ...]
+        self, logs: NDArray[np.float32], rows: NDArray[np.float32], label_set: LabelSet
     ) -> NDArray[np.float32]:
         """Log probabilities (v, k) with other odds of road against sidewalk; `rows` (v, f) are the features."""
-        if ROAD not in names or SIDEWALK not in names or self.weight == 0:
+        classes = road_and_sidewalk(label_set)
+        if classes is None or self.weight == 0:
             return logs
-        road, sidewalk = names.index(ROAD), names.index(SIDEWALK)
         said = self.trees.scores(np.ascontiguousarray(rows[:, COLUMNS]))[:, 0]
-        odds = logs[:, sidewalk] - logs[:, road]
-        odds = odds + np.float32(self.weight) * np.clip(said, np.float32(-MOST_NAT), np.float32(MOST_NAT))
-        both, logs = np.logaddexp(logs[:, road], logs[:, sidewalk]), logs.copy()
-        logs[:, sidewalk] = both - np.logaddexp(0, -odds)
-        logs[:, road] = both - np.logaddexp(0, odds)
-        return logs
+        return with_odds(logs, classes, np.float32(self.weight) * np.clip(said, *LIMITS_NAT))
 
 
 @cache

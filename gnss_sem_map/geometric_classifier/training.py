@@ -117,7 +117,7 @@ def rows_of(
     sure = softmax(state.scores[places]).max(axis=1, initial=0)
     voxels = np.concatenate([places[observed], places[other > 0]])
     classes = np.concatenate([labels[observed], np.full(np.count_nonzero(other > 0), count, np.int8)])
-    weights = np.concatenate([sure[observed], other[other > 0]]).astype(np.float32)
+    weights = np.concatenate([(sure * (1 - other))[observed], other[other > 0]]).astype(np.float32)
     keep = weights >= LEAST_WEIGHT
     voxels, classes, weights = voxels[keep], classes[keep], weights[keep]
     keys = around.keys[voxels]

@@ -151,10 +151,10 @@ class DriveClassifier:
         around = self._raw.around(block, margin_m + features.reach_m(self._raw.fused.voxel_size_m))
         places = places_around(around, block, margin_m)
         rows = features_of(around, self._intensity_of(around.keys), places)
-        weight = self.settings.geometric_classifier.kerb_weight
-        kerbs = RoadSidewalkModel(road_sidewalk.shipped(), weight) if weight else None
         keys = around.keys[places]
-        logs = model.log_probabilities(rows, keys, around.observed[places], kerbs)
+        logs = model.log_probabilities(rows, keys, around.observed[places])
+        weight = self.settings.geometric_classifier.kerb_weight
+        logs = RoadSidewalkModel(road_sidewalk.shipped(), weight).applied(logs, rows, self._label_set)
         return GeometricEvidence(
             keys, np.rint(logs * np.float32(UNITS_PER_NAT)).astype(np.int32), np.ones(len(keys), np.int32)
         )

@@ -35,6 +35,21 @@ def road_and_sidewalk(label_set: LabelSet) -> tuple[int, int] | None:
     return (names.index("road"), names.index("sidewalk")) if "road" in names and "sidewalk" in names else None
 
 
+def with_odds(
+    logs: NDArray[np.float32], classes: tuple[int, int], more: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Log scores (v, k) in which the log odds of sidewalk against road have `more` (v,); their sum stays, and all else.
+
+    `classes` are road and sidewalk.
+    """
+    road, sidewalk = classes
+    both, odds = np.logaddexp(logs[:, road], logs[:, sidewalk]), logs[:, sidewalk] - logs[:, road] + more
+    logs = logs.copy()
+    logs[:, sidewalk] = both - np.logaddexp(0, -odds)
+    logs[:, road] = both - np.logaddexp(0, odds)
+    return logs
+
+
 def is_road_or_sidewalk(semantic_map: SemanticMap) -> NDArray[np.bool_]:
     """Which voxels (v,) are shown as road or sidewalk; none where either is missing: there is nothing to split."""
     classes = road_and_sidewalk(semantic_map.voxels.label_set)

@@ -28,7 +28,7 @@ class GeometricLabelSettings(StepSettings):
     """How much the geometric classifier has to say."""
 
     weight: float = Field(
-        default=0.5,
+        default=0.3,
         ge=0,
         le=10,
         description="Its log probabilities are multiplied by this where images show a voxel as well.",

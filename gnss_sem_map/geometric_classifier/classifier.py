@@ -63,12 +63,13 @@ class Classifier:
         `observed` (v,): what images show, which the model of the other colour judges.
         """
         answers, folds = len(self.names) + 1, folds_of(keys, self.voxel_size_m)
-        temperature = np.float32(self.temperature)
-        of_folds = [softmax(log_scores_of(trees, rows, answers) / temperature) for trees in self.folds]
-        cross = np.where((folds == 1)[:, None], *of_folds)
-        mean = (of_folds[0] + of_folds[1]) / np.float32(2)
-        logs = np.log(np.maximum(np.where(observed[:, None], cross, mean), np.float32(np.exp(LEAST_LOG))))
-        return np.asarray(logs, np.float32)
+        total, judges = np.zeros((len(keys), answers), np.float32), np.where(observed, 1, FOLDS)
+        for fold, trees in enumerate(self.folds):
+            judged = np.flatnonzero(~observed | (folds != fold))
+            scores = log_scores_of(trees, rows[judged], answers)
+            total[judged] += softmax(scores / np.float32(self.temperature))
+        mean = total / judges[:, None].astype(np.float32)
+        return np.asarray(np.log(np.maximum(mean, np.float32(np.exp(LEAST_LOG)))), np.float32)
 
     def to_bytes(self, **beside: NDArray[Any]) -> bytes:
         """The file that `read` reads back."""

@@ -39,7 +39,7 @@ from gnss_sem_map.refinement import geometric_prior, height_above_ground, potts_
 from gnss_sem_map.refinement.state import Evidence, GeometricEvidence
 from gnss_sem_map.voxels.attributes import NOTHING, Attributes, open_attributes
 from gnss_sem_map.voxels.blocks import Block, blocks_of
-from gnss_sem_map.voxels.map_json import files_of
+from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest
 from gnss_sem_map.voxels.tiles import Recent, indices_by_tile, places_around
 
@@ -47,6 +47,8 @@ FILE = "classifier.npz"
 MOST_BLOCKS = 64
 """Of a long drive so many blocks, evenly spread, teach its classifier."""
 OFF = "only what images show has a class"
+VOXELS_AT_ONCE = 1 << 18
+"""Their features take 66 MB."""
 UNITS_PER_NAT = 1024
 """Log probabilities of drives are added as whole numbers, which are the same in any order."""
 
@@ -129,7 +131,8 @@ class DriveClassifier:
         )
         margin = max(features.reach_m(size), height_above_ground.REACH_M + by_steps)
         model = sensor_model.opened(settings.calibration, self._label_set)
-        blocks = blocks_of(dict.fromkeys(self._raw.fused.tiles, 0))
+        files = files_of(self.folder / MAP)
+        blocks = blocks_of({tile_of(name): about["voxels"] for name, about in files.items()})
         step = -(-len(blocks) // MOST_BLOCKS)
         found: Rows | None = None
         for block in blocks[::step]:
@@ -150,13 +153,16 @@ class DriveClassifier:
             return None
         around = self._raw.around(block, margin_m + features.reach_m(self._raw.fused.voxel_size_m))
         places = places_around(around, block, margin_m)
-        rows = features_of(around, self._intensity_of(around.keys), places)
-        keys = around.keys[places]
-        logs = model.log_probabilities(rows, keys, around.observed[places])
-        weight = self.settings.geometric_classifier.kerb_weight
-        logs = RoadSidewalkModel(road_sidewalk.shipped(), weight).applied(logs, rows, self._label_set)
+        intensity, keys, logs = self._intensity_of(around.keys), around.keys[places], []
+        kerbs = RoadSidewalkModel(road_sidewalk.shipped(), self.settings.geometric_classifier.kerb_weight)
+        for part in np.split(places, range(VOXELS_AT_ONCE, len(places), VOXELS_AT_ONCE)):
+            rows = features_of(around, intensity, part)
+            of_part = model.log_probabilities(rows, around.keys[part], around.observed[part])
+            logs.append(kerbs.applied(of_part, rows, self._label_set))
         return GeometricEvidence(
-            keys, np.rint(logs * np.float32(UNITS_PER_NAT)).astype(np.int32), np.ones(len(keys), np.int32)
+            keys,
+            np.rint(np.concatenate(logs) * np.float32(UNITS_PER_NAT)).astype(np.int32),
+            np.ones(len(keys), np.int32),
         )
 
     @cached_property

@@ -137,9 +137,9 @@ def _of(archive: Archive) -> Classifier:
     if (
         numbers.shape != (3,)
         or numbers.dtype.kind != "f"
-        or not (np.isfinite(numbers).all() and numbers[1] > 0)
+        or not (np.isfinite(numbers).all() and 1 <= 100 * numbers[1] <= 10_000)
     ):
-        raise DataError("its voxel size or temperature is no positive number")
+        raise DataError("its voxel size is no number, or its temperature is not within 0.01 and 100")
     folds = tuple(
         BoostedTrees(*(archive.array(f"{field.name}_{k}").read() for field in fields(BoostedTrees)))
         for k in range(FOLDS)

@@ -32,7 +32,7 @@ def scene(rng: np.random.Generator, side: int = 26) -> tuple[VoxelMap, NDArray[n
     """Ground, a wall, a bush and voxels anywhere, around the origin of the axes; and intensities."""
     ground = [(x, y, x // 9) for x in range(-side, side) for y in range(-side, side)]
     wall = [(x, 5, z) for x in range(-side, side, 2) for z in range(1, 14)]
-    bush = rng.integers(-6, 6, (300, 3)) + (-14, -12, 5)
+    bush = rng.integers((-20, -18, -1), (-8, -6, 11), (300, 3))
     anywhere = rng.integers((-side, -side, -3), (side, side, 25), (300, 3))
     indices = np.unique(np.concatenate([ground, wall, bush, anywhere]), axis=0)
     indices = indices[rng.random(len(indices)) < 0.8]

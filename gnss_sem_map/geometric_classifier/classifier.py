@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, fields
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
@@ -109,8 +110,8 @@ def read(path: Path, label_set: LabelSet, voxel_size_m: float) -> Classifier:
         ) from None
     if found.names != label_set.names:
         raise DataError(
-            f"{shown(path)}: is of the classes {list(found.names)[:9]}, the map's are {list(label_set.names)[:9]};"
-            " fit a classifier on runs with the same class set"
+            f"{shown(path)}: is of the classes {brief(list(found.names))}, the map's are"
+            f" {brief(list(label_set.names))}; fit a classifier on runs with the same class set"
         )
     if found.voxel_size_m != voxel_size_m:
         raise DataError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, fields
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
@@ -110,8 +111,8 @@ def read(path: Path, label_set: LabelSet, voxel_size_m: float) -> Classifier:
         ) from None
     if found.names != label_set.names:
         raise DataError(
-            f"{shown(path)}: is of the classes {list(found.names)[:9]}, the map's are {list(label_set.names)[:9]};"
-            " fit a classifier on runs with the same class set"
+            f"{shown(path)}: is of the classes {brief(list(found.names))}, the map's are"
+            f" {brief(list(label_set.names))}; fit a classifier on runs with the same class set"
         )
     if found.voxel_size_m != voxel_size_m:
         raise DataError(
@@ -138,9 +139,9 @@ def _of(archive: Archive) -> Classifier:
     if (
         numbers.shape != (3,)
         or numbers.dtype.kind != "f"
-        or not (np.isfinite(numbers).all() and numbers[1] > 0)
+        or not (np.isfinite(numbers).all() and 1 <= 100 * numbers[1] <= 10_000)
     ):
-        raise DataError("its voxel size or temperature is no positive number")
+        raise DataError("its voxel size is no number, or its temperature is not within 0.01 and 100")
     folds = tuple(
         BoostedTrees(*(archive.array(f"{field.name}_{k}").read() for field in fields(BoostedTrees)))
         for k in range(FOLDS)

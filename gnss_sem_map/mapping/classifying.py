@@ -39,6 +39,7 @@ from gnss_sem_map.refinement import geometric_prior, height_above_ground, potts_
 from gnss_sem_map.refinement.state import Evidence, GeometricEvidence
 from gnss_sem_map.voxels.attributes import NOTHING, Attributes, open_attributes
 from gnss_sem_map.voxels.blocks import Block, blocks_of
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
 from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest
 from gnss_sem_map.voxels.tiles import Recent, indices_by_tile, places_around
@@ -49,8 +50,6 @@ MOST_BLOCKS = 64
 OFF = "only what images show has a class"
 VOXELS_AT_ONCE = 1 << 18
 """Their features take 66 MB."""
-UNITS_PER_NAT = 1024
-"""Log probabilities of drives are added as whole numbers, which are the same in any order."""
 
 
 def drive_folders(run: Path) -> list[Path]:
@@ -100,7 +99,7 @@ class DriveClassifier:
     def fit(self) -> str:
         """Write the classifier, unless one made from the same is there; returns why there is none, or nothing."""
         if (there := self._written) is not None:
-            return there[1]
+            return there if isinstance(there, str) else ""
         named = self.settings.geometric_classifier.model
         found: Classifier | str
         if named is not None:
@@ -159,11 +158,9 @@ class DriveClassifier:
             rows = features_of(around, intensity, part)
             of_part = model.log_probabilities(rows, around.keys[part], around.observed[part])
             logs.append(kerbs.applied(of_part, rows, self._label_set))
-        return GeometricEvidence(
-            keys,
-            np.rint(np.concatenate(logs) * np.float32(UNITS_PER_NAT)).astype(np.int32),
-            np.ones(len(keys), np.int32),
-        )
+        # as whole numbers, whose sums are the same in any order of the drives
+        sums = np.rint(np.concatenate(logs) * np.float32(UNITS_PER_NAT)).astype(np.int32)
+        return GeometricEvidence(keys, sums, np.ones(len(keys), np.int32))
 
     @cached_property
     def digest(self) -> str:
@@ -190,23 +187,23 @@ class DriveClassifier:
         return self.folder / evidence.FOLDER / FILE
 
     @property
-    def _written(self) -> tuple[str, str] | None:
-        """What the written classifier was made from, and why there is none; None for another one, or a damaged one."""
+    def _written(self) -> Classifier | str | None:
+        """The written classifier, or why there is none; None for one made from other things, or a damaged one."""
         if not is_file(self._file):
             return None
         try:
             with open_archive(self._file) as archive:
                 made_from, why = (str(archive.array(name).read()[0]) for name in ("made_from", "why"))
+            if made_from != self.digest:
+                return None
+            return why or classifier.read(self._file, self._label_set, self._raw.fused.voxel_size_m)
         except (DataError, IndexError):
             return None
-        return (made_from, why) if made_from == self.digest else None
 
     @cached_property
     def _model(self) -> Classifier | None:
         written = self._written
-        if written is None or written[1]:
-            return None
-        return classifier.read(self._file, self._label_set, self._raw.fused.voxel_size_m)
+        return written if isinstance(written, Classifier) else None
 
     @cached_property
     def _label_set(self) -> LabelSet:

@@ -40,7 +40,8 @@ from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.fusion import GEOMETRY_ONLY
+from gnss_sem_map.mapping.classifying import OFF
+from gnss_sem_map.mapping.fusion import without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -193,6 +194,7 @@ class Run:
         reads = [inputs_of(self.folder).get("drive")] if self._has_labels else []
         with self._rewritten(out, reads) as (folder, run):
             _check_same_map(run.settings, settings)
+            warnings = _still_true(run, settings)
             georeference = run_folder.georeference_of(settings, run.frame)
             log = run.drive() if run._has_labels else None
             old_labels = shutil.ignore_patterns(*LABELS)
@@ -216,12 +218,14 @@ class Run:
                     drives = (_labelled(known, folder) for known in labelled)
                     write_point_labels(folder, drives, refined.kerbs, settings, progress)
                 about = run.about | {"map": about_map(folder, refined.report)}
+                about |= {"warnings": list(dict.fromkeys([*warnings, *stats.warnings]))}
                 write_merged(folder, settings, about, progress)
             else:
                 known = run.folder / RAW_LABELS
                 run_folder.write_again(
-                    folder, run.folder, run.trajectory, refined, stats, settings, log, {}, known, progress
-                )
+                    folder, run.folder, run.trajectory, refined, stats, settings, log, {"warnings": warnings},
+                    known, progress,
+                )  # fmt: skip
         return Run(self.folder if out is None else Path(out))
 
     def relabel(
@@ -257,7 +261,7 @@ class Run:
             changed = {
                 "inputs": before["inputs"] | {"segmenter": spec},
                 "skips": about_skips([*skips, *stats.skips]),
-                "warnings": [said for said in before["warnings"] if GEOMETRY_ONLY not in said],
+                "warnings": [w for w in _still_true(run, settings) if without_images(settings) not in w],
             }
             with_labels = log if is_folder(run.folder / "labels") else None
             run_folder.write_again(
@@ -362,6 +366,12 @@ def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:
     """A drive of a map of several that is made again in `folder`, whose labels before refinement are known."""
     drive = Run(known_raw.parent)
     return LabelledDrive(folder / DRIVES / known_raw.parent.name, drive.drive(), drive.trajectory, known_raw)
+
+
+def _still_true(run: Run, settings: Settings) -> list[str]:
+    """Warnings of a run that is refined with other settings; what there is to say of its classifier is said anew."""
+    of_images = without_images(run.settings), without_images(settings)
+    return [said.replace(*of_images) for said in run.about.get("warnings", ()) if OFF not in said]
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:

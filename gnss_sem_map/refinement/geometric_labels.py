@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from pydantic import Field
 
-from gnss_sem_map.refinement.potts_mrf import ITERATIONS, mean_field
+from gnss_sem_map.refinement.potts_mrf import ITERATIONS, LEAST_PROBABILITY, mean_field
 from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
@@ -56,7 +56,8 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
     logs = geometry.of(voxels.keys)
     known, seen = np.isfinite(logs[:, 0]), voxels.observed
     temperature = np.float32(1.0 if model is None else model.temperature)
-    images = np.log(doubted(softmax(state.scores / temperature), state.systematic_error))
+    probabilities = doubted(softmax(state.scores / temperature), state.systematic_error)
+    images = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
     logs = np.where(known[:, None], logs, np.float32(0))
     scores = np.where(seen[:, None], np.float32(settings.weight) * logs, logs)
     scores[seen, :-1] += images[seen]

@@ -21,7 +21,7 @@ from gnss_sem_map.voxels.blocks import Block, blocks_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
 VOXELS = street()
-ALL = RefinementSettings.model_validate({"unobserved": {"enabled": True}})
+ALL = RefinementSettings()
 PAPER = RefinementSettings.model_validate(
     {"count_grid": {"method": "paper"}, "vehicles": {"method": "paper"}}
 )

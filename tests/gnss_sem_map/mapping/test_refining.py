@@ -281,7 +281,7 @@ def test_a_drive_that_comes_or_goes_changes_the_sum_in_its_tiles_only(tmp_path: 
         assert linked(tmp_path / later, tmp_path / earlier, "map") == [t for t in EVERY if t not in of_other]
     voxels = tiles.read(tmp_path / "three/map").voxels
     expected = VOXELS + VOXELS[np.arange(9000)] + VOXELS[-9000:]
-    for name in ("keys", "evidence", "hits", "heights"):
+    for name in ("keys", "evidence", "hits", "heights", "of_images"):
         np.testing.assert_array_equal(getattr(voxels, name), getattr(expected, name))
 
 

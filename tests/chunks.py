@@ -23,7 +23,7 @@ def by_chunks(drive: Drive, window_scans: int) -> Drive:
 
 def assert_same(a: VoxelMap, b: VoxelMap) -> None:
     """Fail where two maps differ."""
-    for name in ("keys", "evidence", "hits", "heights"):
+    for name in ("keys", "evidence", "hits", "heights", "of_images"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 

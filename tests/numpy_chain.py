@@ -127,7 +127,7 @@ class NumpyMap:
     keys: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
-        self.sums = np.empty((0, len(self.label_set.names) + 2), np.int64)
+        self.sums = np.empty((0, len(self.label_set.names) + 4), np.int64)
         share = 1.0 if self.answers is None else 0.5
         self._logs = log_table(len(self.label_set.names), self.floor_percent, share)
 
@@ -142,7 +142,9 @@ class NumpyMap:
         seen = pixels >= 0
         looks = np.zeros((len(keys), self.sums.shape[1]), np.int64)
         looks[:, -2], looks[:, -1] = 1, heights
-        looks[seen, :-2] = self._looks(classes[pixels[seen]])
+        looks[seen, :-4] = self._looks(classes[pixels[seen]])
+        looks[seen, -4] = classes[pixels[seen]].any(axis=1)
+        looks[seen, -3] = classes[pixels[seen], -1]
         order = np.argsort(keys)
         starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
         new_keys, sums = keys[order][starts], np.add.reduceat(looks[order], starts)
@@ -167,6 +169,6 @@ class NumpyMap:
         """The same value as `VoxelTable.to_map`."""
         return VoxelMap(
             self.voxel_size_m, self.label_set, self.keys,
-            np.ascontiguousarray(self.sums[:, :-2], np.int32), self.sums[:, -2].astype(np.uint32),
-            self.sums[:, -1].copy(),
+            np.ascontiguousarray(self.sums[:, :-4], np.int32), self.sums[:, -2].astype(np.uint32),
+            self.sums[:, -1].copy(), np.ascontiguousarray(self.sums[:, -4:-2], np.int32),
         )  # fmt: skip

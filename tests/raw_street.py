@@ -23,7 +23,8 @@ MOVED = VOXELS[np.flatnonzero(VOXELS.centres[:, 0] > 350.0)[::9]]
 EVERY = [(x, 0) for x in range(7)]
 BLOCKS: list[Block] = [((0, 0),), ((1, 0), (2, 0)), ((3, 0), (4, 0)), ((5, 0), (6, 0))]
 """The tiles that are refined together."""
-SETTINGS = Settings()
+SETTINGS = Settings().changed("geometric_classifier.enabled=false")
+"""Without a classifier, which is of a whole drive: what changes anywhere in the drive would change every block."""
 
 
 def write_raw(

@@ -68,9 +68,8 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
         scores = with_odds(scores, classes, np.where(seen, more, np.float32(0)))
     share = np.clip(voxels.other_share, *OTHER_LIMITS)
     of_other = np.log(share) - np.log1p(-share)
-    only_other = (
-        voxels.other_share > 0
-    ) & ~seen  # where images show nothing but `other`, no class has evidence
+    # where images show nothing but `other`, no class has evidence
+    only_other = (voxels.other_share > 0) & ~seen
     scores[only_other, -1] += of_other[only_other]
     scores[seen, -1] = scores[seen, -1] + of_other[seen] if settings.other_where_seen else np.float32(NEVER)
     if settings.coupling_nat:

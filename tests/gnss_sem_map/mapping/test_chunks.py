@@ -67,7 +67,7 @@ def together(moving: Drive, tmp_path_factory: pytest.TempPathFactory) -> list[Ma
 def told(chunk: MappedChunk) -> Iterator[tuple[str, object]]:
     """What must not differ: arrays, and plain values."""
     for layer in ("static", "removed"):
-        for name in ("keys", "evidence", "hits", "heights"):
+        for name in ("keys", "evidence", "hits", "heights", "of_images"):
             yield f"{layer}.{name}", getattr(getattr(chunk, layer), name)
     for number, indices in chunk.moving.items():
         yield f"moving {number}", indices

@@ -120,7 +120,8 @@ def test_a_network_that_can_do_nothing_is_named_and_the_map_is_made(drive: Drive
     assert stats.counts["points labelled"] == 0
     first = drive.log.scans[0].number
     assert stats.warnings == [
-        "no point got a label, and the map shows geometry only; first reason:"
+        "no point got a label, and the map shows geometry only; a classifier of drives with labels would name it"
+        " (--set geometric_classifier.model=FILE of `gnss-sem-map fit-classifier`); first reason:"
         f" frame {first}: this network is broken"
     ]
 

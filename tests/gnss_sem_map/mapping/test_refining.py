@@ -19,15 +19,18 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.mapping import evidence, refining
+from gnss_sem_map.mapping.classifying import fit_classifiers
 from gnss_sem_map.mapping.raw_map import open_raw, write_sum
 from gnss_sem_map.mapping.refining import Refined, refine_map
 from gnss_sem_map.voxels import reuse, tiles
 from gnss_sem_map.voxels.blocks import Block
 from gnss_sem_map.voxels.map_json import name_of
+from gnss_sem_map.voxels.semantic_map import State
 from gnss_sem_map.voxels.tile_files import TILE_BITS, Tile
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
 
-WITHOUT_FREE_SPACE = Settings.model_validate({"refinement": {"free_space": {"enabled": False}}})
+WITHOUT_FREE_SPACE = SETTINGS.changed("refinement.free_space.enabled=false")
+CLASSIFIED = Settings().changed("geometric_classifier.rows_per_fold=1000")
 
 
 def seen_again(voxels: VoxelMap, tile: Tile) -> VoxelMap:
@@ -281,7 +284,7 @@ def test_a_drive_that_comes_or_goes_changes_the_sum_in_its_tiles_only(tmp_path: 
         assert linked(tmp_path / later, tmp_path / earlier, "map") == [t for t in EVERY if t not in of_other]
     voxels = tiles.read(tmp_path / "three/map").voxels
     expected = VOXELS + VOXELS[np.arange(9000)] + VOXELS[-9000:]
-    for name in ("keys", "evidence", "hits", "heights"):
+    for name in ("keys", "evidence", "hits", "heights", "of_images"):
         np.testing.assert_array_equal(getattr(voxels, name), getattr(expected, name))
 
 
@@ -294,3 +297,39 @@ def test_drives_of_another_voxel_size_or_frame_do_not_add_up(tmp_path: Path) -> 
     for other in (coarse, elsewhere):
         with pytest.raises(DataError, match=r"voxels of .* m, or another frame; map them again$"):
             write_sum([fine, other], tmp_path / "out", FRAME)
+
+
+def of_drives(run: Path, drives: dict[str, VoxelMap]) -> Path:
+    """A map of several drives, each with its classifier."""
+    folders = [write_raw(run / "drives" / name, voxels, moved=MOVED[:0]) for name, voxels in drives.items()]
+    write_sum(folders, run, FRAME)
+    assert fit_classifiers(run, CLASSIFIED) == []
+    return run
+
+
+@pytest.mark.integration  # scikit-learn asks the system for its cores
+def test_a_classifier_changes_the_map_where_its_drive_is_and_nowhere_else(
+    tmp_path: Path, refine: Any
+) -> None:
+    """A drive that comes, and then one that is classified otherwise, in two tiles at the end of the street."""
+    long, short = VOXELS, VOXELS[-1200:]
+    one = of_drives(tmp_path / "one", {"long": long})
+    both, again = (of_drives(tmp_path / name, {"long": long, "short": short}) for name in ("both", "again"))
+    assert refine(one, None, CLASSIFIED)[1] == BLOCKS
+    inferred = tiles.read(one / "refined").states == State.INFERRED
+    assert 0.05 * len(long) < np.count_nonzero(inferred) < 0.2 * len(long)
+    found, called = refine(both, one, CLASSIFIED)
+    assert called == BLOCKS[3:]
+    whole, called = refine(again, None, CLASSIFIED)
+    assert called == BLOCKS
+    assert content(both / "refined") == content(again / "refined")
+    assert found.report.to_json() == whole.report.to_json()
+
+
+@pytest.mark.integration
+def test_another_classifier_refines_every_block_of_its_drive_again(tmp_path: Path, refine: Any) -> None:
+    run, again = (of_drives(tmp_path / name, {"short": VOXELS[-9000:]}) for name in ("run", "again"))
+    weaker = CLASSIFIED.changed("geometric_classifier.kerb_weight=0.5")
+    _, called = refine(run, None, CLASSIFIED)
+    fit_classifiers(again, weaker)
+    assert refine(again, run, weaker)[1] == called == BLOCKS[3:]

@@ -13,20 +13,38 @@ from hypothesis import given
 from hypothesis import strategies as st
 from long_street import SIZE_M, URBAN, keyframes, street
 
-from gnss_sem_map.refinement.by_block import halo_m, refine_block, run_steps, sums_of, voxels_by_tile
+from gnss_sem_map.refinement.by_block import (
+    geometry_halo_m,
+    halo_m,
+    refine_block,
+    run_steps,
+    sums_of,
+    voxels_by_tile,
+)
 from gnss_sem_map.refinement.figures import Figures, Sums, figures_of
-from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.state import Evidence, GeometricEvidence, MapState
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.voxels.blocks import Block, blocks_of
-from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
+from gnss_sem_map.voxels.voxel_map import VoxelMap, pack, unpack
 
 VOXELS = street()
-ALL = RefinementSettings.model_validate({"unobserved": {"enabled": True}})
+ALL = RefinementSettings()
 PAPER = RefinementSettings.model_validate(
     {"count_grid": {"method": "paper"}, "vehicles": {"method": "paper"}}
 )
 MOVED = replace(VOXELS, keys=VOXELS.keys + 3)[np.arange(0, len(VOXELS), 7)]
-BESIDE = Evidence(moved=MOVED, keyframes=keyframes())
+
+
+def by_shape() -> GeometricEvidence:
+    """What two drives say of the shape of some voxels."""
+    rng = np.random.default_rng(1)
+    keys = VOXELS.keys[rng.random(len(VOXELS)) < 0.9]
+    sums = -rng.integers(1, 3000, (len(keys), len(URBAN.names) + 1), np.int32)
+    return GeometricEvidence(keys, sums, rng.integers(1, 3, len(keys), np.int32))
+
+
+BY_SHAPE = by_shape()
+BESIDE = Evidence(moved=MOVED, keyframes=keyframes(), geometry=BY_SHAPE)
 PER_VOXEL = ("heights", "scores", "removed", "inferred")
 OF_MAP = ("labels", "confidence", "states", "entropy", "removed_hits")
 
@@ -52,6 +70,12 @@ def near(voxels: VoxelMap, block: Block, margin_m: float) -> VoxelMap:
     return voxels[((xy > low) & (xy < high)).all(axis=1)]
 
 
+def shape_near(block: Block, margin_m: float) -> GeometricEvidence:
+    """What is said of the shape of a block and of a margin."""
+    chosen = np.isin(BY_SHAPE.keys, near(VOXELS, block, margin_m).keys)
+    return GeometricEvidence(BY_SHAPE.keys[chosen], BY_SHAPE.sums[chosen], BY_SHAPE.drives[chosen])
+
+
 @pytest.mark.parametrize("block", [((3, 0),), ((3, 0), (4, 0))], ids=["tile", "block"])
 @pytest.mark.parametrize("settings", [ALL, PAPER], ids=["evidence", "paper"])
 def test_a_block_needs_no_more_of_the_map_than_its_halo(settings: RefinementSettings, block: Block) -> None:
@@ -59,7 +83,9 @@ def test_a_block_needs_no_more_of_the_map_than_its_halo(settings: RefinementSett
     assert margin < 30
     part = near(VOXELS, block, margin)
     assert len(part) < len(VOXELS) * (len(block) + 1) / 6
-    beside = replace(BESIDE, moved=near(MOVED, block, 0))
+    geometry = shape_near(block, geometry_halo_m(settings, SIZE_M))
+    assert len(geometry.keys) < len(part)
+    beside = replace(BESIDE, moved=near(MOVED, block, 0), geometry=geometry)
     sums = sums_of(block, VOXELS, BESIDE, settings)
     assert sums == sums_of(block, part, beside, settings)
     assert sums.roads > 0
@@ -91,6 +117,8 @@ def test_the_map_is_the_sum_of_its_blocks_in_any_order() -> None:
             np.testing.assert_array_equal(getattr(part.decided, name), getattr(state.decided, name)[places])
         assert len(part.decided) == len(near(state.decided.voxels, block, 0))
     changed = {step.name: step.changed for step in report.steps}
+    assert state.inferred.any()
+    assert changed["geometric_labels"] > np.count_nonzero(state.inferred)
     assert changed["removed_layer"] == len(MOVED) - (VOXELS.indices_of(MOVED.keys) >= 0).sum()
 
 
@@ -109,8 +137,9 @@ def test_tiles_are_decided_alike_alone_and_in_a_block() -> None:
 def test_nobody_sees_where_blocks_meet() -> None:
     """The same street half a tile farther on: seams lie elsewhere, and cells of a metre lie the same."""
     moved_on = pack(VOXELS.indices + np.array([250, 0, 0]))
-    here = run_steps(VOXELS, ALL)[0]
-    there = run_steps(replace(VOXELS, keys=moved_on), ALL)[0]
+    moved_shape = replace(BY_SHAPE, keys=pack(unpack(BY_SHAPE.keys) + np.array([250, 0, 0])))
+    here = run_steps(VOXELS, ALL, Evidence(geometry=BY_SHAPE))[0]
+    there = run_steps(replace(VOXELS, keys=moved_on), ALL, Evidence(geometry=moved_shape))[0]
     assert here.decided is not None
     assert there.decided is not None
     assert (here.decided.labels == there.decided.labels).mean() > 0.999

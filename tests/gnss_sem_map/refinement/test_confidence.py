@@ -1,12 +1,12 @@
 """Confidence, entropy, and labels for voxels that no camera saw."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.refinement.by_block import refine
+from gnss_sem_map.refinement.state import Evidence, GeometricEvidence
 from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels.semantic_map import State, entropy_of
 from gnss_sem_map.voxels.voxel_map import VoxelMap, pack
@@ -40,44 +40,54 @@ def test_entropy_is_zero_for_certainty_and_the_logarithm_of_the_class_count_for_
     np.testing.assert_allclose(entropy_of(distributions), [0, np.log(5), np.log(2)], atol=1e-6)
 
 
-def test_unseen_voxels_know_nothing_unless_asked_to_infer():
+def test_unseen_voxels_know_nothing_without_a_geometric_classifier():
     voxels = random_map(3)
     refined, report = refine(voxels)
     unseen = ~voxels.observed
     assert unseen.sum() > 100
     assert (refined.labels[unseen] == -1).all()
     np.testing.assert_allclose(refined.entropy[unseen], np.log(5), rtol=1e-6)
-    assert {step.name: step.skipped for step in report.steps}["unobserved"] == "switched off"
-
-
-def test_inferred_voxels_are_marked_and_leave_observed_ones_as_they_were():
-    voxels = random_map(4)
-    plain, _ = refine(voxels)
-    refined, report = refine(voxels, RefinementSettings(unobserved={"enabled": True}))
-    seen, inferred = voxels.observed, refined.states == State.INFERRED
-    np.testing.assert_array_equal(refined.labels[seen], plain.labels[seen])
-    np.testing.assert_array_equal(refined.confidence[seen], plain.confidence[seen])
-    assert inferred.sum() > 100
-    assert (refined.labels[inferred] >= 0).all()
-    assert not (inferred & seen).any()
-    assert {step.name: step.changed for step in report.steps}["unobserved"] == inferred.sum()
-
-
-@pytest.mark.parametrize("iterations", [1, 3])
-def test_labels_spread_one_voxel_per_pass_and_no_farther(iterations):
-    """A row of twelve voxels of which a camera saw only the first."""
-    keys = pack(np.array([(x, 0, 0) for x in range(12)] + [(40, 0, 0)]))
-    evidence = np.zeros((13, 5), np.int32)
-    evidence[0] = -4096
-    evidence[0, BUILDING] = -1
-    voxels = VoxelMap(0.2, URBAN, keys, evidence, np.ones(13, np.uint32))
-    asked = RefinementSettings(
-        unobserved={"enabled": True, "iterations": iterations},
-        geometric_prior={"enabled": False},
-        vehicles={"enabled": False},
+    assert {step.name: step.skipped for step in report.steps}["geometric_labels"] == (
+        "there is no geometric classifier"
     )
-    refined, _ = refine(voxels, asked)
-    expected = [BUILDING] * (1 + iterations) + [-1] * (12 - iterations)
-    assert refined.labels.tolist() == expected
-    assert (np.diff(refined.confidence[: 1 + iterations]) < 0).all(), "farther is less sure"
-    assert (refined.confidence[1 + iterations :] == 0).all()
+
+
+def test_what_no_camera_saw_is_what_shape_says_and_marked_as_inferred():
+    """Of two voxels in three the classifier knows something; `other` is one of its answers."""
+    voxels, rng = random_map(4, unseen=0.5), np.random.default_rng(4)
+    keys = voxels.keys[rng.random(len(voxels)) < 0.67]
+    said = GeometricEvidence(
+        keys, -rng.integers(1, 9000, (len(keys), 6), np.int32), np.ones(len(keys), np.int32)
+    )
+    alone = RefinementSettings(geometric_labels={"coupling_nat": 0}, systematic_error={"rate": 0})
+    plain, _ = refine(voxels, alone)
+    refined, report = refine(voxels, alone, Evidence(geometry=said))
+    seen, known = voxels.observed, np.isin(voxels.keys, keys)
+    inferred = refined.states == State.INFERRED
+    np.testing.assert_array_equal(inferred, known & ~seen)
+    np.testing.assert_array_equal(
+        refined.labels[inferred], said.of(voxels.keys[inferred]).argmax(axis=1), "by shape alone"
+    )
+    assert set(refined.labels[inferred].tolist()) == set(range(6))
+    assert ((refined.labels[seen] >= 0) & (refined.labels[seen] < 5)).all(), "images show a class"
+    np.testing.assert_array_equal(refined.labels[~seen & ~known], -1)
+    np.testing.assert_array_equal(refined.labels[seen & ~known], plain.labels[seen & ~known])
+    np.testing.assert_allclose(refined.confidence[seen & ~known], plain.confidence[seen & ~known], rtol=1e-4)
+    changed = {step.name: step.changed for step in report.steps}["geometric_labels"]
+    assert changed == np.count_nonzero(refined.labels != plain.labels) > inferred.sum() > 100
+
+
+def test_images_that_leave_a_class_no_probability_at_all_keep_their_label():
+    """Without neighbours and doubt nothing limits their log-likelihoods: road and sidewalk are both impossible."""
+    keys = pack(np.array([(x, 0, 0) for x in range(9)]))
+    evidence = np.full((9, 5), -(2**20), np.int32)
+    evidence[:, BUILDING] = -1
+    voxels = VoxelMap(0.2, URBAN, keys, evidence, np.ones(9, np.uint32))
+    said = GeometricEvidence(keys, np.full((9, 6), -1835, np.int32), np.ones(9, np.int32))
+    off = {"enabled": False}
+    alone = RefinementSettings(
+        discount=off, geometric_prior=off, count_grid=off, potts_mrf=off, systematic_error={"rate": 0}
+    )
+    refined, _ = refine(voxels, alone, Evidence(geometry=said))
+    assert (refined.labels == BUILDING).all()
+    np.testing.assert_allclose(refined.confidence, 1, atol=1e-6)

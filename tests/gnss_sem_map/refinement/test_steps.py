@@ -11,7 +11,7 @@ from long_street import SIZE_M, keyframes, street
 
 from gnss_sem_map import refinement
 from gnss_sem_map.refinement.by_block import refine
-from gnss_sem_map.refinement.state import Evidence, MapState
+from gnss_sem_map.refinement.state import Evidence, GeometricEvidence, MapState
 from gnss_sem_map.refinement.steps import STEPS, RefinementSettings, Step, do
 from gnss_sem_map.voxels.semantic_map import State
 
@@ -38,7 +38,9 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
     """Without all that is farther from a place than the reach, the place is refined to the same."""
     settings = step.settings(RefinementSettings()).model_copy(update={"enabled": True})
     voxels = street()
-    beside = Evidence(moved=voxels[:0], keyframes=keyframes())
+    said = np.random.default_rng(1).integers(-3000, 0, (len(voxels), len(voxels.label_set.names) + 1))
+    geometry = GeometricEvidence(voxels.keys, said.astype(np.int32), np.ones(len(voxels), np.int32))
+    beside = Evidence(moved=voxels[:0], keyframes=keyframes(), geometry=geometry)
     before = MapState.of(voxels, beside)
     if step.name in ("levels", "kerbs", "free_space", "crumbs", "removed_layer"):
         before = replace(before, decided=refine(voxels, RefinementSettings.model_validate(OFF))[0])
@@ -51,6 +53,7 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
     whole, part = step.apply(before, settings), step.apply(before[np.flatnonzero(near)], settings)
     if step.name == "free_space":
         assert 100 < whole.is_removed[place].sum() < 0.5 * place.sum()
+    assert whole.inferred[place].any() == (step.name == "geometric_labels")
     for field in ("scores", "labels", "is_removed", "inferred"):
         expected, found = getattr(whole, field)[place], getattr(part, field)[place[near]]
         if step.name == "levels":  # of what other planes are fitted to beyond the reach, see `by_block`

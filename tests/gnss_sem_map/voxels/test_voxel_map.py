@@ -54,24 +54,27 @@ def by_numpy(parts: list[Batch], floor_percent: int = 5) -> VoxelMap:
     """The oracle: group by voxel, sum the logarithms of floored, renormalised probabilities."""
     logs = log_table(5, floor_percent).astype(np.int64)
     p_map = np.concatenate([p for p, _, _ in parts])
-    evidence = []
+    evidence, of_images = [], []
     for _, pixels, classes in parts:
-        seen = np.where(pixels[:, None] >= 0, classes[pixels], 0)[:, :5].astype(np.int64)
+        seen = np.where(pixels[:, None] >= 0, classes[pixels], 0).astype(np.int64)
+        of_images.append(np.column_stack([seen.any(axis=1), seen[:, 5]]))
+        seen = seen[:, :5]
         total = seen.sum(axis=1, keepdims=True)
         q = np.maximum(100 * seen, floor_percent * total)
         evidence.append(np.where(total > 0, logs[q] - logs[q.sum(axis=1, keepdims=True)], 0))
     indices, where = np.unique(np.floor(p_map / 0.2).astype(np.int64), axis=0, return_inverse=True)
-    sums = np.zeros((len(indices), 5), np.int64)
+    sums, others = np.zeros((len(indices), 5), np.int64), np.zeros((len(indices), 2), np.int32)
     np.add.at(sums, where.ravel(), np.concatenate(evidence))
+    np.add.at(others, where.ravel(), np.concatenate(of_images))
     hits = np.bincount(where.ravel(), minlength=len(indices))
     units = np.floor(256 * np.mod(p_map[:, 2] / 0.2, 1)).astype(np.int64)
     heights = np.zeros(len(indices), np.int64)
     np.add.at(heights, where.ravel(), units)
-    return VoxelMap(0.2, URBAN, pack(indices), sums.astype(np.int32), hits.astype(np.uint32), heights)
+    return VoxelMap(0.2, URBAN, pack(indices), sums.astype(np.int32), hits.astype(np.uint32), heights, others)
 
 
 def assert_same(a: VoxelMap, b: VoxelMap) -> None:
-    for name in ("keys", "evidence", "hits", "heights"):
+    for name in ("keys", "evidence", "hits", "heights", "of_images"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 

@@ -1,4 +1,4 @@
-"""The settings of a run in its folder, with the classes and the calibration that they name: a run can be moved."""
+"""The settings of a run in its folder, with the files that they name beside the geoid: a run can be moved."""
 
 from __future__ import annotations
 
@@ -12,18 +12,31 @@ from gnss_sem_map.files.untrusted import read_bytes
 from gnss_sem_map.labels.label_set import SHIPPED_CLASS_SETS
 
 SETTINGS = "config.yaml"
-COPIES = ("calibration.yaml", "classes.yaml")
+MODEL = "geometric_classifier.npz"
+COPIES = ("calibration.yaml", "classes.yaml", MODEL)
 """Files that settings name, each by the name of its setting."""
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
-    """Write config.yaml, and copies of the class set and the calibration that it names; raises ConfigError, OSError."""
+    """Write config.yaml, and copies of the files that it names, but for the geoid; raises ConfigError, OSError."""
     for setting, file in _named(settings).items():
-        content, name = read_bytes(file, error=ConfigError), f"{setting}.yaml"
-        with replacing(folder / name) as copy:  # it may be a second name of the file that was read
-            copy.write(content)
-        settings = settings.model_copy(update={setting: type(getattr(settings, setting))(name)})
+        _copy(file, folder / f"{setting}.yaml")
+        settings = settings.model_copy(update={setting: type(getattr(settings, setting))(f"{setting}.yaml")})
+    if (model := settings.geometric_classifier.model) is not None:
+        _copy(model, folder / MODEL)
+        settings = _with_model(settings, Path(MODEL))
     (folder / SETTINGS).write_text(settings.to_yaml(), "utf-8")
+
+
+def _copy(file: Path, to: Path) -> None:
+    content = read_bytes(file, error=ConfigError)
+    with replacing(to) as copy:  # it may be a second name of the file that was read
+        copy.write(content)
+
+
+def _with_model(settings: Settings, model: Path | bytes) -> Settings:
+    chosen = settings.geometric_classifier.model_copy(update={"model": model})
+    return settings.model_copy(update={"geometric_classifier": chosen})
 
 
 def read_settings(folder: Path) -> Settings:
@@ -39,6 +52,8 @@ def differing(one: Settings, other: Settings) -> list[str]:
 
 def _with_content(settings: Settings) -> Settings:
     contents = {name: read_bytes(file, error=ConfigError) for name, file in _named(settings).items()}
+    if (model := settings.geometric_classifier.model) is not None:
+        settings = _with_model(settings, read_bytes(model, error=ConfigError))
     return settings.model_copy(update=contents)
 
 

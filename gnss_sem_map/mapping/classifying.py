@@ -22,7 +22,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.files.atomic import write_whole
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_bytes
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_bytes, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.geometric_classifier import classifier, features, road_sidewalk, training
 from gnss_sem_map.geometric_classifier.classifier import LEVELS, Classifier
@@ -55,6 +55,14 @@ VOXELS_AT_ONCE = 1 << 18
 def drive_folders(run: Path) -> list[Path]:
     """The folders of a run that have a raw map of one drive each, sorted by name."""
     return sorted((run / DRIVES).iterdir()) if is_folder(run / DRIVES) else [run]
+
+
+def opened_model(settings: Settings) -> Classifier | None:
+    """The classifier that the settings name and use; raises DataError if it is damaged, or of other maps."""
+    chosen = settings.geometric_classifier
+    if not chosen.enabled or chosen.model is None:
+        return None
+    return classifier.read(chosen.model, open_label_set(settings.classes), settings.mapping.voxel_size_m)
 
 
 def fit_classifiers(run: Path, settings: Settings, executor: Executor | None = None) -> list[str]:
@@ -100,17 +108,16 @@ class DriveClassifier:
         """Write the classifier, unless one made from the same is there; returns why there is none, or nothing."""
         if (there := self._written) is not None:
             return there if isinstance(there, str) else ""
-        named = self.settings.geometric_classifier.model
         found: Classifier | str
-        if named is not None:
-            found = classifier.read(named, self._label_set, self._raw.fused.voxel_size_m)
-            if found.uses_intensity and not self.has_intensity:
-                found = f"its scans have no intensities, as those that {named.name} was fitted to: {OFF}"
-        else:
-            found = training.fit(
-                [self.rows()], self._label_set, self._raw.fused.voxel_size_m, self.has_intensity
-            )
+        named, model = self.settings.geometric_classifier.model, opened_model(self.settings)
+        if named is None or model is None:
+            size = self._raw.fused.voxel_size_m
+            found = training.fit([self.rows()], self._label_set, size, self.has_intensity)
             found = f"{found}: {OFF}" if isinstance(found, str) else found
+        elif model.uses_intensity and not self.has_intensity:
+            found = f"its scans have no intensities, as those that {shown(named.name)} was fitted to: {OFF}"
+        else:
+            found = model
         why = found if isinstance(found, str) else ""
         beside = {"made_from": np.array([self.digest]), "why": np.array([why])}
         file = io.BytesIO()

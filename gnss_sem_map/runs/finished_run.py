@@ -40,7 +40,8 @@ from gnss_sem_map.files.untrusted import is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.mapping import evidence
-from gnss_sem_map.mapping.fusion import GEOMETRY_ONLY
+from gnss_sem_map.mapping.classifying import OFF
+from gnss_sem_map.mapping.fusion import without_images
 from gnss_sem_map.mapping.labelled_scans import Drive
 from gnss_sem_map.mapping.raw_map import MAP
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -215,12 +216,24 @@ class Run:
                 if labelled := sorted(run.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
                     drives = (_labelled(known, folder) for known in labelled)
                     write_point_labels(folder, drives, refined.kerbs, settings, progress)
-                about = run.about | {"map": about_map(folder, refined.report)}
+                about = run.about | {
+                    "map": about_map(folder, refined.report),
+                    "warnings": [*run._warnings_with(settings), *stats.warnings],
+                }
                 write_merged(folder, settings, about, progress)
             else:
-                known = run.folder / RAW_LABELS
+                known, changed = run.folder / RAW_LABELS, {"warnings": run._warnings_with(settings)}
                 run_folder.write_again(
-                    folder, run.folder, run.trajectory, refined, stats, settings, log, {}, known, progress
+                    folder,
+                    run.folder,
+                    run.trajectory,
+                    refined,
+                    stats,
+                    settings,
+                    log,
+                    changed,
+                    known,
+                    progress,
                 )
         return Run(self.folder if out is None else Path(out))
 
@@ -257,7 +270,9 @@ class Run:
             changed = {
                 "inputs": before["inputs"] | {"segmenter": spec},
                 "skips": about_skips([*skips, *stats.skips]),
-                "warnings": [said for said in before["warnings"] if GEOMETRY_ONLY not in said],
+                "warnings": [
+                    said for said in run._warnings_with(settings) if without_images(settings) not in said
+                ],
             }
             with_labels = log if is_folder(run.folder / "labels") else None
             run_folder.write_again(
@@ -328,6 +343,11 @@ class Run:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
         log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
+
+    def _warnings_with(self, settings: Settings) -> list[str]:
+        """What the run warns of, as with these settings of the geometric classifier; not what kept it from learning."""
+        before, now = without_images(self.settings), without_images(settings)
+        return [said.replace(before, now) for said in self.about.get("warnings", ()) if OFF not in said]
 
     @property
     def _has_labels(self) -> bool:

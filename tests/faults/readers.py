@@ -212,6 +212,30 @@ def calibration(folder: Path) -> Reader:
     return Reader(file, lambda: sensor_model.read(file, urban).log_likelihoods, mutations.text)
 
 
+def geometric_classifier(folder: Path) -> Reader:
+    """A classifier by shape, which says something of ten voxels once it is read."""
+    from gnss_sem_map.geometric_classifier import classifier, features
+    from gnss_sem_map.geometric_classifier.trees import INNER, LEAVES, BoostedTrees
+
+    folder.mkdir(parents=True)
+    file, rng, count = folder / "classifier.npz", np.random.default_rng(0), len(features.NAMES)
+    trees = BoostedTrees(
+        np.array([0, 3, 5], np.int8),
+        np.zeros(3, np.float32),
+        rng.integers(0, count, (6, INNER), np.int16),
+        rng.normal(size=(6, INNER)).astype(np.float32),
+        rng.normal(size=(6, LEAVES)).astype(np.float32),
+    )
+    file.write_bytes(classifier.Classifier(CLASSES, 0.2, (trees, trees), 1.5, True).to_bytes())
+    urban, rows = label_set.open_label_set(), rng.normal(size=(10, count)).astype(np.float32)
+
+    def read() -> object:
+        found = classifier.read(file, urban, 0.2)
+        return found.log_probabilities(rows, np.arange(10) << 40, np.zeros(10, np.bool_))
+
+    return Reader(file, read, mutations.npz)
+
+
 def run_json(folder: Path) -> Reader:
     """What a run says of itself, as `calibrate` and the report read it."""
     from gnss_sem_map.files.run_json import inputs_of, read_run
@@ -237,7 +261,10 @@ def small_map(folder: Path) -> Path:
     rng = np.random.default_rng(0)
     keys = np.unique(pack(rng.integers(-300, 300, (400, 3))))
     evidence = -rng.integers(0, 5000, (len(keys), len(CLASSES))).astype(np.int32)
-    voxels = VoxelMap(0.2, label_set.open_label_set(), keys, evidence, np.ones(len(keys), np.uint32))
+    heights = rng.integers(0, 256, len(keys))
+    of_images = rng.integers(0, 99, (len(keys), 2), np.int32)
+    ones = np.ones(len(keys), np.uint32)
+    voxels = VoxelMap(0.2, label_set.open_label_set(), keys, evidence, ones, heights, of_images)
     folder.mkdir(parents=True)
     tiles.write(SemanticMap.of(voxels), folder / "map", LocalFrame(49, 8, 100))
     return folder / "map"
@@ -318,6 +345,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "class set": functools.partial(shipped, "urban", label_set.open_label_set),
     "taxonomy": functools.partial(shipped, "cityscapes", _taxonomy),
     "label calibration": calibration,
+    "geometric classifier": geometric_classifier,
     "run.json": run_json,
     "map.json": map_json,
     "tile": tile,

@@ -29,6 +29,7 @@ from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
 from gnss_sem_map.runs import calibrating, merged_run
 from gnss_sem_map.runs.about import about_map
+from gnss_sem_map.runs.classifier_fitting import fit_classifier
 from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.runs.point_label_files import LabelledDrive, write_point_labels
 from gnss_sem_map.voxels import tiles
@@ -185,6 +186,23 @@ def test_relabelled_it_says_what_a_run_with_those_labels_says_of_them(
     for name in ("skips", "inputs"):
         assert again.about[name] == once.about[name], name
     assert not any("geometry only" in said for said in again.about["warnings"])
+
+
+def test_it_warns_of_what_the_classifier_leaves_without_a_class_and_of_nothing_else(
+    finished: Run, small_drive: Street, tmp_path: Path
+) -> None:
+    """Without labels a map has no class, but with the classifier of another drive it has."""
+    bare, file = run(small_drive.drive, tmp_path / "bare", force=True), tmp_path / "classifier.npz"
+    file.write_bytes(fit_classifier([finished.folder])[0].to_bytes())
+    named = bare.settings.changed(f"geometric_classifier.model={file}")
+    classified = bare.refine(named, tmp_path / "classified")
+    assert (bare.map().states == State.UNOBSERVED).all()
+    assert (classified.map().states == State.INFERRED).mean() > 0.9
+    said = {out.folder.name: " ".join(out.about["warnings"]) for out in (bare, classified)}
+    assert "no segmenter: the map shows geometry only; a classifier of drives with labels" in said["bare"]
+    assert "no segmenter: all classes are those of the geometric classifier" in said["classified"]
+    assert "geometry only" not in said["classified"]
+    assert classified.refine(bare.settings, tmp_path / "back").about["warnings"] == bare.about["warnings"]
 
 
 def test_relabelled_it_stays_where_it_was(finished: Run, small_drive: Street, tmp_path: Path) -> None:

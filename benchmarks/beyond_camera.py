@@ -44,7 +44,6 @@ STEPS = (
     "count_grid",
     "potts_mrf",
     "geometric_labels",
-    "levels",
 )
 """Steps to switch off."""
 WITHOUT = "geometric_classifier.enabled=false"

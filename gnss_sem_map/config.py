@@ -33,12 +33,13 @@ PAPER: dict[str, float | bool] = {
     "refinement.potts_mrf.enabled": False,
     "geometric_classifier.enabled": False,
     "refinement.decision.temperature": 1.0,
-    "refinement.levels.enabled": False,
     "refinement.kerbs.enabled": False,
 }
 """What `fusion: paper` sets. The floor is the least that keeps one observation from deciding for ever."""
 
 
+RETIRED = (("refinement", "unobserved"), ("refinement", "levels"))
+"""Settings of runs of earlier versions, which have no effect any more."""
 FILES = (("calibration",), ("classes",), ("geometric_classifier", "model"), ("delivery", "geoid"))
 """Settings that name a file; classes without an ending are a shipped set."""
 
@@ -140,18 +141,29 @@ def _plain(content: Any) -> Any:
     return {key: _plain(value) for key, value in content.items()} if isinstance(content, dict) else content
 
 
-def load(file: Path | None = None, overrides: Iterable[str] = ()) -> Settings:
+def load(
+    file: Path | None = None, overrides: Iterable[str] = (), leave_out: Iterable[tuple[str, str]] = ()
+) -> Settings:
     """Settings from a YAML file and `a.b=c` overrides; raises ConfigError, with the nearest key, for an unknown one.
 
-    Files that the file names are found from its folder, those of the overrides from the working folder.
+    Files that the file names are found from its folder, those of the overrides from the working folder. `leave_out`:
+    sections and names that the file may still have, of earlier versions.
     """
     content = _read(file) if file is not None else {}
+    for section, name in leave_out:
+        if isinstance(content.get(section), dict):
+            content[section].pop(name, None)
     if file is not None:
         _find_files(content, file.parent)
     for override in overrides:
         _apply(content, override)
     _find_files(content, Path.cwd())  # a worker may have another working folder
     return parse(Settings, (), content, str(file) if file else "--set")
+
+
+def of_run(file: Path) -> Settings:
+    """The settings of a finished run, maybe of an earlier version; raises ConfigError."""
+    return load(file, leave_out=RETIRED)
 
 
 def _find_files(content: dict[str, Any], folder: Path) -> None:

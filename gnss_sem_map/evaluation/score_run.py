@@ -60,7 +60,7 @@ def score_run(
     """
     out, truth = Path(out), Path(truth)
     _check_scorable(out)
-    label_set = label_set or open_label_set(config.load(out / "config.yaml").classes)
+    label_set = label_set or open_label_set(config.of_run(out / "config.yaml").classes)
     metrics = read_json(out / "metrics.json")
     metrics |= count_points(out, truth, label_set, restrict_to).figures(label_set)
     path = truth / "trajectory_lidar.tum"

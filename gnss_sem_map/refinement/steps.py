@@ -26,7 +26,6 @@ from gnss_sem_map.refinement import (
     geometric_labels,
     geometric_prior,
     kerbs,
-    levels,
     potts_mrf,
     removed_layer,
     systematic_error,
@@ -40,7 +39,6 @@ from gnss_sem_map.refinement.free_space import FreeSpaceSettings
 from gnss_sem_map.refinement.geometric_labels import GeometricLabelSettings
 from gnss_sem_map.refinement.geometric_prior import GeometricPriorSettings
 from gnss_sem_map.refinement.kerbs import KerbSettings
-from gnss_sem_map.refinement.levels import LevelSettings
 from gnss_sem_map.refinement.potts_mrf import PottsSettings
 from gnss_sem_map.refinement.removed_layer import RemovedLayerSettings
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings, VehicleObject
@@ -81,10 +79,6 @@ class RefinementSettings(BaseModel):
     )
     decision: DecisionSettings = Field(
         default=DecisionSettings(), description="The most probable class, and its confidence."
-    )
-    levels: LevelSettings = Field(
-        default=LevelSettings(),
-        description="Height tells road from sidewalk where the two lie on clearly two levels.",
     )
     kerbs: KerbSettings = Field(
         default=KerbSettings(),
@@ -130,7 +124,6 @@ STEPS = tuple(
         potts_mrf,
         geometric_labels,
         decision,
-        levels,
         kerbs,
         free_space,
         crumbs,

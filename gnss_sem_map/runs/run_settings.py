@@ -35,7 +35,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 def read_settings(folder: Path) -> Settings:
     """The settings of a run; raises ConfigError."""
-    return config.load(folder / SETTINGS)
+    return config.of_run(folder / SETTINGS)
 
 
 def differing(one: Settings, other: Settings) -> list[str]:

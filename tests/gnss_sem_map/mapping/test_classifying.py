@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import damage
 import numpy as np
@@ -21,11 +21,15 @@ from typer.testing import CliRunner
 from gnss_sem_map import Run, Settings, config, run
 from gnss_sem_map.cli import app
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.mapping import classifying
+from gnss_sem_map.mapping import classifying, refining
 from gnss_sem_map.mapping.classifying import FILE, DriveClassifier
+from gnss_sem_map.mapping.execution import InProcess
+from gnss_sem_map.mapping.raw_map import open_raw
+from gnss_sem_map.run_stats import silent
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, run_drives
 from gnss_sem_map.runs.merged_run import merge_run_folders
 from gnss_sem_map.voxels import blocks
+from gnss_sem_map.voxels.map_json import name_of
 from gnss_sem_map.voxels.semantic_map import SemanticMap, State
 
 pytestmark = pytest.mark.integration
@@ -126,12 +130,9 @@ def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
     assert refined(out) == refined(street_run.folder)
 
 
-@pytest.mark.parametrize("damaged", [damage.flipped, lambda path: path.write_bytes(b"")])
-def test_a_damaged_classifier_is_made_again(
-    damaged: Callable[[Path], object], street_run: Run, tmp_path: Path
-) -> None:
+def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(street_run.folder, tmp_path / "copy"))
-    damaged(copy / CLASSIFIER)
+    damage.flipped(copy / CLASSIFIER)
     out = Run.open(copy).refine(street_run.settings, tmp_path / "out").folder
     assert (out / CLASSIFIER).read_bytes() == (street_run.folder / CLASSIFIER).read_bytes()
     assert refined(out) == refined(street_run.folder)
@@ -322,6 +323,7 @@ def test_two_processes_make_the_same_map(drives: Drives, both: Path, tmp_path: P
         assert (tmp_path / "out" / of_drive).read_bytes() == (both / of_drive).read_bytes()
 
 
+@pytest.mark.slow
 def test_an_added_drive_leaves_the_classifier_of_the_first_alone(
     drives: Drives, both: Path, tmp_path: Path
 ) -> None:
@@ -333,6 +335,27 @@ def test_an_added_drive_leaves_the_classifier_of_the_first_alone(
     assert refined(out) == refined(both)
 
 
+def test_a_drive_touches_only_the_blocks_around_it(
+    street_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A block is made again where the classifiers around it are others: those of drives beyond its halo are not."""
+    passed = {"near": [(0, 0), (1, 0)], "beside": [(2, 0)], "far": [(40, 0), (41, 0)]}
+    made = refining._Refinement(
+        open_raw(street_run.folder, URBAN), tmp_path, Settings(), silent, None, InProcess(), tmp_path
+    )
+    made.__dict__["_voxels"] = dict.fromkeys([(0, 0), (3, 0), (40, 0)], 1)
+    monkeypatch.setattr(refining, "files_of", lambda of: dict.fromkeys(map(name_of, passed[of.parent.name])))
+    found = {}
+    for names in (("near", "beside"), ("near", "beside", "far")):
+        drives = [SimpleNamespace(folder=tmp_path / name, digest=name) for name in names]
+        monkeypatch.setattr(refining, "drives_of", lambda *_, drives=drives: drives)
+        found[names] = made._classifier_digests()
+    before, after = found.values()
+    assert before == {((0, 0),): ["near"], ((3, 0),): ["beside"], ((40, 0),): []}
+    assert after == before | {((40, 0),): ["far"]}
+
+
+@pytest.mark.slow
 def test_drives_of_one_kind_make_one_classifier_and_others_are_refused(
     both: Path, street_run: Run, tmp_path: Path
 ) -> None:
@@ -367,6 +390,7 @@ def test_runs_without_labels_teach_nothing(street_run: Run, tmp_path: Path) -> N
     assert not (tmp_path / "new.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_merged_run_has_a_classifier_of_its_own_and_is_the_same_when_refined_again(
     both: Path, tmp_path: Path
 ) -> None:

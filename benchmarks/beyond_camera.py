@@ -32,14 +32,21 @@ from gnss_sem_map import Run
 from gnss_sem_map.evaluation.score_run import Counts, count_points
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import UNLABELLED, open_label_set
-from gnss_sem_map.refinement.steps import RefinementSettings
 from gnss_sem_map.voxels.semantic_map import State
 
 URBAN = open_label_set()
 STREETS = ("00", "08")
 RAW_0005 = "kitti_raw/2011_09_26/2011_09_26_drive_0005_sync"
-STEPS = ("unobserved", "geometric_prior", "levels", "systematic_error", "discount")
-"""Steps to switch off; those that there are."""
+STEPS = (
+    "discount",
+    "geometric_prior",
+    "systematic_error",
+    "count_grid",
+    "potts_mrf",
+    "geometric_labels",
+    "levels",
+)
+"""Steps to switch off."""
 WITHOUT = "geometric_classifier.enabled=false"
 ALL, ASKED = ("streets", "raw", "demo"), ("streets", "raw", "demo", "ablations")
 Figures = dict[str, Any]
@@ -171,9 +178,8 @@ def ablations(data: Path, runs: Path) -> Iterator[tuple[str, Figures]]:
     alone = street_runs(data, runs)
     yield "all steps", scores(alone)
     for step in STEPS:
-        if step in RefinementSettings.model_fields:
-            off = f"refinement.{step}.enabled=false"
-            yield f"without {step}", scores([(refined(out, step, off), truth) for out, truth in alone])
+        off = f"refinement.{step}.enabled=false"
+        yield f"without {step}", scores([(refined(out, step, off), truth) for out, truth in alone])
 
 
 def show(part: str, name: str, figures: Figures) -> None:

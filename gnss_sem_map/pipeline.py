@@ -29,7 +29,7 @@ from gnss_sem_map.files.work_folder import SWEEPS
 from gnss_sem_map.labels.label_set import open_label_set
 from gnss_sem_map.machine import one_blas_thread
 from gnss_sem_map.mapping import fingerprints
-from gnss_sem_map.mapping.classifying import fit_classifiers
+from gnss_sem_map.mapping.classifying import fit_classifiers, opened_model
 from gnss_sem_map.mapping.execution import Executor
 from gnss_sem_map.mapping.fusion import Elsewhere, map_scans
 from gnss_sem_map.mapping.labelled_scans import Drive, pattern_sweeps
@@ -142,6 +142,7 @@ def run(
     check_georeference(log, origin, settings.mapping.voxel_size_m)
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
+    opened_model(settings)
     has_odometry = match is not None and log.given is None and settings.trajectory.lidar_odometry
     saved = work / SWEEPS if has_odometry else None
     page, found, sharpness = _checked_and_located(

@@ -35,6 +35,7 @@ FILES = {
     "config.yaml": "all settings of this run",
     "classes.yaml": "the class set that the settings name",
     "calibration.yaml": "the confusion model of the segmentation network that the settings name",
+    "classifier.npz": "the geometric classifier that the settings name",
     "run.json": "what report.html says of the run, machine-readable",
     "metrics.json": "what report.html says of the evaluation, machine-readable",
 }

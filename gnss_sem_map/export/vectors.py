@@ -149,7 +149,7 @@ def _sieved(cells: NDArray[np.uint8], size: float) -> NDArray[np.uint8]:
     from rasterio import features
 
     sieved = cells.copy()
-    least = round(SMALLEST_AREA_M2 / size**2)
+    least = max(round(SMALLEST_AREA_M2 / size**2), 1)
     sieved[1:-1, 1:-1] = features.sieve(np.ascontiguousarray(cells[1:-1, 1:-1]), least, connectivity=4)
     return sieved
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, fields
 from pathlib import Path
+from reprlib import repr as brief
 from typing import Any
 
 import numpy as np
@@ -63,12 +64,13 @@ class Classifier:
         `observed` (v,): what images show, which the model of the other colour judges.
         """
         answers, folds = len(self.names) + 1, folds_of(keys, self.voxel_size_m)
-        temperature = np.float32(self.temperature)
-        of_folds = [softmax(log_scores_of(trees, rows, answers) / temperature) for trees in self.folds]
-        cross = np.where((folds == 1)[:, None], *of_folds)
-        mean = (of_folds[0] + of_folds[1]) / np.float32(2)
-        logs = np.log(np.maximum(np.where(observed[:, None], cross, mean), np.float32(np.exp(LEAST_LOG))))
-        return np.asarray(logs, np.float32)
+        total, judges = np.zeros((len(keys), answers), np.float32), np.where(observed, 1, FOLDS)
+        for fold, trees in enumerate(self.folds):
+            judged = np.flatnonzero(~observed | (folds != fold))
+            scores = log_scores_of(trees, rows[judged], answers)
+            total[judged] += softmax(scores / np.float32(self.temperature))
+        mean = total / judges[:, None].astype(np.float32)
+        return np.asarray(np.log(np.maximum(mean, np.float32(np.exp(LEAST_LOG)))), np.float32)
 
     def to_bytes(self, **beside: NDArray[Any]) -> bytes:
         """The file that `read` reads back."""
@@ -109,8 +111,8 @@ def read(path: Path, label_set: LabelSet, voxel_size_m: float) -> Classifier:
         ) from None
     if found.names != label_set.names:
         raise DataError(
-            f"{shown(path)}: is of the classes {list(found.names)[:9]}, the map's are {list(label_set.names)[:9]};"
-            " fit a classifier on runs with the same class set"
+            f"{shown(path)}: is of the classes {brief(list(found.names))}, the map's are"
+            f" {brief(list(label_set.names))}; fit a classifier on runs with the same class set"
         )
     if found.voxel_size_m != voxel_size_m:
         raise DataError(
@@ -137,9 +139,9 @@ def _of(archive: Archive) -> Classifier:
     if (
         numbers.shape != (3,)
         or numbers.dtype.kind != "f"
-        or not (np.isfinite(numbers).all() and numbers[1] > 0)
+        or not (np.isfinite(numbers).all() and 1 <= 100 * numbers[1] <= 10_000)
     ):
-        raise DataError("its voxel size or temperature is no positive number")
+        raise DataError("its voxel size is no number, or its temperature is not within 0.01 and 100")
     folds = tuple(
         BoostedTrees(*(archive.array(f"{field.name}_{k}").read() for field in fields(BoostedTrees)))
         for k in range(FOLDS)

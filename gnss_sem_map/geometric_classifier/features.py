@@ -75,11 +75,11 @@ def features_of(
     _columns(voxels.keys, places, found[:, 2:at])
     for level in LEVELS:
         cells = _Cells.of(voxels.keys, level)
-        sums = np.zeros((len(cells.keys), MOMENTS), np.int64)
+        sums = np.zeros((len(cells.keys), MOMENTS), np.int32)
         _add_moments(voxels.keys, z, intensity, cells.of_voxel, level, sums)
         wanted = np.zeros(len(cells.keys), np.bool_)
         wanted[cells.of_voxel[places]] = True
-        shapes = np.empty((len(cells.keys), 9 + MOMENTS), np.float64)
+        shapes = np.empty((len(cells.keys), len(OF_SHAPE) - 1), np.float32)
         _shapes(cells.keys, sums, wanted, level, shapes)
         _of_shape(
             voxels.keys,
@@ -222,7 +222,7 @@ def _shapes(keys, sums, wanted, level, shapes):
                     j += 1
                 ahead[column] = j
                 while j < len(keys) and keys[j] <= low + 2 * WINDOW:
-                    s, n = sums[j], sums[j, 0]
+                    s, n = sums[j], np.int64(sums[j, 0])
                     x, y, h = dx * size, dy * size, (keys[j] - low - WINDOW) * tall
                     total[0] += n
                     total[1] += s[1] + n * x

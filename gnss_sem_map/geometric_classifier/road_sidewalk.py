@@ -24,6 +24,8 @@ from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
 FILE = Path(str(resources.files("gnss_sem_map") / "geometric_classifier" / "road_sidewalk.npz"))
 COLUMNS = np.array([i for i, name in enumerate(features.NAMES) if name not in features.OF_INTENSITY])
 """Simulated intensities are not those of real streets."""
+LEAST_LOG = np.float32(np.log(0.02))
+"""Where road and sidewalk together are less probable, the model is not asked."""
 LIMITS_NAT = np.float32(-3), np.float32(3)
 
 
@@ -41,7 +43,9 @@ class RoadSidewalkModel:
         classes = road_and_sidewalk(label_set)
         if classes is None or self.weight == 0:
             return logs
-        said = self.trees.scores(np.ascontiguousarray(rows[:, COLUMNS]))[:, 0]
+        asked = np.flatnonzero(np.logaddexp(*(logs[:, one] for one in classes)) > LEAST_LOG)
+        said = np.zeros(len(logs), np.float32)
+        said[asked] = self.trees.scores(rows[asked][:, COLUMNS])[:, 0]
         return with_odds(logs, classes, np.float32(self.weight) * np.clip(said, *LIMITS_NAT))
 
 

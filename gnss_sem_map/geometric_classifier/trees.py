@@ -23,7 +23,7 @@ BINS = 63
 SEED = 0
 ROWS_AT_ONCE = 256
 """Voxels that walk through a tree one after another, while it and their features are in the cache."""
-MOST_TREES = 1 << 14
+MOST_TREES, MOST_IN_LEAF = 1 << 14, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +82,24 @@ class BoostedTrees:
         if (
             any(array.dtype != kind for array, kind in zip(arrays, kinds, strict=True))
             or self.classes.ndim != 1
+            or self.leaves.ndim != 2
         ):
             raise DataError("its arrays have other types")
         trees, known = len(self.leaves), self.classes
         scores = 1 if len(known) == 2 else len(known)
         shapes = (scores,), (trees, INNER), (trees, INNER), (trees, LEAVES)
+        if len(known) < 2 or (known[1:] <= known[:-1]).any() or known[0] < 0 or known[-1] >= classes:
+            raise DataError("its trees are of other classes")
         if (
             tuple(array.shape for array in arrays[1:]) != shapes
             or not 0 < trees <= MOST_TREES
             or trees % scores
         ):
             raise DataError("its arrays are no trees of one depth")
-        if len(known) < 2 or (np.diff(known) <= 0).any() or known[0] < 0 or known[-1] >= classes:
-            raise DataError("its trees are of other classes")
         if (self.features < 0).any() or (self.features >= features).any() or np.isnan(self.thresholds).any():
             raise DataError("its trees look at features that are none")
-        if not (np.isfinite(self.leaves).all() and np.isfinite(self.baseline).all()):
-            raise DataError("its leaves are not finite")
+        if not all((np.abs(array) <= MOST_IN_LEAF).all() for array in (self.leaves, self.baseline)):
+            raise DataError(f"its leaves are not within {MOST_IN_LEAF:g}")
 
 
 def _limits_of_bins(column: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:

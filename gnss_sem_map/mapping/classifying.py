@@ -22,7 +22,7 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.files.atomic import write_whole
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_bytes
+from gnss_sem_map.files.untrusted import is_file, is_folder, read_bytes, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.geometric_classifier import classifier, features, road_sidewalk, training
 from gnss_sem_map.geometric_classifier.classifier import LEVELS, Classifier
@@ -39,7 +39,8 @@ from gnss_sem_map.refinement import geometric_prior, height_above_ground, potts_
 from gnss_sem_map.refinement.state import Evidence, GeometricEvidence
 from gnss_sem_map.voxels.attributes import NOTHING, Attributes, open_attributes
 from gnss_sem_map.voxels.blocks import Block, blocks_of
-from gnss_sem_map.voxels.map_json import files_of
+from gnss_sem_map.voxels.kernels import UNITS_PER_NAT
+from gnss_sem_map.voxels.map_json import files_of, tile_of
 from gnss_sem_map.voxels.reuse import digest
 from gnss_sem_map.voxels.tiles import Recent, indices_by_tile, places_around
 
@@ -47,13 +48,21 @@ FILE = "classifier.npz"
 MOST_BLOCKS = 64
 """Of a long drive so many blocks, evenly spread, teach its classifier."""
 OFF = "only what images show has a class"
-UNITS_PER_NAT = 1024
-"""Log probabilities of drives are added as whole numbers, which are the same in any order."""
+VOXELS_AT_ONCE = 1 << 18
+"""Their features take 66 MB."""
 
 
 def drive_folders(run: Path) -> list[Path]:
     """The folders of a run that have a raw map of one drive each, sorted by name."""
     return sorted((run / DRIVES).iterdir()) if is_folder(run / DRIVES) else [run]
+
+
+def opened_model(settings: Settings) -> Classifier | None:
+    """The classifier that the settings name and use; raises DataError if it is damaged, or of other maps."""
+    chosen = settings.geometric_classifier
+    if not chosen.enabled or chosen.model is None:
+        return None
+    return classifier.read(chosen.model, open_label_set(settings.classes), settings.mapping.voxel_size_m)
 
 
 def fit_classifiers(run: Path, settings: Settings, executor: Executor | None = None) -> list[str]:
@@ -98,18 +107,17 @@ class DriveClassifier:
     def fit(self) -> str:
         """Write the classifier, unless one made from the same is there; returns why there is none, or nothing."""
         if (there := self._written) is not None:
-            return there[1]
-        named = self.settings.geometric_classifier.model
+            return there if isinstance(there, str) else ""
         found: Classifier | str
-        if named is not None:
-            found = classifier.read(named, self._label_set, self._raw.fused.voxel_size_m)
-            if found.uses_intensity and not self.has_intensity:
-                found = f"its scans have no intensities, as those that {named.name} was fitted to: {OFF}"
-        else:
-            found = training.fit(
-                [self.rows()], self._label_set, self._raw.fused.voxel_size_m, self.has_intensity
-            )
+        named, model = self.settings.geometric_classifier.model, opened_model(self.settings)
+        if named is None or model is None:
+            size = self._raw.fused.voxel_size_m
+            found = training.fit([self.rows()], self._label_set, size, self.has_intensity)
             found = f"{found}: {OFF}" if isinstance(found, str) else found
+        elif model.uses_intensity and not self.has_intensity:
+            found = f"its scans have no intensities, as those that {shown(named.name)} was fitted to: {OFF}"
+        else:
+            found = model
         why = found if isinstance(found, str) else ""
         beside = {"made_from": np.array([self.digest]), "why": np.array([why])}
         file = io.BytesIO()
@@ -129,7 +137,8 @@ class DriveClassifier:
         )
         margin = max(features.reach_m(size), height_above_ground.REACH_M + by_steps)
         model = sensor_model.opened(settings.calibration, self._label_set)
-        blocks = blocks_of(dict.fromkeys(self._raw.fused.tiles, 0))
+        files = files_of(self.folder / MAP)
+        blocks = blocks_of({tile_of(name): about["voxels"] for name, about in files.items()})
         step = -(-len(blocks) // MOST_BLOCKS)
         found: Rows | None = None
         for block in blocks[::step]:
@@ -150,14 +159,15 @@ class DriveClassifier:
             return None
         around = self._raw.around(block, margin_m + features.reach_m(self._raw.fused.voxel_size_m))
         places = places_around(around, block, margin_m)
-        rows = features_of(around, self._intensity_of(around.keys), places)
-        keys = around.keys[places]
-        logs = model.log_probabilities(rows, keys, around.observed[places])
-        weight = self.settings.geometric_classifier.kerb_weight
-        logs = RoadSidewalkModel(road_sidewalk.shipped(), weight).applied(logs, rows, self._label_set)
-        return GeometricEvidence(
-            keys, np.rint(logs * np.float32(UNITS_PER_NAT)).astype(np.int32), np.ones(len(keys), np.int32)
-        )
+        intensity, keys, logs = self._intensity_of(around.keys), around.keys[places], []
+        kerbs = RoadSidewalkModel(road_sidewalk.shipped(), self.settings.geometric_classifier.kerb_weight)
+        for part in np.split(places, range(VOXELS_AT_ONCE, len(places), VOXELS_AT_ONCE)):
+            rows = features_of(around, intensity, part)
+            of_part = model.log_probabilities(rows, around.keys[part], around.observed[part])
+            logs.append(kerbs.applied(of_part, rows, self._label_set))
+        # as whole numbers, whose sums are the same in any order of the drives
+        sums = np.rint(np.concatenate(logs) * np.float32(UNITS_PER_NAT)).astype(np.int32)
+        return GeometricEvidence(keys, sums, np.ones(len(keys), np.int32))
 
     @cached_property
     def digest(self) -> str:
@@ -184,23 +194,23 @@ class DriveClassifier:
         return self.folder / evidence.FOLDER / FILE
 
     @property
-    def _written(self) -> tuple[str, str] | None:
-        """What the written classifier was made from, and why there is none; None for another one, or a damaged one."""
+    def _written(self) -> Classifier | str | None:
+        """The written classifier, or why there is none; None for one made from other things, or a damaged one."""
         if not is_file(self._file):
             return None
         try:
             with open_archive(self._file) as archive:
                 made_from, why = (str(archive.array(name).read()[0]) for name in ("made_from", "why"))
+            if made_from != self.digest:
+                return None
+            return why or classifier.read(self._file, self._label_set, self._raw.fused.voxel_size_m)
         except (DataError, IndexError):
             return None
-        return (made_from, why) if made_from == self.digest else None
 
     @cached_property
     def _model(self) -> Classifier | None:
         written = self._written
-        if written is None or written[1]:
-            return None
-        return classifier.read(self._file, self._label_set, self._raw.fused.voxel_size_m)
+        return written if isinstance(written, Classifier) else None
 
     @cached_property
     def _label_set(self) -> LabelSet:

@@ -12,7 +12,7 @@ from pydantic import Field
 from gnss_sem_map.refinement.columns import passed_over_ground, seldom_there
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.semantic_map import Reason, State
+from gnss_sem_map.voxels.semantic_map import Reason
 
 
 class CrumbSettings(StepSettings):
@@ -33,7 +33,7 @@ def apply(state: MapState, settings: CrumbSettings) -> MapState:
     assert state.decided is not None
     gone, over = state.is_removed, over_ground(state)
     asked = over & ~gone & (state.voxels.hits <= settings.most_points)
-    asked &= state.decided.states != State.SPLIT  # a kerb is ground
+    asked &= ~state.on_kerbs  # which are ground
     crumbs = more_goes_than_stands(state, asked, gone, over) | passed_over_ground(state, asked, gone, over)
     crumbs |= seldom_there(state, asked, gone, over)
     return state.without(crumbs, Reason.CRUMB)

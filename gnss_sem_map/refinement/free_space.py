@@ -19,7 +19,7 @@ from gnss_sem_map.dynamics.range_images import CLUSTER, FARTHEST_M
 from gnss_sem_map.dynamics.visibility import WIDE_RATIO, Keyframes, hits_and_misses, origins_of, spatial_order
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.surroundings import COLUMNS_AROUND, more_goes_than_stands, over_ground
-from gnss_sem_map.voxels.semantic_map import Reason, State
+from gnss_sem_map.voxels.semantic_map import Reason
 from gnss_sem_map.voxels.voxel_map import VoxelMap
 
 OVER_M = (0.4, 3.0)
@@ -54,7 +54,7 @@ def apply(state: MapState, settings: FreeSpaceSettings) -> MapState:
         raise NotApplicable("no keyframe scans: the poses are not sharp enough to tell what is free")
     assert state.decided is not None
     removed = traversed(state.voxels, state.beside.keyframes, settings)
-    removed &= state.decided.states != State.SPLIT  # a kerb is ground
+    removed &= ~state.on_kerbs  # which are ground
     # rays graze the edges of roofs
     free = more_goes_than_stands(state, removed, removed, over_ground(state))
     return state.without(free, Reason.FREE_SPACE)

@@ -56,8 +56,8 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
     logs = geometry.of(voxels.keys)
     known, seen = np.isfinite(logs[:, 0]), voxels.observed
     temperature = np.float32(1.0 if model is None else model.temperature)
-    probabilities = doubted(softmax(state.scores / temperature), state.systematic_error)
-    images = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
+    images = doubted(softmax(state.scores / temperature), state.systematic_error)
+    images = np.log(np.maximum(images, np.float32(LEAST_PROBABILITY)))
     logs = np.where(known[:, None], logs, np.float32(0))
     scores = np.where(seen[:, None], np.float32(settings.weight) * logs, logs)
     scores[seen, :-1] += images[seen]
@@ -68,9 +68,8 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
         scores = with_odds(scores, classes, np.where(seen, more, np.float32(0)))
     share = np.clip(voxels.other_share, *OTHER_LIMITS)
     of_other = np.log(share) - np.log1p(-share)
-    only_other = (
-        voxels.other_share > 0
-    ) & ~seen  # where images show nothing but `other`, no class has evidence
+    # where images show nothing but `other`, no class has evidence
+    only_other = (voxels.other_share > 0) & ~seen
     scores[only_other, -1] += of_other[only_other]
     scores[seen, -1] = scores[seen, -1] + of_other[seen] if settings.other_where_seen else np.float32(NEVER)
     if settings.coupling_nat:

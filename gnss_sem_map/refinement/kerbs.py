@@ -44,8 +44,8 @@ def apply(state: MapState, settings: KerbSettings) -> MapState:
     kerbs = find_kerbs(state.decided, heights_of(state), settings)
     if kerbs is None:
         return state
-    states = state.decided.states.copy()
-    states[state.decided.voxels.indices_of(kerbs.keys)] = State.SPLIT
+    states, places = state.decided.states.copy(), state.decided.voxels.indices_of(kerbs.keys)
+    states[places] = np.where(states[places] == State.INFERRED, State.INFERRED, State.SPLIT)
     return replace(state, kerbs=kerbs, decided=replace(state.decided, states=states))
 
 

@@ -176,6 +176,14 @@ class MapState:
         """Which voxels (v,) are part of something that moved."""
         return self.removed if self.decided is None else self.decided.states == State.REMOVED
 
+    @property
+    def on_kerbs(self) -> NDArray[np.bool_]:
+        """Which voxels (v,) have points that are classified one by one."""
+        found = np.zeros(len(self.voxels), np.bool_)
+        if self.kerbs is not None:
+            found[self.voxels.indices_of(self.kerbs.keys)] = True
+        return found
+
     @cached_property
     def told(self) -> NDArray[np.int8]:
         """What the map tells of every voxel (v,): its label, -1 where nothing is known, c + 1 where it is removed."""

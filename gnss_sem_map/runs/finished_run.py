@@ -194,6 +194,7 @@ class Run:
         reads = [inputs_of(self.folder).get("drive")] if self._has_labels else []
         with self._rewritten(out, reads) as (folder, run):
             _check_same_map(run.settings, settings)
+            warnings = _still_true(run, settings)
             georeference = run_folder.georeference_of(settings, run.frame)
             log = run.drive() if run._has_labels else None
             old_labels = shutil.ignore_patterns(*LABELS)
@@ -216,25 +217,15 @@ class Run:
                 if labelled := sorted(run.folder.glob(f"{DRIVES}/*/{RAW_LABELS}")):
                     drives = (_labelled(known, folder) for known in labelled)
                     write_point_labels(folder, drives, refined.kerbs, settings, progress)
-                about = run.about | {
-                    "map": about_map(folder, refined.report),
-                    "warnings": [*run._warnings_with(settings), *stats.warnings],
-                }
+                about = run.about | {"map": about_map(folder, refined.report)}
+                about |= {"warnings": list(dict.fromkeys([*warnings, *stats.warnings]))}
                 write_merged(folder, settings, about, progress)
             else:
-                known, changed = run.folder / RAW_LABELS, {"warnings": run._warnings_with(settings)}
+                known = run.folder / RAW_LABELS
                 run_folder.write_again(
-                    folder,
-                    run.folder,
-                    run.trajectory,
-                    refined,
-                    stats,
-                    settings,
-                    log,
-                    changed,
-                    known,
-                    progress,
-                )
+                    folder, run.folder, run.trajectory, refined, stats, settings, log, {"warnings": warnings},
+                    known, progress,
+                )  # fmt: skip
         return Run(self.folder if out is None else Path(out))
 
     def relabel(
@@ -270,9 +261,7 @@ class Run:
             changed = {
                 "inputs": before["inputs"] | {"segmenter": spec},
                 "skips": about_skips([*skips, *stats.skips]),
-                "warnings": [
-                    said for said in run._warnings_with(settings) if without_images(settings) not in said
-                ],
+                "warnings": [w for w in _still_true(run, settings) if without_images(settings) not in w],
             }
             with_labels = log if is_folder(run.folder / "labels") else None
             run_folder.write_again(
@@ -344,11 +333,6 @@ class Run:
         log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
-    def _warnings_with(self, settings: Settings) -> list[str]:
-        """What the run warns of, as with these settings of the geometric classifier; not what kept it from learning."""
-        before, now = without_images(self.settings), without_images(settings)
-        return [said.replace(before, now) for said in self.about.get("warnings", ()) if OFF not in said]
-
     @property
     def _has_labels(self) -> bool:
         """Whether it is a run of one drive with point labels."""
@@ -382,6 +366,12 @@ def _labelled(known_raw: Path, folder: Path) -> LabelledDrive:
     """A drive of a map of several that is made again in `folder`, whose labels before refinement are known."""
     drive = Run(known_raw.parent)
     return LabelledDrive(folder / DRIVES / known_raw.parent.name, drive.drive(), drive.trajectory, known_raw)
+
+
+def _still_true(run: Run, settings: Settings) -> list[str]:
+    """Warnings of a run that is refined with other settings; what there is to say of its classifier is said anew."""
+    of_images = without_images(run.settings), without_images(settings)
+    return [said.replace(*of_images) for said in run.about.get("warnings", ()) if OFF not in said]
 
 
 def _check_same_map(before: Settings, after: Settings) -> None:

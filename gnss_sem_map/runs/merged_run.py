@@ -11,6 +11,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.output_folder import new_folder, read_whole
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.labels.label_set import open_label_set
+from gnss_sem_map.mapping.classifying import fit_classifiers
 from gnss_sem_map.mapping.merging import Alignment, merge_runs
 from gnss_sem_map.mapping.raw_map import open_raw
 from gnss_sem_map.mapping.refining import refine_map
@@ -44,6 +45,7 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
     label_set = open_label_set(settings.classes)
     merged = merge_runs(first, second, label_set, match)
     merged.write_raw(folder)
+    warnings = fit_classifiers(folder, settings)
     refined = refine_map(open_raw(folder, label_set), folder, settings)
     about = {
         "name": f"{first.name} + {second.name}",
@@ -52,6 +54,7 @@ def _merge(first: Path, second: Path, folder: Path, match: bool) -> dict[str, An
         "local_frame": asdict(merged.frame),
         "map": about_map(folder, refined.report),
         "match": _about(merged.alignment),
+        "warnings": warnings,
     }
     keep_tracks(folder, tracks_of(first))
     return write_merged(folder, settings, about)

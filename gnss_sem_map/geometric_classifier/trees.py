@@ -103,15 +103,14 @@ class BoostedTrees:
 
 
 def _limits_of_bins(column: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The largest value in each bin of a feature (r,) but the last: bins of about the same weight, at most `BINS`."""
+    """The limits up to which values of a feature (r,) are in each bin but the last; bins of about one weight."""
+    values = np.unique(column)
+    if len(values) <= BINS:
+        return np.asarray((values[:-1] + values[1:]) / np.float32(2))
     order = np.argsort(column, kind="stable")
     weight = np.cumsum(weights[order])
     last = np.searchsorted(weight, np.arange(1, BINS) / BINS * weight[-1])
-    values = np.unique(column)
-    limits = (
-        values[:-1] if len(values) <= BINS else np.unique(column[order[np.minimum(last, len(order) - 1)]])
-    )
-    return np.asarray(limits)
+    return np.unique(column[order[np.minimum(last, len(order) - 1)]])
 
 
 def _whole(

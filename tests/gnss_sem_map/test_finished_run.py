@@ -343,20 +343,18 @@ def test_a_merged_run_has_no_trajectory_and_cannot_be_relabelled(merged: Run, sm
 def test_points_of_other_have_its_id_and_run_json_counts_its_voxels(finished: Run, tmp_path: Path) -> None:
     other = len(finished.label_set.names)
     refined = finished.map()
-    labels = np.where(
-        (refined.labels < 0) & (refined.states != State.REMOVED), np.int8(other), refined.labels
-    )
+    labels = np.where(refined.states == State.INFERRED, np.int8(other), refined.labels)
     for name in ("map", "evidence"):
         shutil.copytree(finished.folder / name, tmp_path / name)
     tiles.write(replace(refined, labels=labels), tmp_path / "refined", finished.frame)
     drive = LabelledDrive(tmp_path, finished.drive(), finished.trajectory, finished.folder / "labels_raw")
     write_point_labels(tmp_path, [drive], None, finished.settings)
-    before, after = (
-        np.concatenate([np.fromfile(file, "<u4") for file in sorted((folder / "labels").glob("*.label"))])
-        for folder in (finished.folder, tmp_path)
+    raw, after = (
+        np.concatenate([np.fromfile(file, "<u4") for file in sorted(folder.glob("*.label"))])
+        for folder in (finished.folder / "labels_raw", tmp_path / "labels")
     )
     assert (after == 99).sum() > 100
-    assert (before[after == 99] == 0).all()
+    assert (raw[after == 99] == 0).all(), "no image shows them"
     counted = about_map(tmp_path, RefinementReport(()))["labelled"]
     assert counted["refined"]["other"] == (labels == other).sum()
     assert counted["raw"]["other"] == 0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +26,7 @@ BINS = 63
 SEED = 0
 ROWS_AT_ONCE = 256
 """Voxels that walk through a tree one after another, while it and their features are in the cache."""
+CORES_VARIABLE = "LOKY_MAX_CPU_COUNT"
 MOST_TREES, MOST_IN_LEAF = 1 << 14, 1e6
 
 
@@ -60,7 +64,7 @@ class BoostedTrees:
         )  # fmt: skip
         limits = [_limits_of_bins(column, weights) for column in features.T]
         bins = [np.searchsorted(of, column) for of, column in zip(limits, features.T, strict=True)]
-        with threadpool_limits(1):
+        with _one_core():
             model.fit(np.column_stack(bins), classes, sample_weight=weights)
         trees = [_whole(tree.nodes, limits) for of_round in model._predictors for tree in of_round]
         columns, thresholds, leaves = map(np.stack, zip(*trees, strict=True))
@@ -100,6 +104,20 @@ class BoostedTrees:
             raise DataError("its trees look at features that are none")
         if not all((np.abs(array) <= MOST_IN_LEAF).all() for array in (self.leaves, self.baseline)):
             raise DataError(f"its leaves are not within {MOST_IN_LEAF:g}")
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """While it lasts, OpenMP has one thread, and joblib, which scikit-learn asks, starts no process to count cores."""
+    before = os.environ.get(CORES_VARIABLE)
+    os.environ[CORES_VARIABLE] = "1"
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        os.environ.pop(CORES_VARIABLE)
+        if before is not None:
+            os.environ[CORES_VARIABLE] = before
 
 
 def _limits_of_bins(column: NDArray[np.float32], weights: NDArray[np.float64]) -> NDArray[np.float32]:

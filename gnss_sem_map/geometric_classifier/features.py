@@ -70,37 +70,23 @@ def features_of(
     places = np.arange(len(voxels)) if places is None else places
     found = np.empty((len(places), len(NAMES)), np.float32)
     found[:, 0], found[:, 1] = heights[places], intensity[places]
-    z = _fine_z(voxels)
-    at = 2 + len(OF_COLUMN)
-    _columns(voxels.keys, places, found[:, 2:at])
+    z, at = _fine_z(voxels), 2
+    _columns(voxels.keys, places, found, at)
+    at += len(OF_COLUMN)
     for level in LEVELS:
         cells = _Cells.of(voxels.keys, level)
         sums = np.zeros((len(cells.keys), MOMENTS), np.int32)
         _add_moments(voxels.keys, z, intensity, cells.of_voxel, level, sums)
-        wanted = np.zeros(len(cells.keys), np.bool_)
-        wanted[cells.of_voxel[places]] = True
         shapes = np.empty((len(cells.keys), len(OF_SHAPE) - 1), np.float32)
-        _shapes(cells.keys, sums, wanted, level, shapes)
-        _of_shape(
-            voxels.keys,
-            z,
-            intensity,
-            cells.of_voxel,
-            places,
-            level,
-            shapes,
-            found[:, at : at + len(OF_SHAPE)],
-        )
+        _shapes(cells.keys, sums, cells.with_any(places), level, shapes)
+        _of_shape(z, intensity, cells.of_voxel, places, level, shapes, found, at)
         at += len(OF_SHAPE)
     for level in COLUMN_LEVELS:
         cells = _Cells.of(voxels.keys, level, flat=True)
-        lows = np.empty((len(cells.keys), 3), np.int64)
+        lows, area = np.empty((len(cells.keys), 3), np.int64), np.zeros((len(cells.keys), 6), np.float64)
         _lows(voxels.keys, z, cells.of_voxel, lows)
-        wanted = np.zeros(len(cells.keys), np.bool_)
-        wanted[cells.of_voxel[places]] = True
-        area = np.zeros((len(cells.keys), 6), np.float64)
-        _areas(cells.keys, lows, wanted, area)
-        _of_area(z, cells.of_voxel, places, area, found[:, at : at + len(OF_AREA)])
+        _areas(cells.keys, lows, cells.with_any(places), area)
+        _of_area(z, cells.of_voxel, places, area, found, at)
         at += len(OF_AREA)
     return found
 
@@ -133,6 +119,12 @@ class _Cells:
         count = _number(coarse, order, of_voxel, cells)
         return cls(cells[:count].copy(), of_voxel)
 
+    def with_any(self, places: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells hold any of the voxels at these places."""
+        found = np.zeros(len(self.keys), np.bool_)
+        found[self.of_voxel[places]] = True
+        return found
+
 
 @njit(cache=True, nogil=True)
 def _coarsen(keys, level, flat, coarse):
@@ -153,7 +145,7 @@ def _number(coarse, order, of_voxel, cells):
 
 
 @njit(cache=True, nogil=True)
-def _columns(keys, places, found):
+def _columns(keys, places, found, at):
     """What is over and under a voxel in its own column."""
     for p in range(len(places)):
         i = places[p]
@@ -168,13 +160,13 @@ def _columns(keys, places, found):
             up += 1
         while down > first and keys[down - 1] == keys[down] - 1:
             down -= 1
-        found[p, 0] = last - first + 1
-        found[p, 1] = keys[last] - keys[i]
-        found[p, 2] = keys[i] - keys[first]
-        found[p, 3] = keys[up + 1] - keys[up] if up < last else 0
-        found[p, 4] = keys[down] - keys[down - 1] if down > first else 0
-        found[p, 5] = keys[up] - keys[i]
-        found[p, 6] = keys[i] - keys[down]
+        found[p, at] = last - first + 1
+        found[p, at + 1] = keys[last] - keys[i]
+        found[p, at + 2] = keys[i] - keys[first]
+        found[p, at + 3] = keys[up + 1] - keys[up] if up < last else 0
+        found[p, at + 4] = keys[down] - keys[down - 1] if down > first else 0
+        found[p, at + 5] = keys[up] - keys[i]
+        found[p, at + 6] = keys[i] - keys[down]
 
 
 @njit(cache=True, nogil=True)
@@ -291,16 +283,16 @@ def _z_of_axis(a, b, c, d, e, f, value):
 
 
 @njit(cache=True, nogil=True)
-def _of_shape(keys, z, intensity, of_voxel, places, level, shapes, found):
+def _of_shape(z, intensity, of_voxel, places, level, shapes, found, at):
     mask, unit = (HEIGHT_UNITS << level) - 1, 1.0 / HEIGHT_UNITS
     for p in range(len(places)):
         i = places[p]
         shape = shapes[of_voxel[i]]
         for k in range(8):
-            found[p, k] = shape[k]
-        found[p, 8] = (z[i] & mask) * unit - shape[8]
-        found[p, 9], found[p, 10] = shape[9], shape[10]
-        found[p, 11] = intensity[i] - shape[9]
+            found[p, at + k] = shape[k]
+        found[p, at + 8] = (z[i] & mask) * unit - shape[8]
+        found[p, at + 9], found[p, at + 10] = shape[9], shape[10]
+        found[p, at + 11] = intensity[i] - shape[9]
 
 
 @njit(cache=True, nogil=True)
@@ -346,13 +338,13 @@ def _areas(keys, lows, wanted, area):
 
 
 @njit(cache=True, nogil=True)
-def _of_area(z, of_voxel, places, area, found):
+def _of_area(z, of_voxel, places, area, found, at):
     unit = 1.0 / HEIGHT_UNITS
     for p in range(len(places)):
         i = places[p]
         of = area[of_voxel[i]]
-        found[p, 0] = (z[i] - of[0]) * unit
-        found[p, 1] = (z[i] - of[1]) * unit
-        found[p, 2] = of[2]
-        found[p, 3] = (of[3] - z[i]) * unit
-        found[p, 4], found[p, 5] = of[4], of[5]
+        found[p, at] = (z[i] - of[0]) * unit
+        found[p, at + 1] = (z[i] - of[1]) * unit
+        found[p, at + 2] = of[2]
+        found[p, at + 3] = (of[3] - z[i]) * unit
+        found[p, at + 4], found[p, at + 5] = of[4], of[5]

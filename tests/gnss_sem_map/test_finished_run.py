@@ -26,7 +26,7 @@ from gnss_sem_map.files.ownership import MARKER
 from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
-from gnss_sem_map.refinement.steps import RefinementReport, RefinementSettings
+from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings
 from gnss_sem_map.runs import calibrating, merged_run
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.classifier_fitting import fit_classifier
@@ -91,7 +91,7 @@ def test_notebooks_say_the_same_figures_as_the_report(
     words, known = 'for step in runs["evidence"]', {"runs": {"evidence": finished}}
     lines = printed_by("03_refine_and_evaluate.ipynb", words, known, capsys)
     steps = dict(re.findall(r"^(\w+): (\d+) voxels", "\n".join(lines), re.M))
-    assert len(steps) == 13
+    assert len(steps) == len(STEPS)
     for name, changed in steps.items():
         assert rows[name][0] == f"{int(changed):,}"
 

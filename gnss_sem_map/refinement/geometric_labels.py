@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import Field
 
 from gnss_sem_map.refinement.potts_mrf import ITERATIONS, LEAST_PROBABILITY, mean_field
-from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
 from gnss_sem_map.voxels.voxel_map import softmax
@@ -61,11 +60,6 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
     logs = np.where(known[:, None], logs, np.float32(0))
     scores = np.where(seen[:, None], np.float32(settings.weight) * logs, logs)
     scores[seen, :-1] += images[seen]
-    if (classes := road_and_sidewalk(voxels.label_set)) is not None:
-        road, sidewalk = classes
-        # images err alike about other things than shape does; but a kerb they hardly see, and shape does
-        more = np.float32(1 - settings.weight) * (logs[:, sidewalk] - logs[:, road])
-        scores = with_odds(scores, classes, np.where(seen, more, np.float32(0)))
     share = np.clip(voxels.other_share, *OTHER_LIMITS)
     of_other = np.log(share) - np.log1p(-share)
     # where images show nothing but `other`, no class has evidence

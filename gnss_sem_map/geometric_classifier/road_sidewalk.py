@@ -19,7 +19,7 @@ from gnss_sem_map.files.archives import open_archive
 from gnss_sem_map.geometric_classifier import features
 from gnss_sem_map.geometric_classifier.trees import BoostedTrees
 from gnss_sem_map.labels.label_set import LabelSet
-from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
+from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk
 
 FILE = Path(str(resources.files("gnss_sem_map") / "geometric_classifier" / "road_sidewalk.npz"))
 COLUMNS = np.array([i for i, name in enumerate(features.NAMES) if name not in features.OF_INTENSITY])
@@ -36,17 +36,19 @@ class RoadSidewalkModel:
     trees: BoostedTrees
     weight: float
 
-    def applied(
-        self, logs: NDArray[np.float32], rows: NDArray[np.float32], label_set: LabelSet
+    def log_odds(
+        self, rows: NDArray[np.float32], logs: NDArray[np.float32], label_set: LabelSet
     ) -> NDArray[np.float32]:
-        """Log probabilities (v, k) with other odds of road against sidewalk; `rows` (v, f) are the features."""
-        classes = road_and_sidewalk(label_set)
+        """Log odds (v,) of sidewalk against road of voxels with these features (v, f), and log probabilities (v, k).
+
+        Zero where these say neither of the two, and for a class set that lacks one.
+        """
+        said, classes = np.zeros(len(rows), np.float32), road_and_sidewalk(label_set)
         if classes is None or self.weight == 0:
-            return logs
+            return said
         asked = np.flatnonzero(np.logaddexp(*(logs[:, one] for one in classes)) > LEAST_LOG)
-        said = np.zeros(len(logs), np.float32)
         said[asked] = self.trees.scores(rows[asked][:, COLUMNS])[:, 0]
-        return with_odds(logs, classes, np.float32(self.weight) * np.clip(said, *LIMITS_NAT))
+        return np.asarray(np.float32(self.weight) * np.clip(said, *LIMITS_NAT))
 
 
 @cache

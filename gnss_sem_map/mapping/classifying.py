@@ -159,14 +159,14 @@ class DriveClassifier:
             return None
         around = self._raw.around(block, margin_m + features.reach_m(self._raw.fused.voxel_size_m))
         places = places_around(around, block, margin_m)
-        intensity, keys, logs = self._intensity_of(around.keys), around.keys[places], []
+        intensity, keys, said = self._intensity_of(around.keys), around.keys[places], []
         kerbs = RoadSidewalkModel(road_sidewalk.shipped(), self.settings.geometric_classifier.kerb_weight)
         for part in np.split(places, range(VOXELS_AT_ONCE, len(places), VOXELS_AT_ONCE)):
             rows = features_of(around, intensity, part)
-            of_part = model.log_probabilities(rows, around.keys[part], around.observed[part])
-            logs.append(kerbs.applied(of_part, rows, self._label_set))
+            logs = model.log_probabilities(rows, around.keys[part], around.observed[part])
+            said.append(np.column_stack([logs, kerbs.log_odds(rows, logs, self._label_set)]))
         # as whole numbers, whose sums are the same in any order of the drives
-        sums = np.rint(np.concatenate(logs) * np.float32(UNITS_PER_NAT)).astype(np.int32)
+        sums = np.rint(np.concatenate(said) * np.float32(UNITS_PER_NAT)).astype(np.int32)
         return GeometricEvidence(keys, sums, np.ones(len(keys), np.int32))
 
     @cached_property

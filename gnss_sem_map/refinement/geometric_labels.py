@@ -2,7 +2,7 @@
 
 The classifier of `geometric_classifier` is independent of the images of a voxel: it was trained on those of other
 blocks. What both say is a log-opinion pool; where no image looked, the classifier speaks alone, and the voxel is marked
-as inferred. `other`, none of the classes, is one of its answers. A weak Potts model over all voxels follows.
+as inferred. The shape of kerbs counts in full, because images hardly show it. `other`, none of the classes, is one of its answers. A weak Potts model over all voxels follows.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from gnss_sem_map.refinement.potts_mrf import ITERATIONS, LEAST_PROBABILITY, mean_field
+from gnss_sem_map.refinement.road_sidewalk import road_and_sidewalk, with_odds
 from gnss_sem_map.refinement.state import MapState, NotApplicable, StepSettings
 from gnss_sem_map.refinement.systematic_error import doubted
 from gnss_sem_map.voxels.voxel_map import softmax
@@ -52,14 +53,17 @@ def apply(state: MapState, settings: GeometricLabelSettings) -> MapState:
     geometry, voxels, model = state.beside.geometry, state.voxels, state.beside.sensor_model
     if geometry is None:
         raise NotApplicable("there is no geometric classifier")
-    logs = geometry.of(voxels.keys)
-    known, seen = np.isfinite(logs[:, 0]), voxels.observed
+    logs, kerbs = geometry.of(voxels.keys)
+    known, seen = np.isfinite(kerbs), voxels.observed
     temperature = np.float32(1.0 if model is None else model.temperature)
     images = doubted(softmax(state.scores / temperature), state.systematic_error)
     images = np.log(np.maximum(images, np.float32(LEAST_PROBABILITY)))
-    logs = np.where(known[:, None], logs, np.float32(0))
+    logs, kerbs = np.where(known[:, None], logs, np.float32(0)), np.where(known, kerbs, np.float32(0))
     scores = np.where(seen[:, None], np.float32(settings.weight) * logs, logs)
     scores[seen, :-1] += images[seen]
+    if (classes := road_and_sidewalk(voxels.label_set)) is not None:
+        # networks call sidewalks road, hardly ever road sidewalk: a sidewalk that images show stays one
+        scores = with_odds(scores, classes, np.where(seen, np.maximum(kerbs, 0), kerbs))
     share = np.clip(voxels.other_share, *OTHER_LIMITS)
     of_other = np.log(share) - np.log1p(-share)
     # where images show nothing but `other`, no class has evidence

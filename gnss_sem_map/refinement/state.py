@@ -47,7 +47,7 @@ class GeometricEvidence:
     keys: NDArray[np.int64]
     """(v,) sorted."""
     sums: NDArray[np.int32]
-    """(v, c + 1) log probabilities in 2^-10 nat, `other` last."""
+    """(v, c + 2) in 2^-10 nat: log probabilities of the classes and of `other`; log odds of sidewalk by kerbs."""
     drives: NDArray[np.int32]
     """(v,) that say it."""
 
@@ -60,15 +60,18 @@ class GeometricEvidence:
             drives[places] += one.drives
         return GeometricEvidence(keys, sums, drives)
 
-    def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Mean log probabilities (n, c + 1) of voxels by their sorted keys, nat; NaN where no drive says anything."""
+    def of(self, keys: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Means of voxels by their sorted keys, nat; NaN where no drive says anything.
+
+        Log probabilities (n, c + 1), and log odds of sidewalk against road by the shape of kerbs (n,).
+        """
         places = np.empty(len(keys), np.int64)
         find(self.keys, keys, places)
         found = np.full((len(keys), self.sums.shape[1]), np.nan, np.float32)
         known = places >= 0
         of_known = places[known]
         found[known] = self.sums[of_known] / (np.float32(UNITS_PER_NAT) * self.drives[of_known, None])
-        return found
+        return found[:, :-1], found[:, -1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,6 @@ demo's network, which has learnt from seeds 1 to 100 and was chosen and calibrat
 """
 
 import argparse
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from results_file import keep
+from real_data import DATA
+from results_file import RESULTS, keep
 
 from gnss_sem_map import pipeline
 from gnss_sem_map.config import Settings
@@ -226,12 +226,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    here = Path(__file__).resolve().parent
-    default = os.environ.get("GNSS_SEM_MAP_DATA", here.parents[1] / "shared" / "data")
-    parser.add_argument("--data", type=Path, default=Path(default))
+    parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--seeds", type=int, nargs="*", default=[103, 104])
-    parser.add_argument("--out", type=Path, default=here / "results" / "fusion.json")
+    parser.add_argument("--out", type=Path, default=RESULTS / "fusion.json")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

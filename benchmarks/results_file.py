@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 MADE_BY = "made by"
+RESULTS = Path(__file__).resolve().parent / "results"
 
 
 def keep(file: Path, parts: Mapping[str, Any], *packages: str) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from real_data import DATA
 from results_file import keep
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -272,11 +272,10 @@ def summary(rows: Sequence[Figures]) -> Figures:
 
 def real() -> Figures | None:
     """Every other scan of the excerpt as one drive, the rest as another one whose fixes lie 0.88 m away."""
-    data = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    if not (data / EXCERPT).is_dir():
-        print(f"no real data at {data}: excerpt left out")
+    if not (DATA / EXCERPT).is_dir():
+        print(f"no real data at {DATA}: excerpt left out")
         return None
-    log = open_drive(data / EXCERPT)
+    log = open_drive(DATA / EXCERPT)
     assert log.gnss is not None
     moved = GnssFixes(log.gnss.stamps, log.gnss.positions + SHIFT_M, log.gnss.stddevs)
     halves = [replace(log, scans=log.scans[::2]), replace(log, scans=log.scans[1::2], gnss=moved)]

@@ -9,7 +9,6 @@ prints the tables and writes benchmarks/results/sharpness.json. The real excerpt
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
 import xml.etree.ElementTree as ET
@@ -21,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from real_data import DATA
 from results_file import keep
 from scipy.spatial.transform import Rotation
 
@@ -53,15 +53,14 @@ COST_RUNS = 5
 
 def excerpt() -> dict[str, Any] | None:
     """Frames 114 to 153 of the real drive: static points, every trajectory."""
-    data = Path(os.environ.get("GNSS_SEM_MAP_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    if not (data / DRIVE).is_dir():
-        print(f"no real data at {data}: excerpt left out")
+    if not (DATA / DRIVE).is_dir():
+        print(f"no real data at {DATA}: excerpt left out")
         return None
-    log = open_drive(data / DRIVE)
+    log = open_drive(DATA / DRIVE)
     unit, alone, matches, bound, cost = estimate(log)
     assert log.reference is not None
     odometry = chained(matches.relative_poses, log.reference)
-    boxes = moving_boxes(data / DRIVE / "tracklet_labels.xml", log)
+    boxes = moving_boxes(DATA / DRIVE / "tracklet_labels.xml", log)
     trajectories = {"navigation unit": unit, "GNSS + IMU": alone.trajectory, "scan matching alone": odometry}
     trajectories["GNSS + IMU + LiDAR"] = bound.trajectory
     figures = {name: static_sharpness(log, t, boxes) for name, t in trajectories.items()}

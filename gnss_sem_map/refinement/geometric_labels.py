@@ -2,7 +2,8 @@
 
 The classifier of `geometric_classifier` is independent of the images of a voxel: it was trained on those of other
 blocks. What both say is a log-opinion pool; where no image looked, the classifier speaks alone, and the voxel is marked
-as inferred. The shape of kerbs counts in full, because images hardly show it. `other`, none of the classes, is one of its answers. A weak Potts model over all voxels follows.
+as inferred. The shape of kerbs counts in full, because images hardly show it. `other`, none of the classes, is one of
+the answers. A weak Potts model over all voxels follows.
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_switched_off_and_on_again(street_run: Run, tmp_path: Path) -> None:
 
 def test_a_damaged_classifier_is_made_again(street_run: Run, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(street_run.folder, tmp_path / "copy"))
-    damage.flipped(copy / CLASSIFIER)
+    damage.halved(copy / CLASSIFIER)
     out = Run.open(copy).refine(street_run.settings, tmp_path / "out").folder
     assert (out / CLASSIFIER).read_bytes() == (street_run.folder / CLASSIFIER).read_bytes()
     assert refined(out) == refined(street_run.folder)

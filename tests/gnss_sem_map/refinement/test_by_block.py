@@ -39,7 +39,7 @@ def by_shape() -> GeometricEvidence:
     """What two drives say of the shape of some voxels."""
     rng = np.random.default_rng(1)
     keys = VOXELS.keys[rng.random(len(VOXELS)) < 0.9]
-    sums = -rng.integers(1, 3000, (len(keys), len(URBAN.names) + 1), np.int32)
+    sums = 1000 - rng.integers(1, 3000, (len(keys), len(URBAN.names) + 2), np.int32)
     return GeometricEvidence(keys, sums, rng.integers(1, 3, len(keys), np.int32))
 
 

@@ -56,9 +56,9 @@ def test_what_no_camera_saw_is_what_shape_says_and_marked_as_inferred():
     """Of two voxels in three the classifier knows something; `other` is one of its answers."""
     voxels, rng = random_map(4, unseen=0.5), np.random.default_rng(4)
     keys = voxels.keys[rng.random(len(voxels)) < 0.67]
-    said = GeometricEvidence(
-        keys, -rng.integers(1, 9000, (len(keys), 6), np.int32), np.ones(len(keys), np.int32)
-    )
+    of_classes = -rng.integers(1, 9000, (len(keys), 6), np.int32)
+    no_kerbs = np.zeros(len(keys), np.int32)
+    said = GeometricEvidence(keys, np.column_stack([of_classes, no_kerbs]), np.ones(len(keys), np.int32))
     alone = RefinementSettings(geometric_labels={"coupling_nat": 0}, systematic_error={"rate": 0})
     plain, _ = refine(voxels, alone)
     refined, report = refine(voxels, alone, Evidence(geometry=said))
@@ -66,7 +66,7 @@ def test_what_no_camera_saw_is_what_shape_says_and_marked_as_inferred():
     inferred = refined.states == State.INFERRED
     np.testing.assert_array_equal(inferred, known & ~seen)
     np.testing.assert_array_equal(
-        refined.labels[inferred], said.of(voxels.keys[inferred]).argmax(axis=1), "by shape alone"
+        refined.labels[inferred], said.of(voxels.keys[inferred])[0].argmax(axis=1), "by shape alone"
     )
     assert set(refined.labels[inferred].tolist()) == set(range(6))
     assert ((refined.labels[seen] >= 0) & (refined.labels[seen] < 5)).all(), "images show a class"
@@ -83,7 +83,7 @@ def test_images_that_leave_a_class_no_probability_at_all_keep_their_label():
     evidence = np.full((9, 5), -(2**20), np.int32)
     evidence[:, BUILDING] = -1
     voxels = VoxelMap(0.2, URBAN, keys, evidence, np.ones(9, np.uint32))
-    said = GeometricEvidence(keys, np.full((9, 6), -1835, np.int32), np.ones(9, np.int32))
+    said = GeometricEvidence(keys, np.full((9, 7), -1835, np.int32), np.ones(9, np.int32))
     off = {"enabled": False}
     alone = RefinementSettings(
         discount=off, geometric_prior=off, count_grid=off, potts_mrf=off, systematic_error={"rate": 0}

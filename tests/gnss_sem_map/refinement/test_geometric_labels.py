@@ -40,11 +40,12 @@ def images(*said: tuple[int, float] | None, other_share: float = 0.0) -> VoxelMa
     return VoxelMap(0.2, URBAN, keys, evidence, np.ones(len(said), np.uint32), None, of_images)
 
 
-def shape(voxels: VoxelMap, *said: tuple[int, float] | None) -> GeometricEvidence:
-    """What a classifier says of each voxel, as log probabilities."""
+def shape(voxels: VoxelMap, *said: tuple[int, float] | None, kerbs: float = 0.0) -> GeometricEvidence:
+    """What a classifier says of each voxel, as log probabilities, and the log odds of sidewalk by kerbs."""
     known = [k for k, one in enumerate(said) if one is not None]
     scores = np.array([row(*one, 6) for one in said if one is not None], np.float32).reshape(-1, 6)
-    sums = np.rint(UNITS_PER_NAT * np.log(softmax(scores))).astype(np.int32)
+    nat = np.column_stack([np.log(softmax(scores)), np.full(len(scores), kerbs)])
+    sums = np.rint(UNITS_PER_NAT * nat).astype(np.int32)
     return GeometricEvidence(voxels.keys[known], sums, np.ones(len(known), np.int32))
 
 
@@ -87,7 +88,7 @@ def test_without_a_classifier_nothing_is_done() -> None:
 )
 def test_where_a_classifier_says_nothing_nothing_changes(settings: GeometricLabelSettings) -> None:
     voxels = images((ROAD, STRONG), (SIDEWALK, WEAK), None, (VEGETATION, -1.0), None)
-    nothing = GeometricEvidence(np.empty(0, np.int64), np.empty((0, 6), np.int32), np.empty(0, np.int32))
+    nothing = GeometricEvidence(np.empty(0, np.int64), np.empty((0, 7), np.int32), np.empty(0, np.int32))
     before = MapState.of(voxels, Evidence(geometry=nothing))
     after = geometric_labels.apply(before, settings)
     np.testing.assert_array_equal(after.labels, before.labels)
@@ -151,6 +152,17 @@ def test_other_odds_leave_the_sum_of_the_two_and_all_else(
     np.testing.assert_allclose(sums[0], sums[1], atol=1e-4)
 
 
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+def test_kerbs_count_in_full_but_take_no_sidewalk_from_images(weight: float) -> None:
+    voxels = images((ROAD, -2.0), (SIDEWALK, -2.0), None, None)
+    undecided = [(ROAD, 0.0)] * 4
+    for kerbs, expected in ((1.5, [-0.5, 3.5, 1.5, 1.5]), (-1.5, [-2.0, 2.0, -1.5, -1.5])):
+        state = MapState.of(voxels, Evidence(geometry=shape(voxels, *undecided, kerbs=kerbs)))
+        scores = geometric_labels.apply(state, weighing(weight)).scores
+        np.testing.assert_allclose(scores[:, SIDEWALK] - scores[:, ROAD], expected, atol=0.01)
+        np.testing.assert_allclose(scores[:2, VEHICLE] - scores[:2, BUILDING], 0, atol=1e-5)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_other_wins_where_images_show_a_class_only_if_it_may(share: float) -> None:
     voxels = images((ROAD, WEAK), (VEGETATION, STRONG), (VEGETATION, WEAK), other_share=share)
@@ -186,15 +198,17 @@ def test_classifiers_of_several_drives_count_alike_in_any_order() -> None:
     parts = []
     for _ in range(3):
         keys = np.unique(rng.integers(0, 60, 40))
-        sums = rng.integers(-9000, 0, (len(keys), 6)).astype(np.int32)
+        sums = rng.integers(-9000, 0, (len(keys), 7)).astype(np.int32)
         parts.append(GeometricEvidence(keys, sums, np.ones(len(keys), np.int32)))
     one, other = parts[0] + parts[1] + parts[2], parts[2] + (parts[1] + parts[0])
     asked = np.arange(0, 70)
-    np.testing.assert_array_equal(one.of(asked), other.of(asked))
+    for of_one, of_other in zip(one.of(asked), other.of(asked), strict=True):
+        np.testing.assert_array_equal(of_one, of_other)
     for key in asked:
         said = [p.sums[p.keys == key][0] for p in parts if key in p.keys]
-        expected = np.mean(said, axis=0) / UNITS_PER_NAT if said else np.full(6, np.nan)
-        np.testing.assert_allclose(one.of(np.array([key]))[0], expected, rtol=1e-5)
+        expected = np.mean(said, axis=0) / UNITS_PER_NAT if said else np.full(7, np.nan)
+        logs, kerbs = one.of(np.array([key]))
+        np.testing.assert_allclose([*logs[0], *kerbs], expected, rtol=1e-5)
 
 
 def test_a_map_in_memory_gets_geometric_labels_through_all_steps() -> None:

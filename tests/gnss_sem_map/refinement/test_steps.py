@@ -38,7 +38,7 @@ def test_a_step_reads_no_farther_than_its_reach(step: Step) -> None:
     """Without all that is farther from a place than the reach, the place is refined to the same."""
     settings = step.settings(RefinementSettings()).model_copy(update={"enabled": True})
     voxels = street()
-    said = np.random.default_rng(1).integers(-3000, 0, (len(voxels), len(voxels.label_set.names) + 1))
+    said = np.random.default_rng(1).integers(-3000, 0, (len(voxels), len(voxels.label_set.names) + 2))
     geometry = GeometricEvidence(voxels.keys, said.astype(np.int32), np.ones(len(voxels), np.int32))
     beside = Evidence(moved=voxels[:0], keyframes=keyframes(), geometry=geometry)
     before = MapState.of(voxels, beside)

@@ -4,6 +4,8 @@ A raw MEMS unit may turn by several degrees a second at rest. Integrated for a m
 optimiser does not come back from it. So what exceeds any calibrated unit is taken out of the samples before.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
@@ -15,13 +17,12 @@ Array = NDArray[np.float64]
 # A bias below this, rad/s (0.6 deg/s), the graph finds by itself; above the second no gyroscope is of use.
 NOTABLE, LARGEST = 0.01, 0.2
 STEP = 5e-4
-# The course is that of the way from one fix to another, so many s later; over so many s a bias hardly changes.
-CHORD_S, WINDOW_S = 2.0, 100.0
-# Course and gyroscope are of one vehicle when this share of the course agrees; and another bias is better when it
-# makes so many times as much agree.
-AGREEING, BETTER = 0.5, 1.1
-# Less way, m, shows no course.
-LEAST_WAY_M = 100.0
+# The course is that of the way from one fix to another, so many s later, and at least so many rad off the heading;
+# over so many s a bias hardly changes.
+CHORD_S, LEAST_COURSE_STDDEV, WINDOW_S = 2.0, 0.05, 100.0
+# A bias is better than another when its log-likelihood is so much larger, 5 standard deviations; and the gyroscope
+# turns with the vehicle when at least this share of what the courses can tell agrees.
+SURELY, AGREEING = 12.5, 0.5
 # A second of standstill: the IMU scatters no more than so many times as in its quietest tenth, and the fixes stay
 # within so many standard deviations. So many of them are believed.
 QUIET, STAYING, LEAST_STANDING = 2.0, 3.0, 5
@@ -40,44 +41,71 @@ def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
     force = imu.specific_force.mean(axis=0)
     up = force / max(float(np.linalg.norm(force)), TINY)
     rest = _at_rest(imu, fixes)
-    stamps, ways = _ways(fixes)
-    if np.abs(ways).sum() < LEAST_WAY_M:
-        return _if_large(nothing if rest is None else rest)
-    turned = np.interp(stamps, imu.stamps, cumulative_trapezoid(imu.angular_rate @ up, imu.stamps, initial=0))
-    # doubled, a course is the same whether the vehicle goes forward or reverses
-    courses = np.abs(ways) * np.exp(2j * (np.angle(ways) - turned))
+    courses = _Courses.of(imu, fixes, up)
     biases = np.arange(-LARGEST, LARGEST + STEP, STEP)
-    agreements = np.array([_agreement(stamps, courses, bias) for bias in biases])
-    best = agreements.max()
-    if rest is not None and BETTER * _agreement(stamps, courses, float(up @ rest)) > best:
+    fits = np.array([courses.log_likelihood(bias) for bias in biases])
+    best = fits.max()
+    if rest is not None and courses.log_likelihood(float(up @ rest)) > best - SURELY:
         return _if_large(rest)
-    if best < max(AGREEING, BETTER * _agreement(stamps, courses, 0.0)):
+    if best < max(AGREEING * courses.most, courses.log_likelihood(0.0) + SURELY):
         return nothing
     mean = imu.angular_rate.mean(axis=0)
-    return _if_large(biases[agreements.argmax()] * up + mean - (up @ mean) * up)
+    return _if_large(biases[fits.argmax()] * up + mean - (up @ mean) * up)
+
+
+@dataclass(frozen=True, eq=False)
+class _Courses:
+    """How far the course is from what the gyroscope turned, at `stamps` (n,) s, with the weight of each.
+
+    As numbers of the complex plane, with twice the angle: so it is the same forward and in reverse.
+    """
+
+    stamps: Array
+    doubled: NDArray[np.complex128]
+
+    @classmethod
+    def of(cls, imu: ImuSamples, fixes: GnssFixes, up: Array) -> "_Courses":
+        """Of the fixes; `up` (3,) is the vertical in the axes of the imu."""
+        stamps, ways, stddevs = _ways(fixes)
+        turned = np.interp(
+            stamps, imu.stamps, cumulative_trapezoid(imu.angular_rate @ up, imu.stamps, initial=0)
+        )
+        of_course = np.maximum(stddevs / np.maximum(np.abs(ways), TINY), LEAST_COURSE_STDDEV)
+        # concentration of twice the angle (von Mises); one fix is in several ways
+        weights = (
+            1 / (4 * of_course**2) / max(len(ways) * CHORD_S / max(float(np.ptp(fixes.stamps)), TINY), 1.0)
+        )
+        return cls(stamps, weights * np.exp(2j * (np.angle(ways) - turned)))
+
+    @property
+    def most(self) -> float:
+        """The log-likelihood, were all courses as the gyroscope says."""
+        return float(np.abs(self.doubled).sum())
+
+    def log_likelihood(self, bias: float) -> float:
+        """Of a bias about the vertical, rad/s, at the best heading in every window."""
+        if not len(self.stamps):
+            return 0.0
+        window = ((self.stamps - self.stamps[0]) / WINDOW_S).astype(int)
+        turned = self.doubled * np.exp(2j * bias * self.stamps)
+        return float(np.hypot(np.bincount(window, turned.real), np.bincount(window, turned.imag)).sum())
 
 
 def _if_large(bias: Array) -> Array:
     return bias if NOTABLE < np.abs(bias).max() < LARGEST else np.zeros(3)
 
 
-def _agreement(stamps: Array, courses: NDArray[np.complex128], bias: float) -> float:
-    """Share of the way whose course the gyroscope follows, were this its bias about the vertical, rad/s."""
-    window = ((stamps - stamps[0]) / WINDOW_S).astype(int)
-    turned = courses * np.exp(2j * bias * stamps)
-    sums = np.bincount(window, turned.real) + 1j * np.bincount(window, turned.imag)
-    return float(np.abs(sums).sum() / np.abs(courses).sum())
-
-
-def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128]]:
-    """From fix to fix: the middle of the time (n,) s, and the way as a complex number, m."""
+def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
+    """From fix to fix: the middle of the time (n,) s, the way as a complex number, m, and its standard deviation, m."""
     first = np.arange(len(fixes))
     last = np.searchsorted(fixes.stamps, fixes.stamps + CHORD_S)
     first, last = first[last < len(fixes)], last[last < len(fixes)]
     near = fixes.stamps[last] - fixes.stamps[first] < 2 * CHORD_S
     first, last = first[near], last[near]
     way = fixes.positions[last] - fixes.positions[first]
-    return (fixes.stamps[first] + fixes.stamps[last]) / 2, way[:, 0] + 1j * way[:, 1]
+    variances = (fixes.stddevs[:, :2] ** 2).mean(axis=1)
+    stddevs = np.sqrt(variances[first] + variances[last])
+    return (fixes.stamps[first] + fixes.stamps[last]) / 2, way[:, 0] + 1j * way[:, 1], stddevs
 
 
 def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
@@ -95,10 +123,8 @@ def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
         scatter = np.sqrt(means_of((samples - means[second]) ** 2).sum(axis=1))
         quiet &= scatter <= QUIET * np.quantile(scatter[quiet], 0.1)
     stamps = np.arange(len(count)) + imu.stamps[0] + 0.5
-    middles, ways = _ways(fixes)
+    middles, ways, stddevs = _ways(fixes)
     if not len(ways):
         return None
-    limit = STAYING * np.sqrt(2) * np.hypot(*np.median(fixes.stddevs[:, :2], axis=0))
-    stays = np.interp(stamps, middles, np.abs(ways), left=np.inf, right=np.inf) < limit
-    still = quiet & stays
+    still = quiet & (np.interp(stamps, middles, np.abs(ways) / stddevs, left=np.inf, right=np.inf) < STAYING)
     return np.median(rates[still], axis=0) if still.sum() >= LEAST_STANDING else None

@@ -74,10 +74,14 @@ def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_sta
 def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev_m: float) -> GnssFixes:
     """The same fixes with stddevs such that all within one correlation time, (m,) or one for all, weigh as one.
 
-    An inertial unit that reports its filtered position ten times a second says the same thing ten times.
+    An inertial unit that reports its filtered position ten times a second says the same thing ten times. Two fixes are
+    correlated by what is left of the correlation time between them (Bartlett's triangle), so n evenly spaced fixes in
+    such a time weigh as one exactly, and jitter of their stamps changes little.
     """
-    half = np.asarray(correlation_times_s) / 2
-    first = np.searchsorted(fixes.stamps, fixes.stamps - half + 1e-9)
-    last = np.searchsorted(fixes.stamps, fixes.stamps + half - 1e-9)
-    crowd = np.maximum(last - first, 1)[:, None]
+    t = fixes.stamps - fixes.stamps[:1].sum()
+    time = np.broadcast_to(np.maximum(correlation_times_s, 1e-9), t.shape)
+    first, last = np.searchsorted(t, t - time), np.searchsorted(t, t + time)
+    here, sums = np.arange(len(t)) + 1, np.append(0.0, np.cumsum(t))
+    apart = (here - first) * t - (sums[here] - sums[first]) + (sums[last] - sums[here]) - (last - here) * t
+    crowd = np.maximum(last - first - apart / time, 1.0)[:, None]
     return GnssFixes(fixes.stamps, fixes.positions, np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))

@@ -26,6 +26,8 @@ SURELY, AGREEING = 12.5, 0.5
 # A second of standstill: the IMU scatters no more than so many times as in its quietest tenth, and the fixes stay
 # within so many standard deviations. So many of them are believed.
 QUIET, STAYING, LEAST_STANDING = 2.0, 3.0, 5
+# A mean specific force beyond these, m/s², is no gravity, and does not tell what is up.
+LEAST_FORCE, MOST_FORCE = 5.0, 20.0
 TINY = 1e-12
 
 
@@ -36,10 +38,10 @@ def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
     follows the course best, and none in the mean about the horizontal axes: a vehicle keeps its wheels on the ground.
     """
     nothing, fixes = np.zeros(3), fixes[(fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1])]
-    if len(fixes) < 3:
-        return nothing
     force = imu.specific_force.mean(axis=0)
     up = force / max(float(np.linalg.norm(force)), TINY)
+    if len(fixes) < 3 or not LEAST_FORCE < np.linalg.norm(force) < MOST_FORCE:
+        return nothing
     rest = _at_rest(imu, fixes)
     courses = _Courses.of(imu, fixes, up)
     biases = np.arange(-LARGEST, LARGEST + STEP, STEP)

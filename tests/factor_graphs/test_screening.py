@@ -1,9 +1,17 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
+from factor_graphs.screening import (
+    are_drifting,
+    correlation_times,
+    decorrelate,
+    inside,
+    plausible,
+    white_share,
+)
 from factor_graphs.settings import SmootherSettings
 
 
@@ -69,6 +77,22 @@ def test_fixes_drift_together_only_where_an_inertial_unit_reports_them_and_relat
     np.testing.assert_array_equal(correlation_times(unit, settings, np.empty((0, 2))), 1.0)
     receiver = fixes_along(5 * np.arange(20.0))
     np.testing.assert_array_equal(correlation_times(receiver, settings, pairs), 1.0)
+
+
+@pytest.mark.parametrize("hertz", [2.0, 4.0, 10.0])
+def test_a_fast_receiver_is_no_inertial_unit(simulate, hertz: float) -> None:
+    drive = simulate(5, 100.0)
+    stamps = np.arange(0.5, 99.0, 1 / hertz)
+    way, rng = drive.motion.poses(stamps)[:, :3, 3], np.random.default_rng(0)
+    stddevs = np.full((len(stamps), 3), 1.0)
+    receiver = GnssFixes(stamps, way + rng.standard_normal(way.shape), stddevs)
+    assert 0.85 < white_share(receiver) <= 1
+    assert not are_drifting(receiver)
+    np.testing.assert_allclose(decorrelate(receiver, 1.0, 0.02).stddevs, 1.0, atol=0.4)
+    drift = np.cumsum(0.02 * rng.standard_normal(way.shape), axis=0)
+    unit = GnssFixes(stamps, way + drift, stddevs)
+    assert white_share(unit) < 0.15
+    assert are_drifting(unit) == (hertz > 2)
 
 
 def test_fixes_of_different_correlation_times_lose_weight_each_by_its_own():

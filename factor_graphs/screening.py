@@ -13,8 +13,8 @@ Mask = NDArray[np.bool_]
 ALLOWANCE_M = 50.0
 # So many runs of fixes between impossible jumps are tried as the true one.
 BELIEVED_RUNS = 20
-# Who reports positions more often than this, s, with less white noise than this share of what is claimed, reports what a
-# filter makes of them.
+# Who reports positions more often than this, s, with less white noise than this share of what is claimed, reports what
+# a filter makes of them.
 DRIFTING_BELOW_S, FILTERED = 0.5, 0.5
 # Fourth differences of white noise have 70 times its variance; those of a vehicle's way, ten times a second, are of
 # millimetres. Steps are even when they differ by no more than this share.

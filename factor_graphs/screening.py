@@ -13,8 +13,13 @@ Mask = NDArray[np.bool_]
 ALLOWANCE_M = 50.0
 # So many runs of fixes between impossible jumps are tried as the true one.
 BELIEVED_RUNS = 20
-# Who reports positions more often than this, s, reports what a filter makes of them.
-DRIFTING_BELOW_S = 0.5
+# Who reports positions more often than this, s, with less white noise than this share of what is claimed, reports what
+# a filter makes of them.
+DRIFTING_BELOW_S, FILTERED = 0.5, 0.5
+# Fourth differences of white noise have 70 times its variance; those of a vehicle's way, ten times a second, are of
+# millimetres. Steps are even when they differ by no more than this share.
+FOURTH, EVEN = 70.0, 0.1
+MEDIAN_OF_ABS = 0.6745
 
 
 def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
@@ -52,7 +57,23 @@ def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max
 
 def are_drifting(fixes: GnssFixes) -> bool:
     """Whether they are an inertial unit's positions, whose errors last for a minute, not a receiver's."""
-    return len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
+    often = len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
+    return often and white_share(fixes) < FILTERED
+
+
+def white_share(fixes: GnssFixes) -> float:
+    """Standard deviation of white noise in the fixes, as a share of what they claim, at most 1; 0 where it is not seen.
+
+    From fourth differences, which no vehicle has: so for fixes at least twice a second.
+    """
+    steps = np.diff(fixes.stamps)
+    if len(steps) < 4:
+        return 0.0
+    windows = np.lib.stride_tricks.sliding_window_view(steps, 4)
+    even = np.ptp(windows, axis=1) < EVEN * windows.mean(axis=1)
+    off = (np.diff(fixes.positions[:, :2], 4, axis=0) / fixes.stddevs[2:-2, :2])[even]
+    scatter = np.median(np.abs(off)) / MEDIAN_OF_ABS if len(off) else 0.0
+    return min(float(scatter) / FOURTH**0.5, 1.0)
 
 
 def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_stamps: Array) -> Array:
@@ -74,10 +95,16 @@ def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_sta
 def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev_m: float) -> GnssFixes:
     """The same fixes with stddevs such that all within one correlation time, (m,) or one for all, weigh as one.
 
-    An inertial unit that reports its filtered position ten times a second says the same thing ten times.
+    An inertial unit that reports its filtered position ten times a second says the same thing ten times. Two fixes are
+    correlated by what is left of the correlation time between them (Bartlett's triangle), so n evenly spaced fixes in
+    such a time weigh as one exactly, and jitter of their stamps changes little. What is seen to be white noise is not
+    correlated.
     """
-    half = np.asarray(correlation_times_s) / 2
-    first = np.searchsorted(fixes.stamps, fixes.stamps - half + 1e-9)
-    last = np.searchsorted(fixes.stamps, fixes.stamps + half - 1e-9)
-    crowd = np.maximum(last - first, 1)[:, None]
+    t = fixes.stamps - fixes.stamps[:1].sum()
+    time = np.broadcast_to(np.maximum(correlation_times_s, 1e-9), t.shape)
+    first, last = np.searchsorted(t, t - time), np.searchsorted(t, t + time)
+    here, sums = np.arange(len(t)) + 1, np.append(0.0, np.cumsum(t))
+    apart = (here - first) * t - (sums[here] - sums[first]) + (sums[last] - sums[here]) - (last - here) * t
+    white = white_share(fixes) ** 2
+    crowd = white + (1 - white) * np.maximum(last - first - apart / time, 1.0)[:, None]
     return GnssFixes(fixes.stamps, fixes.positions, np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))

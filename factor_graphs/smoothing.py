@@ -21,6 +21,7 @@ from factor_graphs.fitting import (
 )
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.graph import from_values
+from factor_graphs.gyroscope_bias import large_gyroscope_bias
 from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
 from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
@@ -123,6 +124,9 @@ def smooth(
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
 
     relative, samples = relative_poses or NO_RELATIVE_POSES, measured(imu)
+    bias = large_gyroscope_bias(samples, fixes)
+    if bias.any():
+        samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
@@ -142,6 +146,10 @@ def smooth(
         by_fixes = fit_noise_by_components(problem, by_fixes)
     shared_stddevs = np.sqrt(of_shared.diagonal())
     found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
+    if bias.any():
+        said = ", ".join(f"{value:.2f}" for value in np.degrees(bias))
+        told = f"the gyroscope turns by ({said}) deg/s at rest: taken out"
+        found = replace(found, biases=found.biases + np.append(np.zeros(3), bias), notes=(told, *found.notes))
     if filled := len(imu) - len(samples):
         told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
         found = replace(found, notes=(told, *found.notes))

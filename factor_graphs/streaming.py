@@ -62,7 +62,8 @@ class StreamingSmoother:
         end, velocities = start.keyframes, start.keyframes.velocities
         assert velocities is not None
         self.state = StreamedState(end.end, end.T_map_imu[-1], velocities[-1], start.biases[-1])
-        self._stddevs = np.sqrt(np.diag(start.state_covariances[-1]))
+        of_state = start.state_covariances[-1]
+        self._covariances = [of_state[rows, rows] for rows in (slice(0, 6), slice(6, 9), slice(9, 15))]
         self._begin()
 
     def add(
@@ -92,7 +93,7 @@ class StreamingSmoother:
         try:
             self._extend(intervals, fix, relative_poses)
         except RuntimeError:
-            # iSAM2 lost its footing: keep the last state, forget how it came about
+            # iSAM2 lost its footing: keep the last state and how sure it was, forget how it came about
             self.restarts += 1
             self._begin()
             self._extend(intervals, fix, relative_poses)
@@ -108,16 +109,16 @@ class StreamingSmoother:
         params.relinearizeSkip = RELINEARIZE_SKIP
         params.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
         self._smoother = gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
-        i, stddevs, state = self._keyframe, self._stddevs, self.state
-        diagonal = gtsam.noiseModel.Diagonal.Sigmas
+        i, state = self._keyframe, self.state
+        of_pose, of_velocity, of_bias = map(gtsam.noiseModel.Gaussian.Covariance, self._covariances)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         pose, bias = (
             gtsam.Pose3(state.T_map_imu),
             gtsam.imuBias.ConstantBias(state.biases[:3], state.biases[3:]),
         )
-        graph.push_back(gtsam.PriorFactorPose3(X(i), pose, diagonal(stddevs[:6])))
-        graph.push_back(gtsam.PriorFactorVector(V(i), state.velocity, diagonal(stddevs[6:9])))
-        graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, diagonal(stddevs[9:])))
+        graph.push_back(gtsam.PriorFactorPose3(X(i), pose, of_pose))
+        graph.push_back(gtsam.PriorFactorVector(V(i), state.velocity, of_velocity))
+        graph.push_back(gtsam.PriorFactorConstantBias(B(i), bias, of_bias))
         values.insert(X(i), pose3=pose)
         values.insert(V(i), state.velocity)
         values.insert(B(i), constant_bias=bias)
@@ -158,6 +159,7 @@ class StreamingSmoother:
         oldest = float(fix.stamps[0]) - self._lag_s
         self._keyframe_stamps = {i: stamp for i, stamp in known.items() if stamp > oldest}
         self._keyframe, self.state = last, self._newest(last, float(fix.stamps[0]))
+        self._covariances = [self._smoother.marginalCovariance(key) for key in (X(last), V(last), B(last))]
 
     def _newest(self, i: int, stamp: float) -> StreamedState:
         smoother = self._smoother

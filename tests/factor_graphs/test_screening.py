@@ -1,9 +1,17 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
+from factor_graphs.screening import (
+    are_drifting,
+    correlation_times,
+    decorrelate,
+    inside,
+    plausible,
+    white_share,
+)
 from factor_graphs.settings import SmootherSettings
 
 
@@ -41,7 +49,21 @@ def test_ten_fixes_a_second_weigh_as_one_and_one_a_second_keeps_its_weight():
     np.testing.assert_array_equal(slow.stddevs, 1.0)
     fast = decorrelate(fixes_along(np.arange(500.0), np.arange(500) * 0.1), 1.0, 0.02)
     weight_per_second = np.sum(1 / fast.stddevs[100:400, 0] ** 2) / 30
-    assert np.isclose(weight_per_second, 1.0, rtol=0.15)
+    assert np.isclose(weight_per_second, 1.0, rtol=1e-6)
+
+
+@given(st.integers(1, 40), st.floats(0.05, 5.0), st.floats(0, 1e-3))
+def test_so_many_fixes_as_a_correlation_time_holds_weigh_as_one(n: int, step_s: float, jitter: float) -> None:
+    stamps = step_s * np.arange(200) * (1 + jitter)
+    weighed = decorrelate(fixes_along(stamps, stamps), n * step_s, 0.02)
+    np.testing.assert_allclose(weighed.stddevs[50:-50] ** 2, max(n / (1 + jitter), 1.0), rtol=2e-3 + n * 1e-6)
+
+
+def test_stamps_that_shake_by_a_millisecond_change_no_weight() -> None:
+    stamps = np.arange(100.0) + 1e-3 * np.random.default_rng(0).uniform(-1, 1, 100)
+    for time_s in (1.0, 2.0, 4.0):
+        weighed = decorrelate(fixes_along(stamps, stamps), time_s, 0.02)
+        np.testing.assert_allclose(weighed.stddevs[10:-10] ** 2, time_s, rtol=5e-3)
 
 
 def test_fixes_drift_together_only_where_an_inertial_unit_reports_them_and_relative_poses_hold_the_shape():
@@ -55,6 +77,22 @@ def test_fixes_drift_together_only_where_an_inertial_unit_reports_them_and_relat
     np.testing.assert_array_equal(correlation_times(unit, settings, np.empty((0, 2))), 1.0)
     receiver = fixes_along(5 * np.arange(20.0))
     np.testing.assert_array_equal(correlation_times(receiver, settings, pairs), 1.0)
+
+
+@pytest.mark.parametrize("hertz", [2.0, 4.0, 10.0])
+def test_a_fast_receiver_is_no_inertial_unit(simulate, hertz: float) -> None:
+    drive = simulate(5, 100.0)
+    stamps = np.arange(0.5, 99.0, 1 / hertz)
+    way, rng = drive.motion.poses(stamps)[:, :3, 3], np.random.default_rng(0)
+    stddevs = np.full((len(stamps), 3), 1.0)
+    receiver = GnssFixes(stamps, way + rng.standard_normal(way.shape), stddevs)
+    assert 0.85 < white_share(receiver) <= 1
+    assert not are_drifting(receiver)
+    np.testing.assert_allclose(decorrelate(receiver, 1.0, 0.02).stddevs, 1.0, atol=0.4)
+    drift = np.cumsum(0.02 * rng.standard_normal(way.shape), axis=0)
+    unit = GnssFixes(stamps, way + drift, stddevs)
+    assert white_share(unit) < 0.15
+    assert are_drifting(unit) == (hertz > 2)
 
 
 def test_fixes_of_different_correlation_times_lose_weight_each_by_its_own():

@@ -305,3 +305,14 @@ def test_the_smoother_changes_none_of_its_input(mems):
         before, (mems.imu.stamps, mems.imu.specific_force, mems.fixes.positions), strict=True
     ):
         np.testing.assert_array_equal(kept, now)
+
+
+@pytest.mark.slow
+def test_white_fixes_ten_times_a_second_are_ten_times_as_many(simulate):
+    drive = simulate(6, 240.0, ImuNoise())
+    stamps = np.arange(0.4, 239.5, 0.1)
+    fixes = simulate_gnss(drive.motion, stamps, (1.0, 1.0, 2.0), LEVER, np.random.default_rng(6))
+    once, often = (smooth(drive.imu, of, FRAME, None, LEVER) for of in (drive.fixes, fixes))
+    assert error_of(often, drive).horizontal_rms_m < min(0.15, 0.8 * error_of(once, drive).horizontal_rms_m)
+    stddevs = np.sqrt(np.einsum("kii->k", often.keyframes.covariances[:, 3:, 3:]))
+    assert np.median(stddevs) < 0.25

@@ -19,7 +19,7 @@ from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
 Array = NDArray[np.float64]
 
-# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s², height m.
+# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s², height m
 MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01, 2.0])
 # What of the mounting is found by motion sideways, and what then by motion upwards.
 SIDEWAYS, UPWARDS = [0, 2, 3, 4], [1]

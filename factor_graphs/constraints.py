@@ -40,7 +40,7 @@ def non_holonomic_factors(
     for i in range(k):
         row = gtsam.JacobianFactor(X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit)
         yield gtsam.LinearContainerFactor(row, values)
-    yield gtsam.PriorFactorVector(M(k), np.zeros(4), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
+    yield gtsam.PriorFactorVector(M(k), np.zeros(5), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
 
 
 def zero_velocity_factors(

@@ -45,7 +45,7 @@ class Visitor(Protocol):
 class SumVariance:
     """Variance of sums of G x over the keyframes of a window, and of G s of what all keyframes share.
 
-    `rows` (k, m, 15) are G of every keyframe and `windows` (k,) its window, -1 for none; `of_shared` (w, m, 4) are G of
+    `rows` (k, m, 15) are G of every keyframe and `windows` (k,) its window, -1 for none; `of_shared` (w, m, 5) are G of
     the mounting. `found` (w, m) is known once `keyframe_covariances` has gone through all keyframes.
     """
 

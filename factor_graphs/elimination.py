@@ -25,7 +25,7 @@ SIZE = 15
 INDEX_BITS = 56
 # Where pose, velocity and bias stand in the 15 numbers of a keyframe, mounting and wheels in those that all share.
 OF_KEYFRAME = {ord("x"): range(6), ord("v"): range(6, 9), ord("b"): range(9, 15)}
-PLACES = OF_KEYFRAME | {ord("m"): range(4), ord("w"): range(4, 8)}
+PLACES = OF_KEYFRAME | {ord("m"): range(5), ord("w"): range(5, 9)}
 
 
 @dataclass(frozen=True, eq=False)

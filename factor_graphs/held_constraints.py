@@ -40,7 +40,7 @@ ROUNDS, SETTLED_MPS, SETTLED_SLIP = 4, 0.3, 0.2
 class _Held:
     """What a solution shows of the vehicle, to be held in the next one; None for what is not held.
 
-    `mounting` (4,) is that of the axle. `slips`: once it is held, the slip that the axle was held with first, and the
+    `mounting` (5,) is that of the axle. `slips`: once it is held, the slip that the axle was held with first, and the
     one that is found by its residuals. `settled`: the next solution would hardly move.
     """
 
@@ -160,7 +160,7 @@ def constrain(
 def _observed(
     problem: Problem, fit: Fit, motion: BodyMotion, speeds: WheelSpeeds | None
 ) -> tuple[Vehicle | None, Wheels | None, Array]:
-    """Vehicle and wheels as the solution shows them, None where they are not wanted, and the mounting (4,) of the IMU.
+    """Vehicle and wheels as the solution shows them, None where they are not wanted, and the mounting (5,) of the IMU.
 
     The axle adds nothing that LiDAR odometry does not know better: on a drive of 480 s it changes no digit of the
     error, and takes 70 % more time. So `auto` does not want it there.
@@ -169,14 +169,14 @@ def _observed(
     with_axle = wanted == "on" or (wanted == "auto" and not problem.is_bound)
     with_wheels = speeds is not None and problem.settings.wheel_speed != "off"
     if not with_axle and not with_wheels:
-        return None, None, np.zeros(4)
+        return None, None, np.zeros(5)
     shown = observe(problem, fit, motion)
     if not shown.doubt and (heading := _heading_if_gentle(problem, fit)) > MOST_OF_HEADING:
         doubt = (
             f"its heading is known to {np.degrees(heading):.0f}° only: it hardly turns or changes its speed"
         )
         shown = replace(shown, doubt=doubt)
-    mounting = np.zeros(4) if shown.doubt and wanted != "on" else shown.mounting
+    mounting = np.zeros(5) if shown.doubt and wanted != "on" else shown.mounting
     vehicle = shown if with_axle else None
     if speeds is None or not with_wheels:
         return vehicle, None, mounting

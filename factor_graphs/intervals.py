@@ -28,7 +28,7 @@ MOST_STEPS = 10_000_000
 # The steps are made in blocks of so many, few enough for the cache: in one piece, two hours took half as long again,
 # and three times the memory.
 BLOCK = 10_000
-# Yaw rate is the mean over so long, s: a single sample is noise.
+# Rates are means over so long, s: a single sample is noise.
 RATE_WINDOW_S = 0.1
 
 
@@ -54,13 +54,17 @@ class ImuIntervals:
         return np.diff(self.nodes)
 
     @cached_property
-    def yaw_rate(self) -> Array:
-        """What the gyroscope says about the imu's z axis around every keyframe, (k,) rad/s."""
-        turned = np.concatenate([[0.0], np.cumsum(self.angular_rate[:, 2] * self.durations)])
+    def rates(self) -> Array:
+        """What the gyroscope says around every keyframe, (k, 3) rad/s."""
+        turned = np.zeros((len(self.nodes), 3))
+        np.cumsum(self.angular_rate * self.durations[:, None], axis=0, out=turned[1:])
         first = np.maximum(self.keyframes - RATE_WINDOW_S / 2, self.nodes[0])
         last = np.minimum(self.keyframes + RATE_WINDOW_S / 2, self.nodes[-1])
-        by_first, by_last = (np.interp(stamps, self.nodes, turned) for stamps in (first, last))
-        return np.asarray((by_last - by_first) / (last - first))
+        by_first, by_last = (
+            np.column_stack([np.interp(stamps, self.nodes, about) for about in turned.T])
+            for stamps in (first, last)
+        )
+        return np.asarray((by_last - by_first) / (last - first)[:, None])
 
     def part(self, first: int, last: int) -> "ImuIntervals":
         """From one keyframe to another."""

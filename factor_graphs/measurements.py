@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.filled_gaps import filled_in
+from factor_graphs.imu_noise import ImuNoise as ImuNoise
 
 Array = NDArray[np.float64]
 
@@ -95,31 +95,6 @@ class WheelSpeeds:
 
     def __len__(self) -> int:
         return len(self.stamps)
-
-
-class ImuNoise(BaseModel):
-    """How good an IMU is, in continuous time; the defaults are a good consumer MEMS unit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    accelerometer_noise_density: float = Field(2e-3, gt=0, description="White noise, m/s²/√Hz.")
-    gyroscope_noise_density: float = Field(1.7e-4, gt=0, description="White noise, rad/s/√Hz.")
-    accelerometer_bias_walk: float = Field(2e-4, gt=0, description="Random walk of the bias, m/s³/√Hz.")
-    gyroscope_bias_walk: float = Field(5e-6, gt=0, description="Random walk of the bias, rad/s²/√Hz.")
-    accelerometer_bias_stddev: float = Field(0.1, gt=0, description="Unknown bias at the start, m/s².")
-    gyroscope_bias_stddev: float = Field(5e-3, gt=0, description="Unknown bias at the start, rad/s.")
-
-    def scaled(self, factor: float, of_walk: float | None = None) -> "ImuNoise":
-        """The same unit with `factor` times the white noise, and `of_walk` times the bias walk, if not as much."""
-        of_walk = factor if of_walk is None else of_walk
-        return self.model_copy(
-            update={
-                "accelerometer_noise_density": self.accelerometer_noise_density * factor,
-                "gyroscope_noise_density": self.gyroscope_noise_density * factor,
-                "accelerometer_bias_walk": self.accelerometer_bias_walk * of_walk,
-                "gyroscope_bias_walk": self.gyroscope_bias_walk * of_walk,
-            }
-        )
 
 
 @dataclass(frozen=True, eq=False)

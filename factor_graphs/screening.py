@@ -73,7 +73,7 @@ def white_share(fixes: GnssFixes) -> float:
     even = np.ptp(windows, axis=1) < EVEN * windows.mean(axis=1)
     off = (np.diff(fixes.positions[:, :2], 4, axis=0) / fixes.stddevs[2:-2, :2])[even]
     scatter = np.median(np.abs(off)) / MEDIAN_OF_ABS if len(off) else 0.0
-    return min(float(scatter) / FOURTH**0.5, 1.0)
+    return float(min(scatter / FOURTH**0.5, 1.0))
 
 
 def correlation_times(fixes: GnssFixes, settings: SmootherSettings, relative_stamps: Array) -> Array:

@@ -79,7 +79,9 @@ def slip_sums(problem: Problem, fit: Fit, vehicle: Vehicle) -> SlipSums | None:
     by_state, by_mounting = motion.by_state(vehicle.mounting)[where], -motion.by_mounting()[where]
     rows = np.zeros((len(motion.spacing), BLOCKS * AXES, SIZE))
     rows[where, :, :9] = (share[:, :, :, None] * by_state[:, None]).reshape(len(where), -1, 9)
-    of_all = summed((share[:, :, :, None] * by_mounting[:, None]).reshape(len(where), -1, 4))
+    of_all = summed(
+        (share[:, :, :, None] * by_mounting[:, None]).reshape(len(where), -1, by_mounting.shape[2])
+    )
     windows = np.full(len(rows), -1)
     windows[where] = window
     return SlipSums(seen, of_slip, SumVariance(rows, windows, of_all))

@@ -171,7 +171,7 @@ def _solution(
 ) -> Solution:
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
     if vehicle is not None and vehicle.held:
-        vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:4])
+        vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:5])
     if wheels is not None and wheels.held:
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()

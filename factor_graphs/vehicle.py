@@ -1,8 +1,9 @@
 """Is it a wheeled vehicle? How the IMU sits on it, and how much its axle slides, as a solution shows them.
 
 A point on the axle moves along the vehicle and nowhere else (non-holonomic constraint). In the imu's axes
-v_y = a v_x + l w_z + c |v_x| v_x w_z and v_z = b v_x, up to slip: a and b are the slopes of the direction of travel,
-l is how far the IMU sits ahead of the axle, and c the angle at which tyres roll under lateral acceleration v_x w_z.
+v_y = a v_x + l w_z - h w_x + c |v_x| v_x w_z and v_z = b v_x - l w_y, up to slip: a and b are the slopes of the
+direction of travel, l and h how far the IMU sits ahead of the axle and above it (on a roof, the body's roll swings it),
+and c the angle at which tyres roll under lateral acceleration v_x w_z.
 Going backwards changes the sign of v_x and nothing else.
 """
 
@@ -18,10 +19,10 @@ from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
 Array = NDArray[np.float64]
 
-# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s².
-MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01])
-# What of the mounting moves the imu sideways, and what upwards.
-SIDEWAYS, UPWARDS = [0, 2, 3], [1]
+# Before anything is seen: slopes (about rad) of the direction of travel, distance to the axle m, rad per m/s², height m
+MOUNTING_STDDEVS = np.array([0.2, 0.2, 3.0, 0.01, 2.0])
+# What of the mounting is found by motion sideways, and what then by motion upwards.
+SIDEWAYS, UPWARDS = [0, 2, 3, 4], [1]
 # Slower than this, m/s, the direction of travel is not seen; seen for less long, s, or less far, m, it is not known.
 MOVING_SPEED, LEAST_TIME_S, LEAST_WAY_M = 2.0, 30.0, 200.0
 # What slides more than this share of its speed, or looks farther off its course, is no vehicle with an IMU on it.
@@ -36,29 +37,35 @@ SKID = 3.0
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """Motion at keyframes, in the imu's axes: `velocity` (k, 3) m/s, `yaw_rate` (k,) rad/s.
+    """Motion at keyframes, in the imu's axes: `velocity` (k, 3) m/s, `rates` (k, 3) rad/s.
 
     `R_imu_map` (k, 3, 3) turns to these axes; `spacing` (k,) s is the time that each keyframe stands for.
     """
 
     R_imu_map: Array
     velocity: Array
-    yaw_rate: Array
+    rates: Array
     spacing: Array
 
+    @property
+    def yaw_rate(self) -> Array:
+        """About the imu's z axis, (k,) rad/s."""
+        return np.asarray(self.rates[:, 2])
+
     def __getitem__(self, rows: NDArray[np.bool_]) -> "BodyMotion":
-        return BodyMotion(self.R_imu_map[rows], self.velocity[rows], self.yaw_rate[rows], self.spacing[rows])
+        return BodyMotion(self.R_imu_map[rows], self.velocity[rows], self.rates[rows], self.spacing[rows])
 
     def sliding(self, mounting: Array) -> Array:
-        """Lateral and vertical velocity that the mounting (4,) does not explain, (k, 2) m/s."""
+        """Lateral and vertical velocity that the mounting (5,) does not explain, (k, 2) m/s."""
         left: Array = self.velocity[:, 1:] - self.by_mounting() @ mounting
         return left
 
     def by_mounting(self) -> Array:
-        """Lateral and vertical velocity of an imu whose axle does not slide, by its mounting, (k, 2, 4)."""
-        ahead, rows = self.velocity[:, 0], np.zeros((len(self.velocity), 2, 4))
+        """Lateral and vertical velocity of an imu whose axle does not slide, by its mounting, (k, 2, 5)."""
+        ahead, rows = self.velocity[:, 0], np.zeros((len(self.velocity), 2, 5))
         rows[:, 0, 0] = rows[:, 1, 1] = ahead
         rows[:, 0, 2], rows[:, 0, 3] = self.yaw_rate, np.abs(ahead) * ahead * self.yaw_rate
+        rows[:, 0, 4], rows[:, 1, 2] = -self.rates[:, 0], -self.rates[:, 1]
         return rows
 
     def by_velocity(self, mounting: Array) -> Array:
@@ -88,10 +95,10 @@ class BodyMotion:
 class Vehicle:
     """How the IMU sits on the vehicle, and how much the axle slides.
 
-    `mounting` (4,): slopes of the direction of travel in the imu's axes, to the left and upwards; how far the IMU is
-    ahead of the axle, m; angle of the tyres, rad per m/s². `mounting_stddevs` (4,) once it was part of a graph.
-    `slip`: lateral and vertical; `skids` (k, 2) m/s: what does not fit it, zero where all fits. `doubt`: why it is no
-    such vehicle, or nothing. `held`: the constraint is on.
+    `mounting` (5,): slopes of the direction of travel in the imu's axes, to the left and upwards; how far the IMU is
+    ahead of the axle, m; angle of the tyres, rad per m/s²; how far it is above the axle, m. `mounting_stddevs` (5,)
+    once it was part of a graph. `slip`: lateral and vertical; `skids` (k, 2) m/s: what does not fit it, zero where all
+    fits. `doubt`: why it is no such vehicle, or nothing. `held`: the constraint is on.
     """
 
     mounting: Array
@@ -131,13 +138,15 @@ class Vehicle:
 
     def __str__(self) -> str:
         (yaw, pitch), (lateral, vertical) = self.yaw_pitch_deg, self.typical_slip
-        unsure = ["", "", ""]
+        unsure = [""] * 4
         if self.mounting_stddevs is not None:
             of_yaw, of_pitch = np.degrees(self.mounting_stddevs[:2] / (1 + self.mounting[:2] ** 2))
-            unsure = [f" ± {of_yaw:.2f}", f" ± {of_pitch:.2f}", f" ± {self.mounting_stddevs[2]:.1f}"]
+            of_place = self.mounting_stddevs[[2, 4]]
+            unsure = [f" ± {of:.2f}" for of in (of_yaw, of_pitch)] + [f" ± {of:.1f}" for of in of_place]
         return (
             f"slip {lateral:.2f} m/s sideways, {vertical:.2f} m/s vertically; IMU mounted {yaw:+.2f}{unsure[0]}° in"
-            f" yaw, {pitch:+.2f}{unsure[1]}° in pitch, {self.mounting[2]:+.1f}{unsure[2]} m ahead of the axle"
+            f" yaw, {pitch:+.2f}{unsure[1]}° in pitch, {self.mounting[2]:+.1f}{unsure[2]} m ahead of the axle,"
+            f" {self.mounting[4]:+.1f}{unsure[3]} m above it"
         )
 
 
@@ -147,7 +156,7 @@ def body_motion(problem: Problem, fit: Fit) -> BodyMotion:
     T, velocities, biases = from_values(fit.values, len(stamps))
     R_imu_map = np.swapaxes(T[:, :3, :3], 1, 2)
     in_imu = (R_imu_map @ velocities[:, :, None])[:, :, 0]
-    return BodyMotion(R_imu_map, in_imu, problem.intervals.yaw_rate - biases[:, 5], np.gradient(stamps))
+    return BodyMotion(R_imu_map, in_imu, problem.intervals.rates - biases[:, 3:], np.gradient(stamps))
 
 
 def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
@@ -158,11 +167,12 @@ def observe(problem: Problem, fit: Fit, motion: BodyMotion) -> Vehicle:
     if time < LEAST_TIME_S or way < LEAST_WAY_M:
         unseen = Slip(np.array([UNSEEN_SLIP**2, 0.0, 0.0]), LEAST_LASTING_S, UNSEEN_SLIP)
         doubt = f"it is seen to move for {time:.0f} s and {way:.0f} m only"
-        return Vehicle(np.zeros(4), (unseen, unseen), skids, doubt)
-    mounting, by_mounting, slip = np.zeros(4), seen.by_mounting(), []
+        return Vehicle(np.zeros(5), (unseen, unseen), skids, doubt)
+    mounting, by_mounting, slip = np.zeros(5), seen.by_mounting(), []
     for row, part in enumerate((SIDEWAYS, UPWARDS)):
+        known = by_mounting[:, row] @ mounting
         mounting[part], its_slip, skids[where, row] = explain(
-            seen.velocity[:, 1 + row],
+            seen.velocity[:, 1 + row] - known,
             by_mounting[:, row, part],
             MOUNTING_STDDEVS[part],
             seen.velocity[:, 0],

@@ -110,7 +110,7 @@ class Wheels:
 
 
 def direction(mounting: Array) -> Array:
-    """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (4,) begins with."""
+    """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (5,) begins with."""
     slopes = np.array([1.0, mounting[0], mounting[1]])
     return np.asarray(slopes / np.linalg.norm(slopes))
 

@@ -24,12 +24,12 @@ def test_the_linearised_constraint_agrees_with_differences_of_the_real_one():
         gtsam.Pose3(gtsam.Rot3(Rotation.random(random_state=3).as_matrix()), rng.standard_normal(3)),
         5 * rng.standard_normal(3),
     )
-    mounting, yaw_rate = np.array([0.03, -0.02, 1.2, -0.004]), 0.4
+    mounting, rates = np.array([0.03, -0.02, 1.2, -0.004, 1.8]), np.array([0.1, -0.2, 0.4])
 
     def sliding(change: np.ndarray) -> tuple[np.ndarray, BodyMotion]:
         R_imu_map = pose.retract(change[:6]).rotation().matrix().T
         motion = BodyMotion(
-            R_imu_map[None], (R_imu_map @ (velocity + change[6:9]))[None], np.array([yaw_rate]), np.ones(1)
+            R_imu_map[None], (R_imu_map @ (velocity + change[6:9]))[None], rates[None], np.ones(1)
         )
         return (motion.sliding(mounting + change[9:]) / stddevs)[0], motion
 
@@ -37,10 +37,10 @@ def test_the_linearised_constraint_agrees_with_differences_of_the_real_one():
     at.insert(X(0), pose)
     at.insert(V(0), velocity)
     at.insert(M(1), mounting)
-    off, motion = sliding(np.zeros(13))
+    off, motion = sliding(np.zeros(14))
     row = next(iter(non_holonomic_factors(at, motion, stddevs)))
     jacobian, b = row.linearize(at).jacobian()
-    numeric = np.column_stack([(sliding(step * e)[0] - off) / step for e in np.eye(13)])
+    numeric = np.column_stack([(sliding(step * e)[0] - off) / step for e in np.eye(14)])
     columns = {X(0): numeric[:, :6], V(0): numeric[:, 6:9], M(1): numeric[:, 9:]}
     np.testing.assert_allclose(b, -off)
     np.testing.assert_allclose(jacobian, np.hstack(list(map(columns.get, row.keys()))), atol=1e-3)

@@ -32,7 +32,7 @@ def test_the_variance_of_sums_is_that_of_the_whole_covariance(simulate):
     k, rng = len(problem.intervals.keyframes), np.random.default_rng(0)
     windows = np.repeat([-1, 0, 1, -1, 2], [5, 20, 10, 4, k - 39])
     windows[50:53] = -1
-    rows, of_mounting = rng.standard_normal((k, 2, SIZE)), rng.standard_normal((3, 2, 4))
+    rows, of_mounting = rng.standard_normal((k, 2, SIZE)), rng.standard_normal((3, 2, 5))
     rows[windows < 0] = 0.0
     sums = SumVariance(rows, windows, of_mounting)
     keyframe_covariances(fit.graph, fit.values, k, sums)

@@ -1,6 +1,7 @@
 """Mounting, slip, and whether it is a vehicle at all: found in exact motion, and in solutions of noisy drives."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def skidding(seconds: float, rng: np.random.Generator) -> FreeMotion:
 def seen(motion: RigidMotion, stamps: np.ndarray) -> BodyMotion:
     R_imu_map = np.swapaxes(motion.poses(stamps)[:, :3, :3], 1, 2)
     velocity = np.einsum("kij,kj->ki", R_imu_map, motion.velocities(stamps))
-    return BodyMotion(R_imu_map, velocity, motion.turn_rates(stamps)[:, 2], np.gradient(stamps))
+    return BodyMotion(R_imu_map, velocity, motion.turn_rates(stamps), np.gradient(stamps))
 
 
 def gauss_markov(k: int, keep: float, rng: np.random.Generator) -> np.ndarray:
@@ -73,7 +74,7 @@ def test_an_axle_that_does_not_slide_does_not_forward_or_backward_wherever_the_i
     motion = seen(on_axle(Motion(level.path, level.speed)), np.arange(1.0, 199.0, 0.5))
     assert motion.velocity[:, 0].min() < -4.0
     yaw, pitch = np.radians(YAW_PITCH_DEG)
-    mounting = np.array([-np.tan(yaw) / np.cos(pitch), np.tan(pitch), AHEAD_M / np.cos(yaw), 0.0])
+    mounting = np.array([-np.tan(yaw) / np.cos(pitch), np.tan(pitch), AHEAD_M / np.cos(yaw), 0.0, 0.0])
     sliding = motion.sliding(mounting)
     assert np.abs(motion.velocity[:, 1]).max() > 0.2
     np.testing.assert_allclose(sliding, 0.0, atol=2e-3)
@@ -236,6 +237,21 @@ def test_relative_poses_take_the_place_of_the_constraint(simulate):
     assert held is None
     assert alone.held
     assert asked.held
+
+
+def test_an_imu_on_a_roof_is_as_good_as_one_on_the_axle(simulate):
+    """1.8 m up, on a body that sways by a degree."""
+    T_axle_imu = np.eye(4)
+    T_axle_imu[2, 3] = 1.8
+
+    def on_roof(seconds: float, rng: np.random.Generator) -> Mounted:
+        return Mounted(replace(random_drive(seconds, rng), suspension=np.radians(1.0)), T_axle_imu)
+
+    drive = simulate(5, 240.0, ImuNoise(), on_roof, outages=[(100.0, 150.0)])
+    vehicle = smooth(drive.imu, drive.fixes, FRAME, None, LEVER).vehicle
+    assert vehicle.held
+    assert vehicle.mounting[4] == pytest.approx(1.8, abs=max(4 * vehicle.mounting_stddevs[4], 0.05))
+    assert vehicle.slip[0].typical < 0.03
 
 
 def test_on_a_roundabout_the_verdict_says_how_little_it_tells_of_the_mounting(simulate):

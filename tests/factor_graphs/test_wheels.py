@@ -70,7 +70,7 @@ def test_the_linearised_factor_agrees_with_differences_of_the_real_one():
     def off(change: np.ndarray) -> tuple[float, BodyMotion, Wheels]:
         R_imu_map = pose.retract(change[:6]).rotation().matrix().T
         in_imu = (R_imu_map @ (velocity + change[6:9]))[None]
-        motion = BodyMotion(R_imu_map[None], in_imu, np.array([0.3]), np.ones(1))
+        motion = BodyMotion(R_imu_map[None], in_imu, np.array([[0.1, -0.2, 0.3]]), np.ones(1))
         calibration = TRUTH + change[9:]
         ahead = in_imu @ direction(mounting)
         readings = read(speeds, np.array([1.0]) + calibration[2], ahead)

@@ -24,8 +24,9 @@ CHORD_S, LEAST_COURSE_STDDEV, WINDOW_S = 2.0, 0.05, 100.0
 # turns with the vehicle when at least this share of what the courses can tell agrees.
 SURELY, AGREEING = 12.5, 0.5
 # A second of standstill: the IMU scatters no more than so many times as in its quietest tenth, and the fixes stay
-# within so many standard deviations. So many of them are believed.
-QUIET, STAYING, LEAST_STANDING = 2.0, 3.0, 5
+# within so many standard deviations. So many of them are believed, if half of them are within so many rad/s: what
+# stands turns at one rate.
+QUIET, STAYING, LEAST_STANDING, STEADY = 2.0, 3.0, 5, 3e-3
 # A mean specific force beyond these, m/s², is no gravity, and does not tell what is up.
 LEAST_FORCE, MOST_FORCE = 5.0, 20.0
 TINY = 1e-12
@@ -129,4 +130,8 @@ def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
     if not len(ways):
         return None
     still = quiet & (np.interp(stamps, middles, np.abs(ways) / stddevs, left=np.inf, right=np.inf) < STAYING)
-    return np.median(rates[still], axis=0) if still.sum() >= LEAST_STANDING else None
+    if still.sum() < LEAST_STANDING:
+        return None
+    rate = np.median(rates[still], axis=0)
+    is_one = np.median(np.abs(rates[still] - rate).max(axis=1)) < STEADY
+    return np.asarray(rate) if is_one else None

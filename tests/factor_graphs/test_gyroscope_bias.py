@@ -12,6 +12,7 @@ from factor_graphs.accuracy import errors
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.gyroscope_bias import large_gyroscope_bias
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.rigid_motion import drone, hand_held
 from factor_graphs.simulation import Motion, random_drive
 from factor_graphs.smoothing import heading_stddevs, smooth
 
@@ -76,6 +77,13 @@ def test_a_bias_as_data_sheets_have_it_is_left_to_the_graph(simulate) -> None:
         rates = level + np.radians([0, 0, degrees_per_s])
         imu = ImuSamples(drive.imu.stamps, drive.imu.specific_force, rates)
         assert not large_gyroscope_bias(imu, drive.fixes).any()
+
+
+@pytest.mark.parametrize("moves", [hand_held, drone])
+@pytest.mark.parametrize("seed", range(5))
+def test_what_does_not_look_where_it_goes_shows_no_bias(simulate, moves, seed: int) -> None:
+    drive = simulate(seed, 300.0, ImuNoise(), moves)
+    assert not large_gyroscope_bias(drive.imu, drive.fixes).any()
 
 
 def test_what_turns_as_its_course_does_has_no_bias() -> None:

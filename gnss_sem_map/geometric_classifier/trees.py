@@ -18,8 +18,11 @@ from gnss_sem_map.errors import DataError
 DEPTH = 4
 INNER, LEAVES = (1 << DEPTH) - 1, 1 << DEPTH
 """Nodes of a whole tree: the children of node n are 2 n + 1 and 2 n + 2."""
-ROUNDS, LEARNING_RATE, LEAST_IN_LEAF = 40, 0.1, 100
-"""Few labels are independent of each other, as views of one surface err alike: small trees of many voxels."""
+ALL_LEAVES, DE_BRUIJN = (1 << LEAVES) - 1, 0x0F2D
+"""As bits; and a number whose products with the 16 bits differ in bits 12 to 15."""
+ROUNDS, OF_ALL_ROUNDS, LEAST_IN_LEAF = 80, 4.0, 100
+"""Few labels are independent of each other, as views of one surface err alike: small trees of many voxels, in small
+steps: the learning rate is `OF_ALL_ROUNDS` / rounds."""
 SHARE_OF_FEATURES = 0.5
 """Of each split."""
 BINS = 63
@@ -47,7 +50,11 @@ class BoostedTrees:
 
     @classmethod
     def fit(
-        cls, features: NDArray[np.float32], classes: NDArray[np.int8], weights: NDArray[np.float64]
+        cls,
+        features: NDArray[np.float32],
+        classes: NDArray[np.int8],
+        weights: NDArray[np.float64],
+        rounds: int = ROUNDS,
     ) -> BoostedTrees:
         """Fit them to the classes (r,) of rows (r, f), two different ones at least.
 
@@ -58,7 +65,7 @@ class BoostedTrees:
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         model = HistGradientBoostingClassifier(
-            max_iter=ROUNDS, max_depth=DEPTH, max_leaf_nodes=LEAVES, learning_rate=LEARNING_RATE,
+            max_iter=rounds, max_depth=DEPTH, max_leaf_nodes=LEAVES, learning_rate=OF_ALL_ROUNDS / rounds,
             min_samples_leaf=LEAST_IN_LEAF, max_features=SHARE_OF_FEATURES, max_bins=BINS, early_stopping=False,
             random_state=SEED,
         )  # fmt: skip
@@ -160,12 +167,14 @@ def _whole(
 def _walk(rows, features, thresholds, leaves, scores):
     """Every row goes through every tree.
 
-    All nodes of a tree answer before the walk, also those that it does not pass: to compare a feature of many rows in
-    one vector instruction, and without branches, takes a third of the time of a look at four nodes of one row.
+    All nodes of a tree answer, also those that a row does not pass, and strike out the leaves that it cannot reach any
+    more; the first that is left is its leaf (QuickScorer, Lucchese et al. 2015). So one vector instruction compares a
+    feature of many rows: a sixth of the time of a look at four nodes of one row after another.
     """
-    columns, here = scores.shape[1], np.empty((rows.shape[1], ROWS_AT_ONCE), np.float32)
-    total, right = np.empty(ROWS_AT_ONCE, np.float32), np.empty((INNER, ROWS_AT_ONCE), np.int32)
-    here[:] = 0
+    columns, here = scores.shape[1], np.zeros((rows.shape[1], ROWS_AT_ONCE), np.float32)
+    total, reachable = np.empty(ROWS_AT_ONCE, np.float32), np.empty(ROWS_AT_ONCE, np.int32)
+    to_the_right, slots = _reached_to_the_right(), _slots()
+    by_slot = np.empty(LEAVES, np.float32)
     for first in range(0, len(rows), ROWS_AT_ONCE):
         count = min(ROWS_AT_ONCE, len(rows) - first)
         for i in range(count):
@@ -175,15 +184,42 @@ def _walk(rows, features, thresholds, leaves, scores):
             for i in range(count):
                 total[i] = scores[first + i, column]
             for tree in range(column, len(leaves), columns):
+                reachable[:] = ALL_LEAVES
                 for node in range(INNER):
                     values, threshold = here[features[tree, node]], thresholds[tree, node]
-                    answers = right[node]
+                    left_out = to_the_right[node]
                     for i in range(ROWS_AT_ONCE):
-                        answers[i] = values[i] > threshold
+                        reachable[i] &= left_out if values[i] > threshold else ALL_LEAVES
+                for leaf in range(LEAVES):
+                    by_slot[slots[leaf]] = leaves[tree, leaf]
                 for i in range(count):
-                    place = 0  # in its level
-                    for level in range(DEPTH):
-                        place = 2 * place + right[(1 << level) - 1 + place, i]
-                    total[i] += leaves[tree, place]
+                    total[i] += by_slot[_slot(reachable[i] & -reachable[i])]
             for i in range(count):
                 scores[first + i, column] = total[i]
+
+
+@njit(cache=True, nogil=True)
+def _slot(bit):
+    """A number from 0 to 15 for each of 16 bits (de Bruijn multiplication)."""
+    return ((bit * DE_BRUIJN) & ALL_LEAVES) >> 12
+
+
+@njit(cache=True, nogil=True)
+def _slots():
+    """The slot of each leaf, (16,)."""
+    slots = np.empty(LEAVES, np.int32)
+    for leaf in range(LEAVES):
+        slots[leaf] = _slot(1 << leaf)
+    return slots
+
+
+@njit(cache=True, nogil=True)
+def _reached_to_the_right():
+    """Of every inner node (15,) the leaves, as bits, that stay possible where a row goes right."""
+    masks = np.empty(INNER, np.int32)
+    for level in range(DEPTH):
+        width = LEAVES >> level  # leaves below a node of this level
+        for place in range(1 << level):
+            on_the_left = ((1 << width // 2) - 1) << place * width
+            masks[(1 << level) - 1 + place] = ALL_LEAVES ^ on_the_left
+    return masks

@@ -47,7 +47,7 @@ class RoadSidewalkModel:
         if classes is None or self.weight == 0:
             return said
         asked = np.flatnonzero(np.logaddexp(*(logs[:, one] for one in classes)) > LEAST_LOG)
-        said[asked] = self.trees.scores(rows[asked][:, COLUMNS])[:, 0]
+        said[asked] = self.trees.scores(np.ascontiguousarray(rows[asked][:, COLUMNS]))[:, 0]
         return np.asarray(np.float32(self.weight) * np.clip(said, *LIMITS_NAT))
 
 

@@ -36,7 +36,8 @@ def test_scores_are_those_of_scikit_learn(classes: tuple[int, ...]) -> None:
     found.check(rows.shape[1], 6)
     assert found.classes.tolist() == list(classes)
     oracle = HistGradientBoostingClassifier(
-        max_iter=trees.ROUNDS, max_depth=DEPTH, max_leaf_nodes=trees.LEAVES, learning_rate=trees.OF_ALL_ROUNDS / trees.ROUNDS,
+        max_iter=trees.ROUNDS, max_depth=DEPTH, max_leaf_nodes=trees.LEAVES,
+        learning_rate=trees.OF_ALL_ROUNDS / trees.ROUNDS,
         min_samples_leaf=trees.LEAST_IN_LEAF, max_features=trees.SHARE_OF_FEATURES, max_bins=trees.BINS,
         early_stopping=False, random_state=trees.SEED,
     )  # fmt: skip

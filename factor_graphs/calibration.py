@@ -15,7 +15,7 @@ from gtsam.symbol_shorthand import C, X
 from numpy.typing import NDArray
 
 from factor_graphs.elimination import by_sections, eliminate, split
-from factor_graphs.graph import motion_from, relative_pose_factors
+from factor_graphs.model import motion_from, relative_pose_factors
 from factor_graphs.problem import RELATIVE_LOSSES, Fit, Problem
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factor_graphs.elimination import PLACES, SIZE, eliminate, split, split_key, state_keys
-from factor_graphs.graph import motion_from
+from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.trajectory import Trajectory
 

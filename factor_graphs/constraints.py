@@ -1,19 +1,15 @@
-"""What a road vehicle cannot do: slide sideways, lift off, or move while it stands.
-
-The velocity in the imu's own axes depends on pose and velocity, and GTSAM has no factor for it. It is
-linearised here and held in a linear container; the smoother relinearises it in an outer loop, which costs
-a tenth of a custom factor in Python.
-"""
+"""What a road vehicle cannot do: slide sideways, lift off, or move while it stands."""
 
 from collections.abc import Iterator
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import M, V, X
+from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
 
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes
+from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.vehicle import MOUNTING_STDDEVS, BodyMotion
 
 Array = NDArray[np.float64]
@@ -32,24 +28,11 @@ def non_holonomic_factors(
 
     The mounting, M(k), is one unknown of all rows, and has a prior.
     """
-    k, unit = len(stddevs), gtsam.noiseModel.Unit.Create(2)
-    mounting, scale = values.atVector(M(k)), 1 / stddevs[:, :, None]
-    by_state, by_mounting = motion.by_state(mounting) * scale, -motion.by_mounting() * scale
-    by_pose, by_velocity = by_state[:, :, :6], by_state[:, :, 6:]
-    off = -motion.sliding(mounting) / stddevs
-    for i in range(k):
-        row = gtsam.JacobianFactor(X(i), by_pose[i], V(i), by_velocity[i], M(k), by_mounting[i], off[i], unit)
-        yield gtsam.LinearContainerFactor(row, values)
-    yield gtsam.PriorFactorVector(M(k), np.zeros(5), gtsam.noiseModel.Diagonal.Sigmas(MOUNTING_STDDEVS))
-
-
-def zero_velocity_factors(
-    standing: NDArray[np.bool_], stddev_mps: float
-) -> Iterator[gtsam.PriorFactorVector]:
-    """The velocity of every standing keyframe is zero."""
-    model = gtsam.noiseModel.Isotropic.Sigma(3, stddev_mps)
-    for i in np.flatnonzero(standing).tolist():
-        yield gtsam.PriorFactorVector(V(i), np.zeros(3), model)
+    k = len(stddevs)
+    mounting = values.atVector(M(k))
+    by_state = motion.by_state(motion.by_velocity(mounting))
+    known = BodyVelocities(np.arange(k), motion.sliding(mounting), by_state, -motion.by_mounting(), stddevs)
+    return body_velocity_factors(values, known, M(k), np.zeros(5), MOUNTING_STDDEVS)
 
 
 def standing(

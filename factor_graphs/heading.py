@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import EstimationError
-from factor_graphs.graph import motion_from
+from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem, fit_as_expected
 
 Array = NDArray[np.float64]

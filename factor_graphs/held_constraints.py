@@ -13,13 +13,12 @@ from factor_graphs.constraints import (
     non_holonomic_factors,
     quiet_intervals,
     standing,
-    zero_velocity_factors,
 )
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import FITTING_CHI2, fit_noise_from
-from factor_graphs.graph import from_values
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
+from factor_graphs.model import from_values, zero_velocity_factors
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip

@@ -17,7 +17,10 @@ from factor_graphs.alignment import (
 from factor_graphs.chi_square import probability_below, quantile
 from factor_graphs.errors import EstimationError, MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.graph import (
+from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
+from factor_graphs.least_squares import minimise
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.model import (
     gnss_factors,
     imu_factors,
     motion_from,
@@ -25,9 +28,6 @@ from factor_graphs.graph import (
     relative_pose_factors,
     to_values,
 )
-from factor_graphs.intervals import ImuIntervals, nearest, noise_as_sampled, split
-from factor_graphs.least_squares import gauss_newton, levenberg_marquardt
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
@@ -294,18 +294,9 @@ def _chi2_per_dof(motion: float, squares: Array, relative_squares: Array) -> flo
 def _minimise(
     problem: Problem, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float
 ) -> tuple[gtsam.Values, int]:
-    """Levenberg-Marquardt where relative poses bind the keyframes; else Gauss-Newton, or GTSAM's if that fails.
-
-    By QR: Cholesky stalls and throws where a stiff IMU meets weak fixes, in short drives and outages. Where relative
-    poses bind the keyframes it does neither, but stops elsewhere: in the demo 8 mm and 0.03 degrees away.
-    """
-    k, limit = len(problem.intervals.keyframes), problem.settings.max_iterations
+    limit = problem.settings.max_iterations
     try:
-        if problem.is_bound:
-            values, iterations = levenberg_marquardt(graph, start, k, limit, tolerance)
-        else:
-            found = gauss_newton(graph, start, k, limit, tolerance)
-            values, iterations = found or _minimise_whole(graph, start, limit, tolerance)
+        values, iterations = minimise(graph, start, problem.is_bound, limit, tolerance)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[0]
         raise EstimationError(f"the equations of the graph have no solution: {reason}") from error
@@ -315,28 +306,6 @@ def _minimise(
         f"the optimiser stopped at its limit of {limit} iterations, cost {graph.error(values):.4g}; "
         "check units, axes and lever arm of the log, or raise max_iterations"
     )
-
-
-def _minimise_whole(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
-) -> tuple[gtsam.Values, int]:
-    """GTSAM's optimiser; where its damping makes it crawl, undamped steps from where it was."""
-    damped, undamped = gtsam.LevenbergMarquardtParams(), gtsam.GaussNewtonParams()
-    damped.setMaxIterations(limit)
-    damped.setRelativeErrorTol(tolerance)
-    damped.setLinearSolverType("MULTIFRONTAL_QR")
-    undamped.setLinearSolverType("MULTIFRONTAL_QR")
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, damped)
-    values = optimiser.optimize()
-    if optimiser.iterations() < limit:
-        return values, optimiser.iterations()
-    newton, cost = gtsam.GaussNewtonOptimizer(graph, values, undamped), optimiser.error()
-    for iteration in range(limit):
-        newton.iterate()
-        if abs(cost - newton.error()) <= tolerance * cost and newton.error() <= optimiser.error():
-            return newton.values(), iteration
-        cost = newton.error()
-    return values, limit
 
 
 def _squares(problem: Problem, values: gtsam.Values) -> Array:

@@ -76,7 +76,8 @@ def slip_sums(problem: Problem, fit: Fit, vehicle: Vehicle) -> SlipSums | None:
     sliding, believed = motion.sliding(vehicle.mounting)[where], vehicle.slip_stddevs(motion)[where]
     seen = summed(share * sliding[:, None]).reshape(count, -1)
     of_slip = summed(share**2 * believed[:, None] ** 2).reshape(count, -1)
-    by_state, by_mounting = motion.by_state(vehicle.mounting)[where], -motion.by_mounting()[where]
+    by_state = motion.by_state(motion.by_velocity(vehicle.mounting))[where]
+    by_mounting = -motion.by_mounting()[where]
     rows = np.zeros((len(motion.spacing), BLOCKS * AXES, SIZE))
     rows[where, :, :9] = (share[:, :, :, None] * by_state[:, None]).reshape(len(where), -1, 9)
     of_all = summed(

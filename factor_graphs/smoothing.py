@@ -20,11 +20,11 @@ from factor_graphs.fitting import (
     reject,
 )
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.graph import from_values
 from factor_graphs.gyroscope_bias import large_gyroscope_bias
 from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
 from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
+from factor_graphs.model import from_values
 from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.graph import gnss_factors, imu_factors, relative_pose_factors
 from factor_graphs.intervals import SAME_STAMP_S, ImuIntervals, split
 from factor_graphs.measurements import GnssFixes, ImuSamples
+from factor_graphs.model import gnss_factors, imu_factors, relative_pose_factors
 from factor_graphs.problem import LOSSES, RELATIVE_LOSSES
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.smoothing import Solution

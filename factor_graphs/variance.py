@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import Places
 from factor_graphs.elimination import PLACES, SIZE, split_key
-from factor_graphs.graph import from_values, motion_from
+from factor_graphs.model import from_values, motion_from
 from factor_graphs.problem import GATE, GOOD_MEAN, Fit, Problem
 
 Array = NDArray[np.float64]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.graph import from_values
 from factor_graphs.intervals import nearest
+from factor_graphs.model import from_values
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 
@@ -75,15 +75,21 @@ class BodyMotion:
         rows[:, 1, 0] = -mounting[1]
         return rows
 
-    def by_state(self, mounting: Array) -> Array:
-        """Jacobian of `sliding` by the tangent of the pose and the velocity in the map, (k, 2, 9).
+    def by_state(self, by_velocity: Array) -> Array:
+        """Jacobian (k, r, 9) by the tangent of the pose and the velocity in the map, of what has this one (k, r, 3).
 
-        With v_imu = Rᵀ v and R perturbed on the right, d v_imu = [v_imu]× dθ + Rᵀ dv.
+        `by_velocity` is by the velocity in the imu's axes. With v_imu = Rᵀ v and R perturbed on the right,
+        d v_imu = [v_imu]× dθ + Rᵀ dv.
         """
-        across, rows = self.by_velocity(mounting), np.zeros((len(self.velocity), 2, 9))
-        rows[:, :, :3] = across @ np.cross(self.velocity[:, None], np.eye(3)).swapaxes(1, 2)
-        rows[:, :, 6:] = across @ self.R_imu_map
+        rows = np.zeros((*by_velocity.shape[:2], 9))
+        rows[:, :, :3] = np.cross(by_velocity, self.velocity[:, None])
+        rows[:, :, 6:] = by_velocity @ self.R_imu_map
         return rows
+
+    def ahead(self, mounting: Array) -> Array:
+        """Forward speed of a point on the axle (k,) m/s: as the body pitches, an imu above it swings to and fro."""
+        speed: Array = self.velocity @ direction(mounting) - mounting[4] * self.rates[:, 1]
+        return speed
 
     def grows_with(self) -> Array:
         """What the variance of slip grows with: nothing, speed squared, lateral acceleration squared, (k, 3)."""
@@ -209,3 +215,9 @@ def beside_fixes(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     distance = np.abs(good[nearest(good, stamps)] - stamps)
     beside: NDArray[np.bool_] = distance <= min(1.5 * float(np.median(np.diff(good))), BESIDE_S)
     return beside
+
+
+def direction(mounting: Array) -> Array:
+    """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (5,) begins with."""
+    slopes = np.array([1.0, mounting[0], mounting[1]])
+    return np.asarray(slopes / np.linalg.norm(slopes))

@@ -1,8 +1,8 @@
 """Wheel speed as a measurement: its scale, offset and latency are unknowns of the graph, and slip is not believed.
 
 The wheels say w at a stamp that is `latency` late. The axle moves forward at ±(scale w + offset), and the imu, `left`
-of where the wheels are, at that less left times yaw rate. A wheel at rest says zero: it has no offset. Slip that goes
-with acceleration cannot be told from latency.
+of where the wheels are and `up`, at that less left times yaw rate and plus up times pitch rate. A wheel at rest says
+zero: it has no offset. Slip that goes with acceleration cannot be told from latency.
 """
 
 from collections.abc import Iterator
@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import V, W, X
+from gtsam.symbol_shorthand import W
 from numpy.typing import NDArray
 
 from factor_graphs.measurements import WheelSpeeds
+from factor_graphs.model import BodyVelocities, body_velocity_factors
 from factor_graphs.problem import Fit, Problem
 from factor_graphs.slip import LEAST_LASTING_S, Slip, explain, robust_stddev
 from factor_graphs.vehicle import (
@@ -23,6 +24,7 @@ from factor_graphs.vehicle import (
     UNSEEN_SLIP,
     BodyMotion,
     beside_fixes,
+    direction,
 )
 from factor_graphs.wheel_readings import Readings, read
 
@@ -109,12 +111,6 @@ class Wheels:
         )
 
 
-def direction(mounting: Array) -> Array:
-    """The direction of travel in the imu's axes, (3,), by the slopes that the mounting (5,) begins with."""
-    slopes = np.array([1.0, mounting[0], mounting[1]])
-    return np.asarray(slopes / np.linalg.norm(slopes))
-
-
 def misfit(ahead: Array, yaw_rate: Array, readings: Readings, calibration: Array) -> tuple[Array, Array]:
     """Speed of the solution less that of the wheels, (k,) m/s, and its Jacobian by the calibration, (k, 4)."""
     scale, offset, _, left = calibration
@@ -135,7 +131,7 @@ def observe_wheels(
 
     `known` (4,) is their calibration, where a graph found it already.
     """
-    stamps, ahead = problem.intervals.keyframes, motion.velocity @ direction(mounting)
+    stamps, ahead = problem.intervals.keyframes, motion.ahead(mounting)
     calibration, beside = UNKNOWN if known is None else known, beside_fixes(problem, fit)
     for step in range(LATENCY_ROUNDS if known is None else 1):
         readings = read(wheels, stamps + calibration[2], ahead)
@@ -216,17 +212,17 @@ def wheel_factors(
 ) -> Iterator[gtsam.NonlinearFactor]:
     """Forward speed at every keyframe where the wheels say one, linearised at `values`, which `motion` is of.
 
-    The calibration, W(k), is one unknown of all rows, and has a prior. With v_imu = Rᵀ v and R perturbed on the right,
-    d v_imu = [v_imu]× dθ + Rᵀ dv. A small turn of the direction of travel changes no speed along it.
+    The calibration, W(k), is one unknown of all rows, and has a prior. A small turn of the direction of travel changes
+    no speed along it.
     """
-    k, unit, along = len(motion.velocity), gtsam.noiseModel.Unit.Create(1), direction(mounting)
-    off, by_wheels = misfit(motion.velocity @ along, motion.yaw_rate, wheels.readings, wheels.calibration)
-    scale = 1 / wheels.noise_stddevs(motion.spacing)[:, None]
-    by_pose = np.zeros((k, 6))
-    by_pose[:, :3] = np.cross(along, motion.velocity)
-    by_pose, by_velocity, by_wheels = by_pose * scale, along @ motion.R_imu_map * scale, by_wheels * scale
-    off = -off[:, None] * scale
-    for i in np.flatnonzero(wheels.readings.rolling | wheels.readings.stopped).tolist():
-        rows = X(i), by_pose[i : i + 1], V(i), by_velocity[i : i + 1], W(k), by_wheels[i : i + 1]
-        yield gtsam.LinearContainerFactor(gtsam.JacobianFactor(*rows, off[i], unit), values)
-    yield gtsam.PriorFactorVector(W(k), UNKNOWN, gtsam.noiseModel.Diagonal.Sigmas(STDDEVS))
+    where = np.flatnonzero(wheels.readings.rolling | wheels.readings.stopped)
+    off, by_wheels = misfit(motion.ahead(mounting), motion.yaw_rate, wheels.readings, wheels.calibration)
+    along = np.broadcast_to(direction(mounting), (len(off), 1, 3))
+    known = BodyVelocities(
+        where,
+        off[where, None],
+        motion.by_state(along)[where],
+        by_wheels[where, None],
+        wheels.noise_stddevs(motion.spacing)[where, None],
+    )
+    return body_velocity_factors(values, known, W(len(off)), UNKNOWN, STDDEVS)

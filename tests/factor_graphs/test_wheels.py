@@ -21,7 +21,7 @@ from factor_graphs.slip import Slip
 from factor_graphs.smoothing import smooth
 from factor_graphs.vehicle import BodyMotion
 from factor_graphs.wheel_readings import read
-from factor_graphs.wheels import Wheels, direction, misfit, wheel_factors
+from factor_graphs.wheels import Wheels, misfit, wheel_factors
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
 LEVER = np.array([0.5, 0.3, 1.0])
@@ -62,7 +62,7 @@ def test_the_linearised_factor_agrees_with_differences_of_the_real_one():
     attitude, velocity = Rotation.random(random_state=3).as_matrix(), np.array([4.0, -6.0, 0.5])
     pose, mounting = (
         gtsam.Pose3(gtsam.Rot3(attitude), rng.standard_normal(3)),
-        np.array([0.05, -0.03, 1.2, 0.0]),
+        np.array([0.05, -0.03, 1.2, 0.0, 1.8]),
     )
     stamps = np.arange(0.0, 2.0, 0.05)
     speeds = WheelSpeeds(stamps, 5.0 + 1.5 * stamps)  # a straight line is what the readings hold exactly
@@ -72,7 +72,7 @@ def test_the_linearised_factor_agrees_with_differences_of_the_real_one():
         in_imu = (R_imu_map @ (velocity + change[6:9]))[None]
         motion = BodyMotion(R_imu_map[None], in_imu, np.array([[0.1, -0.2, 0.3]]), np.ones(1))
         calibration = TRUTH + change[9:]
-        ahead = in_imu @ direction(mounting)
+        ahead = motion.ahead(mounting)
         readings = read(speeds, np.array([1.0]) + calibration[2], ahead)
         noise = Slip(np.array([stddev**2, 0.0, 0.0]), 1.0, stddev)
         left, _ = misfit(ahead, motion.yaw_rate, readings, calibration)

@@ -1,6 +1,20 @@
-"""One function per factor: how each measurement binds the pose X, velocity V and bias B of the keyframes."""
+"""The factor graph of a drive: its unknowns, and one function for each kind of factor.
+
+    prior --- X(0) --- relative pose --- X(1) --- relative pose --- X(2) ...      pose of the IMU in the map
+    prior --- V(0) ---+             +--- V(1) ---+             +--- V(2) ...      velocity in the map
+    prior --- B(0) ---+---- IMU ----+--- B(1) ---+---- IMU ----+--- B(2) ...      biases of accelerometer and gyroscope
+
+    GNSS fix        on X(i)              the antenna of the keyframe is where the receiver says
+    axle            on X(i), V(i), M     a point on the axle does not slide; M is the mounting of the IMU, with a prior
+    wheels          on X(i), V(i), W     it moves ahead as fast as they roll; W is their calibration, with a prior
+    zero velocity   on V(i)              while the vehicle stands
+
+Keyframes are at the fixes, at the ends of relative poses (LiDAR odometry), and in between where these are far apart.
+`problem.optimise` adds the factors up and solves the graph.
+"""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -107,6 +121,47 @@ def prior_factors(
     yield gtsam.PriorFactorConstantBias(
         B(0), gtsam.imuBias.ConstantBias(), gtsam.noiseModel.Diagonal.Sigmas(bias_stddevs)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class BodyVelocities:
+    """Velocities of the vehicle that are known, r of them at each of n keyframes, linearised.
+
+    `off` (n, r) m/s: by how much a solution misses them; its Jacobians by pose tangent and velocity `by_state`
+    (n, r, 9), and by `by_shared` (n, r, s), what all keyframes share; `stddevs` (n, r) m/s.
+    """
+
+    keyframes: NDArray[np.intp]
+    off: Array
+    by_state: Array
+    by_shared: Array
+    stddevs: Array
+
+
+def body_velocity_factors(
+    values: gtsam.Values, known: BodyVelocities, shared: int, prior: Array, prior_stddevs: Array
+) -> Iterator[gtsam.NonlinearFactor]:
+    """Axle or wheels: velocities in the axes of the vehicle, linearised at `values`; and the prior of what they share.
+
+    GTSAM has no such factor, and one in Python costs ten times as much: so the smoother relinearises in an outer loop.
+    """
+    scale, unit = 1 / known.stddevs[:, :, None], gtsam.noiseModel.Unit.Create(known.off.shape[1])
+    by_pose, by_velocity = known.by_state[:, :, :6] * scale, known.by_state[:, :, 6:] * scale
+    by_shared, right = known.by_shared * scale, -known.off / known.stddevs
+    for i, *of_keyframe in zip(known.keyframes.tolist(), by_pose, by_velocity, by_shared, right, strict=True):
+        pose, velocity, of_shared, b = of_keyframe
+        row = gtsam.JacobianFactor(X(i), pose, V(i), velocity, shared, of_shared, b, unit)
+        yield gtsam.LinearContainerFactor(row, values)
+    yield gtsam.PriorFactorVector(shared, prior, gtsam.noiseModel.Diagonal.Sigmas(prior_stddevs))
+
+
+def zero_velocity_factors(
+    standing: NDArray[np.bool_], stddev_mps: float
+) -> Iterator[gtsam.PriorFactorVector]:
+    """The velocity of every standing keyframe is zero."""
+    model = gtsam.noiseModel.Isotropic.Sigma(3, stddev_mps)
+    for i in np.flatnonzero(standing).tolist():
+        yield gtsam.PriorFactorVector(V(i), np.zeros(3), model)
 
 
 def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:

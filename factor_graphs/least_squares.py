@@ -22,7 +22,11 @@ def minimise(
 
 
 def _gauss_newton(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    limit: int,
+    tolerance: float,
+    may_grow: bool = False,
 ) -> tuple[gtsam.Values, int] | None:
     """Undamped steps, until one gains what the linear graph says; None where the cost grows, or there is no step.
 
@@ -31,17 +35,17 @@ def _gauss_newton(
     params = gtsam.GaussNewtonParams()
     params.setLinearSolverType(QR)
     optimiser = gtsam.GaussNewtonOptimizer(graph, start, params)
-    values, cost = start, optimiser.error()
+    values, first = start, optimiser.error()
+    cost = first
     try:
         for iteration in range(1, limit):
             linear, before, cost = optimiser.iterate(), cost, optimiser.error()
-            if not cost <= before:
+            if not (may_grow or cost <= before):
                 return None
-            # a copy, for the optimiser owns what it returns, and drops it at its next step
-            before_step, values = values, gtsam.Values(optimiser.values())
-            step = before_step.localCoordinates(values)
-            expected = linear.error(values.zeroVectors()) - linear.error(step)
-            if abs(before - cost - expected) <= tolerance * cost:
+            # a copy: the optimiser drops its values at the next step
+            here, values = values, gtsam.Values(optimiser.values())
+            expected = linear.error(here.zeroVectors()) - linear.error(here.localCoordinates(values))
+            if abs(before - cost - expected) <= tolerance * cost and cost <= first:
                 return values, iteration
     except RuntimeError:  # a graph that only damping makes regular
         return None
@@ -51,7 +55,7 @@ def _gauss_newton(
 def _levenberg_marquardt(
     graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, limit: int, tolerance: float
 ) -> tuple[gtsam.Values, int]:
-    """Damped steps; where damping makes them too small, undamped ones from there."""
+    """Damped steps; where damping makes them crawl, undamped ones from there, whatever they cost on the way."""
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType(QR)
     params.setMaxIterations(limit)
@@ -60,4 +64,4 @@ def _levenberg_marquardt(
     values, iterations = optimiser.optimize(), optimiser.iterations()
     if iterations < limit:
         return values, iterations
-    return _gauss_newton(graph, values, limit, tolerance) or (values, limit)
+    return _gauss_newton(graph, values, limit, tolerance, may_grow=True) or (values, limit)

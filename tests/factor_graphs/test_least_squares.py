@@ -69,11 +69,3 @@ def test_a_bound_graph_is_solved_from_far_away(bound):
 def test_a_limit_of_iterations_is_kept(held):
     graph, values, k = held
     assert minimise(graph, moved(values, k, 0.5, 30.0), False, 2, 1e-10)[1] == 2
-
-
-def test_keyframes_that_nothing_holds_are_an_error(bound):
-    _, fit = fit_noise(bound)
-    values = gtsam.Values(fit.values)
-    values.insert(X(len(bound.intervals.keyframes)), gtsam.Pose3())
-    with pytest.raises(RuntimeError):
-        minimise(fit.graph, values, True, 10, 1e-5)

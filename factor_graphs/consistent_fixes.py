@@ -8,23 +8,22 @@ agree, and the largest group that agrees is believed, before any noise is change
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from factor_graphs.chi_square import quantile
+from factor_graphs.jumps import SIDE, SURELY, beyond_imu, find_jumps, is_jump
 from factor_graphs.measurements import LONGEST_STEP, GnssFixes
-from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Problem, fit_as_expected
+from factor_graphs.problem import REJECTION, RELATIVE_REJECTION, Fit, Problem, fit_as_expected
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
-# One fix in so many s is looked at, so many on each side of a jump: in 10 s the error of the IMU's way is a cubic
-# (position, velocity, tilt, bias of the gyroscope).
-STEP_S, SIDE, DEGREE = 1.0, 5, 3
-# A jump has so many standard deviations (one false alarm in ten million) and so many m. Smaller ones, of solutions that
-# converge, are of the same block. So are blocks that differ by such a share of the jumps: what is wrong drifts.
-SURELY, LEAST_JUMP_M, DRIFTED = 6.0, 0.5, 0.2
+# Of the fixes, one in so many s is looked at for jumps.
+STEP_S = 1.0
+# What is wrong drifts: blocks that differ by such a share of the jumps may be of the same group.
+DRIFTED = 0.2
 # A group of fixes is believed without the IMU's word when it is so many times as large as any other.
 CLEARLY = 2.0
 
@@ -64,15 +63,14 @@ def with_consistent_fixes(
         costs = []
         for group in groups[:2] if len(stretches) > 1 else ():
             believed[i] = [group]
-            costs.append(_cost(_posed(problem, fixes, pose, believed)) - 3 * group.size)
+            posed = _posed(problem, fixes, pose, believed)
+            costs.append(_cost(fit_as_expected(posed)) - 3 * group.size)
         is_told = costs and abs(costs[0] - costs[1]) > REJECTION
         believed[i] = [groups[int(costs[1] < costs[0])]] if is_told else groups[:2]
     chosen = _posed(problem, fixes, pose, believed)
-    lost = len(problem.fixes) - len(chosen.fixes)
-    if _cost(chosen) + REJECTION * lost >= _cost(problem):
+    if not _fits_better(fit_as_expected(chosen), fit_as_expected(problem)):
         return problem
-    told = _told(problem, stretches, believed)
-    return replace(chosen, notes=(*problem.notes, *told))
+    return replace(chosen, notes=(*problem.notes, *_told(problem, stretches, believed)))
 
 
 def _is_clear(groups: list[_Group]) -> bool:
@@ -82,9 +80,20 @@ def _is_clear(groups: list[_Group]) -> bool:
     return len(groups[0].blocks) > 1 and all(len(group.blocks) == 1 for group in groups[1:])
 
 
-def _cost(problem: Problem) -> float:
-    """The squared whitened residuals of the best fit, none counted for more than rejection allows."""
-    fit = fit_as_expected(problem)
+def _fits_better(chosen: Fit, fit: Fit) -> bool:
+    """Whether some fixes fit the IMU so well that all of them would cost far less, did the others fit as well.
+
+    And whether none in a row do not fit: beside outliers, one end of a block may not be seen.
+    """
+    n, lost = len(chosen.squares), len(fit.squares) - len(chosen.squares)
+    chance = SURELY * float(np.minimum(chosen.squares, REJECTION).std()) * lost**0.5
+    usual = max(1.0, float(np.median(chosen.squares)) / quantile(0.5, 3))
+    unfit = sliding_window_view(chosen.squares > REJECTION * usual, min(SIDE, n)).all(axis=1).any()
+    return bool(not unfit and _cost(chosen) * (1 + lost / n) + chance < _cost(fit))
+
+
+def _cost(fit: Fit) -> float:
+    """The squared whitened residuals, none counted for more than rejection allows."""
     bounded = (
         np.minimum(fit.squares, REJECTION).sum() + np.minimum(fit.relative_squares, RELATIVE_REJECTION).sum()
     )
@@ -94,12 +103,9 @@ def _cost(problem: Problem) -> float:
 def _posed(
     problem: Problem, fixes: GnssFixes, pose: Callable[[GnssFixes], Problem], believed: list[list[_Group]]
 ) -> Problem:
-    """The problem of these groups only, one of each stretch, or two, moved to the middle between them."""
-    shifts, kept, common = (
-        np.zeros((len(problem.fixes), 3)),
-        np.zeros(len(problem.fixes), np.bool_),
-        np.zeros(3),
-    )
+    """The problem of these groups only, of each stretch; more than one are moved to the middle between them."""
+    shifts, common = np.zeros((len(problem.fixes), 3)), np.zeros(3)
+    kept = np.zeros(len(shifts), np.bool_)
     for groups in believed:
         middle = np.mean([group.offset for group in groups], axis=0)
         common = np.maximum(common, np.abs(groups[0].offset - middle))
@@ -110,7 +116,7 @@ def _posed(
     some = GnssFixes(fixes.stamps[rows], fixes.positions[rows] + shifts[kept], fixes.stddevs[rows])
     posed, used = pose(some), np.zeros(len(fixes), np.bool_)
     used[rows] = posed.used
-    return replace(posed, used=used, common_stddevs=(*common.tolist(),))
+    return replace(posed, used=used, common_stddevs=(common[0], common[1], common[2]))
 
 
 def _told(problem: Problem, stretches: list[list[_Group]], believed: list[list[_Group]]) -> Iterator[str]:
@@ -119,41 +125,37 @@ def _told(problem: Problem, stretches: list[list[_Group]], believed: list[list[_
     for groups, right in zip(stretches, believed, strict=True):
         if len(right) > 1:
             off = np.linalg.norm(right[0].offset - right[1].offset)
+            later = max(group.blocks[0][0] for group in right)
             yield (
-                f"the fixes jump by {off:.1f} m at {t[max(right, key=_begin).blocks[0][0]]:.1f} s, and nothing tells"
+                f"the fixes jump by {off:.1f} m at {t[later]:.1f} s, and nothing tells"
                 f" which are right: moved to the middle, all poses may be {off / 2:.1f} m off together"
             )
-        reason = f"{right[0].size} others agree with the IMU" + (
-            ", before and after" if len(right[0].blocks) > 1 else ""
-        )
+        where = ", before and after" if len(right[0].blocks) > 1 else ""
         for group in (group for group in groups if group not in right):
             off = np.linalg.norm(group.offset - right[0].offset)
             for first, last in group.blocks:
                 yield (
                     f"{last - first + 1} of {n} fixes jump together by {off:.1f} m, {t[first]:.1f} to {t[last]:.1f} s:"
-                    f" rejected, for {reason}"
+                    f" rejected, for {right[0].size} others agree with the IMU{where}"
                 )
-
-
-def _begin(group: _Group) -> int:
-    return group.blocks[0][0]
 
 
 def _stretches(problem: Problem) -> Iterator[list[_Group]]:
     """The groups of blocks of every stretch of fixes without a gap, the one that is most likely right first."""
     t = problem.fixes.stamps
     rows = np.unique(np.round((t - t[0]) / STEP_S), return_index=True)[1]
-    steps = np.diff(t[rows])
+    steps = np.diff(t[rows], prepend=t[0])
     unseen = np.concatenate([[0.0], np.cumsum(problem.intervals.blind)])[problem.at[rows]]
-    gaps = (steps > LONGEST_STEP * max(float(np.median(steps)), STEP_S)) | (np.diff(unseen) > 0)
-    at, jumps, variances = _jumps(problem, rows, gaps)
-    for stretch in np.split(np.arange(len(rows)), np.flatnonzero(gaps) + 1):
+    gaps = (steps > LONGEST_STEP * max(float(np.median(steps)), STEP_S)) | (np.diff(unseen, prepend=0) > 0)
+    chain, off = np.cumsum(gaps, dtype=np.intp), beyond_imu(problem)[rows]
+    at, jumps, variances, good = find_jumps(t[rows], problem.fixes.stddevs[rows], off, chain)
+    for stretch in np.split(np.arange(len(rows)), np.flatnonzero(gaps[1:]) + 1):
         own = np.isin(at, stretch)
-        begins = [int(stretch[0]), *at[own].tolist(), int(stretch[-1]) + 1]
+        begins = [int(stretch[0]), *at[own].tolist()]
+        ends = [rows[good[good < i][-1]] for i in begins[1:]]
+        ends.append(rows[stretch[-1] + 1] - 1 if stretch[-1] + 1 < len(rows) else len(t) - 1)
         offsets, summed = (np.cumsum([np.zeros(3), *each[own]], axis=0) for each in (jumps, variances))
-        ends = [rows[i - 1] for i in begins[1:-1]]
-        ends.append(rows[begins[-1]] - 1 if begins[-1] < len(rows) else len(t) - 1)
-        blocks = [(int(rows[i]), int(end)) for i, end in zip(begins, ends, strict=False)]
+        blocks = [(int(rows[i]), int(end)) for i, end in zip(begins, ends, strict=True)]
         yield _grouped([_Group((block,), *of) for block, *of in zip(blocks, offsets, summed, strict=True)])
 
 
@@ -164,7 +166,7 @@ def _grouped(blocks: list[_Group]) -> list[_Group]:
     for block in sorted(blocks, key=lambda block: -block.size):
         for i, group in enumerate(groups):
             off, variance = block.offset - group.offset, block.variance + group.variance
-            if np.linalg.norm(off) <= drifted or not _is_jump(off, variance):
+            if np.linalg.norm(off) <= drifted or not is_jump(off, variance):
                 groups[i] = replace(group, blocks=(*group.blocks, *block.blocks))
                 break
         else:
@@ -174,64 +176,3 @@ def _grouped(blocks: list[_Group]) -> list[_Group]:
     if len(returned) == 1 and not groups[0].size >= CLEARLY * groups[min(1, len(groups) - 1)].size:
         groups.sort(key=lambda group: group is not returned[0])
     return groups
-
-
-def _is_jump(steps: Array, variances: Array) -> NDArray[np.bool_]:
-    """Whether steps (n, 3) m with variances (n, 3) m² are jumps."""
-    surely = np.sum(steps**2 / np.maximum(variances, 1e-12), axis=-1) > SURELY**2
-    return np.asarray(surely & (np.linalg.norm(steps, axis=-1) > LEAST_JUMP_M))
-
-
-def _jumps(problem: Problem, rows: Rows, gaps: NDArray[np.bool_]) -> tuple[Rows, Array, Array]:
-    """Before which of some `rows` of the fixes these jump, by how much (n, 3) m, and its variances (n, 3) m².
-
-    By least squares of a step beside a cubic, in windows of SIDE fixes before and after. Fixes that scatter more than
-    they say, in the window or usually, have so much more variance.
-    """
-    nothing = np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 3))
-    if len(rows) < 2 * SIDE:
-        return nothing
-    windows = np.lib.stride_tricks.sliding_window_view(np.arange(len(rows)), 2 * SIDE)
-    t, stddevs = problem.fixes.stamps[rows][windows], problem.fixes.stddevs[rows][windows]
-    off = _beyond_imu(problem)[rows][windows]
-    since = (t - t.mean(axis=1, keepdims=True)) / STEP_S
-    step = np.broadcast_to(np.arange(2 * SIDE) >= SIDE, since.shape)
-    A = np.stack([*(since**power for power in range(DEGREE + 1)), step], axis=2)
-    of_axes = stddevs.mean(axis=1) / stddevs.mean(axis=(1, 2))[:, None]
-    weights = 1 / stddevs.mean(axis=2)
-    A, y = A * weights[:, :, None], (off - off.mean(axis=1, keepdims=True)) * weights[:, :, None]
-    P = np.linalg.inv(np.swapaxes(A, 1, 2) @ A)
-    found = P @ (np.swapaxes(A, 1, 2) @ y)
-    squares = (
-        np.mean(((y - A @ found) / of_axes[:, None]) ** 2, axis=(1, 2)) * 2 * SIDE / (2 * SIDE - DEGREE - 2)
-    )
-    scatter = np.maximum(squares, max(1.0, float(np.median(squares))))
-    steps, variances = found[:, -1], P[:, -1, -1, None] * of_axes**2 * scatter[:, None]
-    crossed = np.lib.stride_tricks.sliding_window_view(gaps, 2 * SIDE - 1).any(axis=1)
-    are_jumps = _is_jump(steps, variances) & ~crossed
-    sureness, at = np.sum(steps**2 / variances, axis=1), list[int]()
-    for i in sorted(np.flatnonzero(are_jumps).tolist(), key=lambda i: -sureness[i]):
-        if all(abs(i - other) >= SIDE for other in at):
-            at.append(i)
-    chosen = np.array(sorted(at), np.intp)
-    return chosen + SIDE, steps[chosen], variances[chosen]
-
-
-def _beyond_imu(problem: Problem) -> Array:
-    """Fixes less the way that the IMU has gone by the attitudes of the first guess, (m, 3) m: smooth over some seconds."""
-    intervals, (T, velocities) = problem.intervals, problem.guess
-    R, dt = T[:, :3, :3], intervals.durations[:, None]
-    heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    cos, sin = np.cos(heading[0]), np.sin(heading[0])
-    level = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ R[0]
-    turned = np.append(0.0, np.cumsum(intervals.angular_rate @ level[2] * dt[:, 0]))
-    missing = np.unwrap(heading - turned[intervals.bounds])
-    turned = turned[:-1] + np.interp(intervals.nodes[:-1], intervals.keyframes, missing)
-    force, cos, sin = intervals.specific_force @ level.T, np.cos(turned), np.sin(turned)
-    east, north = cos * force[:, 0] - sin * force[:, 1], sin * force[:, 0] + cos * force[:, 1]
-    steps = np.column_stack([east, north, force[:, 2] - problem.frame.gravity]) * dt
-    speeds = np.cumsum(steps, axis=0)
-    way = np.cumsum((speeds - steps / 2) * dt, axis=0)
-    way = np.concatenate([np.zeros((1, 3)), way])[intervals.bounds[problem.at]]
-    antennas: Array = problem.antennas_found(T, velocities) - R[problem.at] @ problem.p_imu_antenna
-    return antennas - way

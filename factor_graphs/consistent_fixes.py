@@ -32,7 +32,8 @@ CLEARLY = 2.0
 class _Group:
     """Blocks of fixes of a problem, first and last of each, all displaced by `offset` (3,) m, `variance` (3,) m².
 
-    Displaced against where the fixes were after the last gap: over a gap no displacement is known.
+    Displaced against where the fixes were after the last gap: over a gap no displacement is known. The variance is
+    summed over the jumps since then; of two blocks, the difference counts.
     """
 
     blocks: tuple[tuple[int, int], ...]
@@ -165,7 +166,7 @@ def _grouped(blocks: list[_Group]) -> list[_Group]:
     groups: list[_Group] = []
     for block in sorted(blocks, key=lambda block: -block.size):
         for i, group in enumerate(groups):
-            off, variance = block.offset - group.offset, block.variance + group.variance
+            off, variance = block.offset - group.offset, np.abs(block.variance - group.variance)
             if np.linalg.norm(off) <= drifted or not is_jump(off, variance):
                 groups[i] = replace(group, blocks=(*group.blocks, *block.blocks))
                 break

@@ -35,7 +35,7 @@ def find_jumps(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> tuple[
 
     `stddevs` (m, 3) m, one fix about every second; across a change of `chain` (m,), a gap, no jump is found. Returns
     the row (j,) after each jump, the jumps (j, 3) m with their variances (j, 3) m², and the rows (l,) without outliers.
-    A step or a peak counts only where all else in its window fits: beside an outlier, another looks like a jump.
+    An outlier counts only where all else in its window fits, a jump only if it lasts.
     """
     rows = np.arange(len(stamps))
     for _ in range(OUTLIER_ROUNDS):
@@ -51,9 +51,7 @@ def find_jumps(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> tuple[
             outliers = SIDE + np.flatnonzero(is_jump(peaks, of_peaks) & ~others_misfit & surer)
         if not len(outliers):
             whole = chain[rows[2 * SIDE - 1 :]] == chain[rows[: 1 - 2 * SIDE]]
-            at = _apart(
-                is_jump(steps, variances, LIKELY) & ~misfit & whole, np.sum(steps**2 / variances, axis=1)
-            )
+            at = _apart(is_jump(steps, variances, LIKELY) & whole, np.sum(steps**2 / variances, axis=1))
             at = at[np.array([_lasts(i + SIDE, *of, steps[i], variances[i]) for i in at.tolist()], np.bool_)]
             if not is_jump(steps[at], variances[at]).any():
                 at = at[:0]
@@ -67,7 +65,7 @@ def _lasts(i: int, stamps: Array, stddevs: Array, off: Array, step: Array, varia
     around = np.arange(max(i - SIDE - 1, 0), min(i + SIDE + 1, len(stamps)))
     around = around[(around != i) & (around != i - 1)]
     found, _, _ = _found_in_windows(stamps[around], stddevs[around], off[around], around > i)
-    return bool(np.sum((found[0] - step) ** 2 / variance) < np.sum(step**2 / variance) / 4)
+    return bool(np.sum((found[0] - step) ** 2 / variance) < np.sum(step**2 / variance) / 2)
 
 
 def _apart(wanted: Mask, sureness: Array) -> Rows:

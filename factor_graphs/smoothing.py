@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
 from factor_graphs.condensing import CondensedDrive, condense
+from factor_graphs.consistent_fixes import with_consistent_fixes
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
 from factor_graphs.errors import MeasurementError
@@ -131,8 +132,11 @@ def smooth(
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
         lever = calibration.p_imu_antenna
-        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
-        return fit_noise(with_heading(problem))
+
+        def pose(some: GnssFixes) -> Problem:
+            return pose_problem(samples, some, frame, settings, lever, initial_attitude, relative)
+
+        return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
@@ -155,7 +159,9 @@ def smooth(
         found = replace(found, notes=(told, *found.notes))
     if not condensed:
         return found
-    lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])
+    lacking = _lacking(
+        problem, fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3]
+    )
     return replace(found, condensed=condense(problem, fit, lacking))
 
 
@@ -175,7 +181,7 @@ def _solution(
     if wheels is not None and wheels.held:
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
-    of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(fixes[problem.used], of_poses, R) @ R
+    of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(problem, fixes[problem.used], of_poses, R) @ R
     of_poses += _of_calibration(calibration, problem.settings, R, velocities)
     if problem.heading_in_doubt:
         of_poses += of_any_heading(R, problem.p_imu_antenna)
@@ -230,18 +236,19 @@ def _of_calibration(
     return covariances
 
 
-def _lacking(fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
+def _lacking(problem: Problem, fixes: GnssFixes, covariances: Array, R_map_imu: Array) -> Array:
     """Variance (3,) m² by which all poses, of covariances (k, 6, 6), may be wrong together beside them.
 
     Fixes that drift together are wrong together: the more of them, the better the shape, not the place. So the track is
     nowhere better placed than by one fix. What its best placed keyframe lacks in variance of a fix, all of them lack:
     so their differences stay as sure as they are.
     """
+    common = np.square(problem.common_stddevs)
     if not are_drifting(fixes):
-        return np.zeros(3)
+        return common
     in_map = np.einsum("kij,kjl,kil->ki", R_map_imu, covariances[:, 3:, 3:], R_map_imu)
     lacking: Array = np.maximum(np.median(fixes.stddevs, axis=0) ** 2 - in_map.min(axis=0), 0.0)
-    return lacking
+    return lacking + common
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:
@@ -290,7 +297,7 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
 
 def _correlation(problem: Problem, fit: Fit, fixes: GnssFixes, residuals: Array) -> Iterator[str]:
     """In words, whether the used fixes are less independent than they are taken for; an inertial unit's always are."""
-    if are_drifting(fixes):
+    if are_drifting(fixes) or any(problem.common_stddevs):
         return
     good, believed = fit.squares < GATE, problem.settings.fix_correlation_time_s
     stddevs = problem.of_fixes * np.maximum(fixes.stddevs, problem.settings.min_fix_stddev_m)

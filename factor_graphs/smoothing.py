@@ -1,6 +1,6 @@
 """The batch smoother: IMU, GNSS and what else there is in, the most probable trajectory out, with covariance."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,12 +20,13 @@ from factor_graphs.fitting import (
     reject,
 )
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.gnss_velocity import observe_velocities
 from factor_graphs.graph import from_values
 from factor_graphs.gyroscope_bias import large_gyroscope_bias
 from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
-from factor_graphs.held_constraints import constrain
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
-from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
+from factor_graphs.held_constraints import constrain, hold_beside
+from factor_graphs.measurements import GnssFixes, GnssVelocities, ImuNoise, ImuSamples, WheelSpeeds, measured
+from factor_graphs.problem import GATE, NOWHERE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
@@ -109,14 +110,16 @@ def smooth(
     relative_poses: RelativePoses | None = None,
     wheels: WheelSpeeds | None = None,
     condensed: bool = False,
+    also: Sequence[GnssVelocities] = (),
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
-    `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
-    IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
-    its wheels rolled; none of them need be given. What fills gaps of the IMU with straight lines is not believed. With
-    `condensed` the solution says what is needed to bind it to other drives or to itself (`sessions.bind`). Raises
-    MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser stops at its limit.
+    `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first IMU
+    stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
+    its wheels rolled, `also` what else the receiver says; none of them need be given. What fills gaps of the IMU
+    with straight lines is not believed. With `condensed` the solution says what is needed to bind it to other
+    drives or to itself (`sessions.bind`). Raises MeasurementError with fewer than three usable fixes, and
+    EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)
@@ -129,16 +132,19 @@ def smooth(
         samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
-        shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
+        shifted = replace(fixes, stamps=fixes.stamps + calibration.time_offset_s)
         lever = calibration.p_imu_antenna
-        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
+        also_at = np.concatenate([NOWHERE, *(one.stamps for one in also)]) + calibration.time_offset_s
+        problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative, also_at)
         return fit_noise(with_heading(problem))
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
+    beside = [observe_velocities(one, problem, fit, calibration.time_offset_s) for one in also]
     by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
-        fit, constraints, vehicle, odometer = constrain(problem, by_fixes, wheels)
+        held = hold_beside(problem, by_fixes, beside)
+        fit, constraints, vehicle, odometer = constrain(problem, held, wheels, beside)
         fit, steps = reject(problem, fit, constraints), BiasSteps(k)
         covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
         if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
@@ -153,6 +159,7 @@ def smooth(
     if filled := len(imu) - len(samples):
         told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
         found = replace(found, notes=(told, *found.notes))
+    found = replace(found, notes=(*found.notes, *(one.verdict for one in beside)))
     if not condensed:
         return found
     lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
+    AntennaHeadings,
     GnssFixes,
     GnssVelocities,
     ImuSamples,
@@ -26,7 +27,7 @@ from factor_graphs.measurements import (
     unit_fault,
 )
 from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
-from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, velocities_of
+from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
 from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
@@ -83,6 +84,21 @@ def read_velocities(folder: Path | str) -> GnssVelocities | None:
     if repairs is not None and (repairs.dropped or repairs.out_of_order):
         warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
     return velocities
+
+
+def read_headings(folder: Path | str, baseline: ArrayLike | None = None) -> AntennaHeadings | None:
+    """Read the headings in `gnss.csv` of a folder, for `smooth(..., also=...)`; None where there are none.
+
+    Columns: heading_deg, clockwise from north; std_heading_deg. `baseline` (3,) m from the main antenna to the second
+    one in the imu frame; None: the heading is that of the imu's x axis. Rows are repaired, and errors raised, as by
+    `read_csv`.
+    """
+    path = Path(folder) / "gnss.csv"
+    rows, _ = _receiver_rows(path)
+    headings, repairs = headings_of(rows, LocalFrame(*(float(value) for value in rows[0, 1:4])), baseline)
+    if repairs is not None and (repairs.dropped or repairs.out_of_order):
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    return headings
 
 
 def read_wheels(folder: Path | str) -> WheelSpeeds | None:

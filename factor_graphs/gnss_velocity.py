@@ -17,14 +17,13 @@ from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.graph import from_values
 from factor_graphs.measurements import UNMEASURED, GnssVelocities
 from factor_graphs.problem import Fit, Problem
-from factor_graphs.side_measurements import Observed, Placed, placed
+from factor_graphs.side_measurements import FEWEST_SEEN, Observed, Placed, noise_scale, placed
 from factor_graphs.vehicle import MOVING_SPEED, beside_fixes
 
 Array = NDArray[np.float64]
 
-# Velocities that differ from those of the positions by more than this share of the speed are something else. Seen so
-# often, they show it.
-MOST_MISFIT, FEWEST_SEEN = 0.1, 10
+# Velocities that differ from those of the positions by more than this share of the speed are something else.
+MOST_MISFIT = 0.1
 # What they may be: matrices that make the velocity east, north of it in m/s.
 MISTAKES = {
     "in knots, not m/s": np.eye(2) * 1852 / 3600,
@@ -33,8 +32,6 @@ MISTAKES = {
     "north, east, not east, north": np.array([[0.0, 1.0], [1.0, 0.0]]),
     "backwards": -np.eye(2),
 }
-# Noise is taken as stated unless it is so many times larger.
-NOTABLE = 1.2
 # One velocity in twenty of a good receiver has Huber's loss, and every wrong one.
 LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.95, 3) ** 0.5)
 
@@ -50,7 +47,7 @@ def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit, o
         return Observed(f"GNSS velocity off: {doubt}")
     scales = _noise_shown(problem, fit, place, off, kept.stddevs, seen)
     if scales.max() > 1:
-        said += f", with {scales[0]:.1f} times (up {scales[1]:.1f} times) the noise that is stated"
+        said += f", as if of {scales[0]:.1f} times (up {scales[1]:.1f} times) the noise that is stated"
     noisier = GnssVelocities(kept.stamps, kept.velocities, kept.stddevs * scales[[0, 0, 1]])
     return Observed(said, partial(_factors, noisier, problem, place))
 
@@ -85,10 +82,7 @@ def _misfit(said: Array, known: Array) -> float:
 def _noise_shown(
     problem: Problem, fit: Fit, place: Placed, off: Array, stddevs: Array, seen: NDArray[np.bool_]
 ) -> Array:
-    """How many times more noise than stated velocities show, level and up, (2,): at least 1.
-
-    By medians, so that outliers are none; the solution's own uncertainty is not theirs.
-    """
+    """As if of how many times more noise than stated velocities count, level and up, (2,): at least 1."""
     covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
     own = np.diagonal(covariances[place.at, 6:9, 6:9], axis1=1, axis2=2)
     scales = np.ones(2)
@@ -96,10 +90,8 @@ def _noise_shown(
         rows = seen & (stddevs[:, axes] < UNMEASURED).all(axis=1)
         if rows.sum() < FEWEST_SEEN:
             continue
-        shown = np.median(np.sum(off[rows][:, axes] ** 2, axis=1)) / quantile(0.5, len(axes))
-        variance = shown - np.median(own[rows][:, axes])
-        scale = float(np.sqrt(max(variance, 0.0) / np.median(stddevs[rows][:, axes] ** 2)))
-        scales[row] = scale if scale > NOTABLE else 1.0
+        stamps = problem.intervals.keyframes[place.at[rows]]
+        scales[row] = noise_scale(stamps, off[rows][:, axes], stddevs[rows][:, axes], own[rows][:, axes])
     return scales
 
 

@@ -25,6 +25,8 @@ LARGEST_OF_IMU = 1e6
 LARGEST_OF_WHEELS, LARGEST_OF_USUAL, LARGEST_OF_ANY = 150.0, 10.0, 1e6
 # Standard deviation, m/s, of a component of velocity that is not measured: no vehicle is as fast.
 UNMEASURED = 1e3
+# Antennas nearer to each other than this show no heading.
+LEAST_BASELINE_M = 0.05
 # A longer step than so many usual ones is a gap: where one row is lost it is of two, with some jitter.
 LONGEST_STEP = 2.5
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
@@ -152,6 +154,41 @@ class GnssVelocities:
 
 
 @dataclass(frozen=True, eq=False)
+class AntennaHeadings:
+    """Azimuth of the baseline between two antennas of a receiver, clockwise from the map's north.
+
+    `stamps` (n,) s on the clock of the fixes, strictly increasing; `azimuths` (n,) rad; `stddevs` (n,) rad, positive;
+    `baseline` (3,) m, from the main antenna to the second one in the imu frame. Raises MeasurementError as `GnssFixes`
+    does, and for a baseline that shows no heading: of two antennas that are one, or one above the other.
+    """
+
+    stamps: Array
+    azimuths: Array
+    stddevs: Array
+    baseline: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "AntennaHeadings")
+        if np.any(self.stddevs <= 0):
+            row = int(np.flatnonzero(self.stddevs <= 0)[0])
+            raise MeasurementError(
+                f"AntennaHeadings.stddevs[{row}] is {self.stddevs[row]} rad; expected positive values"
+            )
+        if not (level := float(np.linalg.norm(self.baseline[:2]))) >= LEAST_BASELINE_M:
+            raise MeasurementError(
+                f"the two antennas are {level:.3f} m apart in the plane of the imu, expected {LEAST_BASELINE_M} m or"
+                " more: p_imu_antenna2 is the place of the second antenna"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "AntennaHeadings":
+        return AntennaHeadings(self.stamps[rows], self.azimuths[rows], self.stddevs[rows], self.baseline)
+
+
+@dataclass(frozen=True, eq=False)
 class Repairs:
     """What cleaning did to the rows of one sensor: how many were dropped and why, and where data are missing.
 
@@ -259,6 +296,19 @@ def clean_velocities(
     return GnssVelocities(*columns), repairs
 
 
+def clean_headings(
+    stamps: ArrayLike, azimuths: ArrayLike, stddevs: ArrayLike, baseline: ArrayLike
+) -> tuple[AntennaHeadings, Repairs]:
+    """Raw headings -> those in order of time, once each, and the report of what was repaired.
+
+    Shapes and units as in `AntennaHeadings`; rows with a stddev that is not positive are dropped. Raises
+    MeasurementError as it does.
+    """
+    s = np.asarray(stddevs, np.float64)
+    columns, repairs = _clean("antenna heading", stamps, azimuths, np.where(s > 0, s, np.nan), width=())
+    return AntennaHeadings(columns[0], columns[1], columns[2], np.asarray(baseline, np.float64)), repairs
+
+
 def far_off(stamps: Array) -> NDArray[np.bool_]:
     """Which stamps (n,) s, finite, in any order, are not of the same drive as most: (n,).
 
@@ -336,7 +386,10 @@ def _check(value: "Measurements", what: str) -> None:
     for f in fields(value):
         if (array := getattr(value, f.name)) is None:
             continue
-        expected = (n,) if f.name in ("stamps", "speeds") else (n, 3)
+        of_one = f.name in ("stamps", "speeds", "azimuths") or (
+            f.name == "stddevs" and hasattr(value, "azimuths")
+        )
+        expected = (3,) if f.name == "baseline" else (n,) if of_one else (n, 3)
         if array.shape != expected:
             raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
         if not np.isfinite(array).all():
@@ -353,4 +406,4 @@ def _check(value: "Measurements", what: str) -> None:
         )
 
 
-Measurements = ImuSamples | GnssFixes | GnssVelocities | WheelSpeeds
+Measurements = ImuSamples | GnssFixes | GnssVelocities | AntennaHeadings | WheelSpeeds

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.antenna_heading import observe_headings
 from factor_graphs.calibration import Calibration
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.covariances import keyframe_covariances
@@ -23,13 +24,22 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.gnss_velocity import observe_velocities
 from factor_graphs.graph import from_values
 from factor_graphs.gyroscope_bias import large_gyroscope_bias
-from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
+from factor_graphs.heading import of_any_heading, stddevs_of_heading, turned_to, with_heading
 from factor_graphs.held_constraints import constrain, hold_beside
-from factor_graphs.measurements import GnssFixes, GnssVelocities, ImuNoise, ImuSamples, WheelSpeeds, measured
+from factor_graphs.measurements import (
+    AntennaHeadings,
+    GnssFixes,
+    GnssVelocities,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+    measured,
+)
 from factor_graphs.problem import GATE, NOWHERE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
+from factor_graphs.side_measurements import Observed
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.variance import BiasSteps, correlation_time_shown, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
@@ -110,7 +120,7 @@ def smooth(
     relative_poses: RelativePoses | None = None,
     wheels: WheelSpeeds | None = None,
     condensed: bool = False,
-    also: Sequence[GnssVelocities] = (),
+    also: Sequence[GnssVelocities | AntennaHeadings] = (),
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
@@ -140,7 +150,8 @@ def smooth(
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
-    beside = [observe_velocities(one, problem, fit, calibration.time_offset_s) for one in also]
+    beside = [_observe(one, problem, fit, calibration.time_offset_s) for one in also]
+    problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
     by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
         held = hold_beside(problem, by_fixes, beside)
@@ -164,6 +175,12 @@ def smooth(
         return found
     lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])
     return replace(found, condensed=condense(problem, fit, lacking))
+
+
+def _observe(one: GnssVelocities | AntennaHeadings, problem: Problem, fit: Fit, offset_s: float) -> Observed:
+    if isinstance(one, AntennaHeadings):
+        return observe_headings(one, problem, fit, offset_s)
+    return observe_velocities(one, problem, fit, offset_s)
 
 
 def _solution(

@@ -4,7 +4,8 @@
                                                        or by `imu_axes`, `force_unit`, `rate_unit` in log.yaml
     gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna; optional:
                                                        corr_en,corr_eu,corr_nu of its errors, and its velocity
-                                                       ve_mps,vn_mps,vu_mps,std_ve_mps,std_vn_mps,std_vu_mps
+                                                       ve_mps,vn_mps,vu_mps,std_ve_mps,std_vn_mps,std_vu_mps,
+                                                       and heading_deg,std_heading_deg between two antennas
     wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
                                                        or by `speed_unit` in log.yaml
     log.yaml            optional: see `log_yaml.LogFile`
@@ -42,7 +43,7 @@ from factor_graphs.csv_log import (
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import WheelSpeeds, clean_imu, clean_wheels
-from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, velocities_of
+from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
@@ -78,7 +79,9 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
     gnss, gnss_repairs, no_covariance = fixes_of(gnss_rows, frame)
     velocities, velocity_repairs = velocities_of(gnss_rows, frame)
-    cleaned = {"imu.csv": (imu_repairs,), "gnss.csv": (gnss_repairs, velocity_repairs)}
+    with _as_data_error():
+        headings, heading_repairs = headings_of(gnss_rows, frame, about.baseline)
+    cleaned = {"imu.csv": (imu_repairs,), "gnss.csv": (gnss_repairs, velocity_repairs, heading_repairs)}
     skips = [
         Skip("samples", shown(drive / name), str(repairs))
         for name, all_repairs in cleaned.items()
@@ -104,6 +107,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu=imu,
         gnss=gnss,
         velocities=velocities,
+        headings=headings,
         wheels=wheels,
         imu_noise=about.imu_noise,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,

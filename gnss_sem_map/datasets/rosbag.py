@@ -19,9 +19,9 @@ from factor_graphs.alignment import AttitudePrior
 from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, GnssVelocities, ImuSamples, clean_imu
+from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, clean_imu
 from factor_graphs.position_covariances import split_covariances
-from factor_graphs.receiver_rows import fixes_of, velocities_of, with_more
+from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
@@ -75,6 +75,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     skips += invalid
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
+    headings = _headings(fixes, frame, rig.gnss, calibration.p_imu_antenna)
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
@@ -95,6 +96,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu=samples,
         gnss=gnss,
         velocities=velocities,
+        headings=headings,
         imu_noise=rig.imu.noise,
         initial_attitude=attitude,
         attitude_of_unit=True,
@@ -106,7 +108,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 def _fixes(
     bag: Bag, about: GnssTopic, folder: Path, imu: Messages, clock: Clock
 ) -> tuple[Array, NDArray[np.int64], list[Skip]]:
-    """Rows (n, 16) as `receiver_rows.ROW_COLUMNS`; their Unix times; and the skipped fixes."""
+    """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`; their Unix times; and the skipped fixes."""
     if about.file is not None:
         drive_ns = _span_ns(bag, imu, clock)
         found = read_gnss_file(about.file, folder, None, drive_ns)
@@ -164,6 +166,17 @@ def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, 
     if no_covariance:
         skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
     return gnss, velocities, frame, skips
+
+
+def _headings(
+    rows: Array, frame: LocalFrame, about: GnssTopic, p_imu_antenna: Array
+) -> AntennaHeadings | None:
+    """Headings in a file of positions."""
+    second = about.p_imu_antenna2
+    try:
+        return headings_of(rows, frame, None if second is None else np.subtract(second, p_imu_antenna))[0]
+    except MeasurementError as error:
+        raise DataError(f"rig.yaml: gnss: {error}") from None
 
 
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:

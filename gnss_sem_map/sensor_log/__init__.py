@@ -20,7 +20,14 @@ from numpy.typing import NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, GnssVelocities, ImuNoise, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import (
+    AntennaHeadings,
+    GnssFixes,
+    GnssVelocities,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+)
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
@@ -191,6 +198,8 @@ class SensorLog:
     gnss: GnssFixes | None = None
     velocities: GnssVelocities | None = None
     """Of the receiver; None: the log has none."""
+    headings: AntennaHeadings | None = None
+    """Between two antennas of the receiver; None: the log has none."""
     wheels: WheelSpeeds | None = None
     """None: the log has no wheel speed."""
     imu_noise: ImuNoise | None = None
@@ -271,6 +280,7 @@ class SensorLog:
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
             gnss=None if self.gnss is None else theirs.on_our_clock(self.gnss),
             velocities=None if self.velocities is None else theirs.on_our_clock(self.velocities),
+            headings=None if self.headings is None else theirs.on_our_clock(self.headings),
             wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
             initial_attitude=attitude,
             conventions=None,

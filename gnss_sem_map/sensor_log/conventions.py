@@ -14,10 +14,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
-from factor_graphs.measurements import GnssFixes, GnssVelocities, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, WheelSpeeds
 
 Array = NDArray[np.float64]
-OfReceiver = TypeVar("OfReceiver", GnssFixes, GnssVelocities)
+OfReceiver = TypeVar("OfReceiver", GnssFixes, GnssVelocities, AntennaHeadings)
 
 NAMED_AXES = {"flu": "x y z", "frd": "x -y -z", "rfu": "y -x z"}
 """Forward left up, forward right down, right forward up: each says where our x, y, z are among the sensor's axes."""

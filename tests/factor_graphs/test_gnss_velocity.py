@@ -94,8 +94,29 @@ def test_noise_that_is_not_stated_is_found(simulate):
             also=(replace(exact, velocities=exact.velocities + noise),),
         )
         said = next(note for note in found.notes if note.startswith("GNSS velocity"))
-        ratios.append(float(said.split("with ")[1].split(" times")[0]))
+        ratios.append(float(said.split("as if of ")[1].split(" times")[0]))
     assert np.mean(ratios) == pytest.approx(6.0, rel=0.15)
+
+
+def test_errors_that_last_count_once(simulate):
+    """Ten velocities a second whose errors last 1 s, exp(-t/1 s): 1 + 2 sum rho^k = 20 of them say as much as one."""
+    counted = []
+    for seed in range(3):
+        drive = simulate(seed, 100.0, ImuNoise())
+        stamps = np.arange(1.37, 99.0, 0.1)
+        exact, rng = velocities_of(drive, None, stamps), np.random.default_rng(seed)
+        noise = np.zeros((len(stamps), 3))
+        rho = np.exp(-0.1)
+        for k in range(1, len(noise)):
+            noise[k] = rho * noise[k - 1] + np.sqrt(1 - rho**2) * rng.standard_normal(3)
+        given = replace(exact, velocities=exact.velocities + 6 * noise * exact.stddevs)
+        problem, fit = fit_noise(
+            pose_problem(drive.imu, drive.fixes, FRAME, FREE, LEVER, None, also_at=stamps)
+        )
+        verdict = observe_velocities(given, problem, fit, 0.0).verdict
+        counted.append(float(verdict.split("as if of ")[1].split(" times")[0]) / 6)
+    expected = np.sqrt((1 + rho) / (1 - rho))
+    assert np.mean(counted) == pytest.approx(expected, rel=0.25)
 
 
 def test_what_is_not_measured_is_not_used_and_rows_without_velocity_are_counted():

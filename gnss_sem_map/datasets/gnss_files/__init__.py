@@ -57,7 +57,7 @@ class FileFixes:
     """Rows of a file of positions on the clock of a log."""
 
     rows: Array
-    """(n, 16) as `receiver_rows.ROW_COLUMNS`: stamp s, latitude and longitude °, height m, their deviations m, ..."""
+    """(n, 18) as `receiver_rows.ROW_COLUMNS`: stamp s, latitude and longitude °, height m, their deviations m, ..."""
     stamps_ns: NDArray[np.int64]
     """(n,) Unix time, ns."""
     skips: list[Skip]

@@ -1,6 +1,6 @@
 """NMEA 0183: positions of GGA, dates of RMC or ZDA, standard deviations of GST, speed and course of RMC or VTG.
 
-Parsed by `pynmeagps`. VTG has no time: it is of the last sentence that has one.
+And headings of HDT or THS. Parsed by `pynmeagps`. VTG, HDT and THS have no time: it is that of the sentence before.
 
 GGA's height is above the geoid; with the geoid's own height, which it also tells, it is above the ellipsoid.
 """
@@ -23,7 +23,8 @@ from gnss_sem_map.sensor_log import Skip
 STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0.3, 0.5)}
 """Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
-USED = ("GGA", "RMC", "ZDA", "GST", "VTG")
+USED = ("GGA", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
+TIMELESS = ("VTG", "HDT", "THS")
 MPS_PER_KNOT, VELOCITY_STDDEV_MPS = 1852 / 3600, 0.1
 """NMEA does not tell how good a velocity is; receivers of all makes promise 0.03 to 0.1 m/s. What the drive shows is
 larger where it is."""
@@ -39,6 +40,7 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     now: int | None = None  # by the last sentence with a date
     deviations: dict[int, tuple[float, float, float]] = {}
     velocities: dict[int, tuple[float, float]] = {}
+    headings: dict[int, float] = {}
     clock: int | None = None  # of the last sentence with a time
     fixes: list[tuple[int, bool, list[float]]] = []
     lost: dict[str, int] = {}
@@ -48,10 +50,12 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
             if why:
                 lost[why] = lost.get(why, 0) + 1
             continue
-        if sentence.msgID != "VTG":
+        if sentence.msgID not in TIMELESS:
             clock = _clock_ns(sentence.time)
         if clock is not None and (velocity := _velocity(sentence)) is not None:
             velocities[clock] = velocity
+        if clock is not None and (heading := _heading(sentence)) is not None:
+            headings[clock] = heading
         if sentence.msgID in ("RMC", "ZDA"):
             now = _moment_ns(sentence) or now
             continue
@@ -73,6 +77,7 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     found = _joined(path, fixes, deviations, near_ns, skips)
     flat = np.array([velocities.get(int(stamp % DAY_NS), (np.nan, np.nan)) for stamp in found.stamps_ns])
     up = np.full(len(flat), np.nan)
+    found.more["headings_deg"] = np.array([headings.get(int(s % DAY_NS), np.nan) for s in found.stamps_ns])
     found.more["velocities"] = np.column_stack([flat, up])
     found.more["velocity_stddevs"] = np.where(
         np.isfinite(found.more["velocities"]), VELOCITY_STDDEV_MPS, np.nan
@@ -121,6 +126,17 @@ def _velocity(sentence: Any) -> tuple[float, float] | None:
     if not isinstance(course, float | int):
         return (0.0, 0.0) if speed < AT_REST_MPS else None
     return speed * float(np.sin(np.radians(course))), speed * float(np.cos(np.radians(course)))
+
+
+def _heading(sentence: Any) -> float | None:
+    """Degrees from true north, of a measurement; None where it tells nothing."""
+    if sentence.msgID == "HDT":
+        said = sentence.headingT
+    elif sentence.msgID == "THS" and sentence.mi == "A":  # others: dead reckoning, by hand, simulated, void
+        said = sentence.headt
+    else:
+        return None
+    return float(said) if isinstance(said, float | int) else None
 
 
 def _sentence(line: str) -> tuple[Any | None, str]:

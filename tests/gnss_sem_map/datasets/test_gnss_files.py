@@ -198,6 +198,19 @@ def test_speed_and_course_of_nmea(tmp_path: Path, kind: str) -> None:
     assert np.isnan(found[:, 2]).all()
 
 
+@pytest.mark.parametrize("kind", ["HDT", "THS"])
+def test_headings_of_nmea(tmp_path: Path, kind: str) -> None:
+    """Degrees from true north, of the fix before; THS says whether it is measured (A) or dead reckoning (E)."""
+    fields = ({"headingT": 123.4, "headingTu": "T"}, {"headt": 123.4, "mi": "A"})[kind == "THS"]
+    bad = ({"headingT": "", "headingTu": "T"}, {"headt": 123.4, "mi": "E"})[kind == "THS"]
+    sentences = [NMEAMessage("GN", kind, GET, **one).serialize().decode() for one in (fields, bad)]
+    times = [START_NS, START_NS + 10**9]
+    text = [gga(t) + sentence for t, sentence in zip(times, sentences, strict=True)]
+    found = read(nmea(tmp_path, rmc(START_NS - 10**9), *text)).rows[:, 16]
+    assert found[0] == 123.4
+    assert np.isnan(found[1])
+
+
 def gst(ns: int) -> str:
     return NMEAMessage(
         "GN", "GST", GET, time=moment(ns).time(), rangeRms=1.0, stdLat=0.11, stdLong=0.12, stdAlt=0.2

@@ -28,6 +28,7 @@ from factor_graphs.measurements import (
 )
 from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.surveyed_points import SurveyedPoints, to_points
 from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
 WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 # Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer.
 LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
+MAY_LACK = ("stamp_s", "std_e_m", "std_n_m", "std_u_m")
+POINT_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "easting_m", "northing_m", "height_m", "epsg", *MAY_LACK)
 LONGEST_HEADER = 10_000
 NOT_DEFINITE = "their covariance is not positive definite; used without correlations"
 NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$"
@@ -99,6 +102,37 @@ def read_headings(folder: Path | str, baseline: ArrayLike | None = None) -> Ante
     if repairs is not None and (repairs.dropped or repairs.out_of_order):
         warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
     return headings
+
+
+def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
+    """Read surveyed points, for `smooth(..., also=...)`.
+
+    Columns: name; type, control or check; lat_deg, lon_deg, alt_m, or easting_m, northing_m, height_m and epsg; if they
+    are there, stamp_s and std_e_m, std_n_m, std_u_m. Heights are above the ellipsoid. Raises MeasurementError as
+    `surveyed_points.to_points` does, and for a row that is damaged.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise MeasurementError(
+            f"{path}: cannot be read ({error.strerror}); expected a table of points"
+        ) from None
+    return parse_points(content, frame, str(path))
+
+
+def parse_points(content: bytes, frame: LocalFrame, where: str) -> SurveyedPoints:
+    """Surveyed points of the content of a CSV file; see `read_points`."""
+    header = names_in(content)
+    numbers = [name for name in POINT_COLUMNS if name in header]
+    types = {"name": "string", "type": "string"} | dict.fromkeys(numbers, "float64")
+    table = parse_columns(content, types, where)
+    names, kinds = ([str(text).strip() for text in table[column].to_pylist()] for column in ("name", "type"))
+    values = {name: table[name].to_numpy().astype(np.float64) for name in numbers}
+    for name in [name for name in numbers if name not in MAY_LACK]:
+        if np.isnan(values[name]).any():
+            row = int(np.flatnonzero(np.isnan(values[name]))[0])
+            raise MeasurementError(f"{where}: point {names[row]} has no {name}; expected a number")
+    return to_points(values, tuple(names), tuple(kinds), frame, where)
 
 
 def read_wheels(folder: Path | str) -> WheelSpeeds | None:

@@ -5,6 +5,7 @@ So a wrong unit, sign or place is found by what is known already, and said, and 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -36,6 +37,8 @@ class Observed:
     verdict: str
     factors: Callable[[Fit], list[gtsam.NonlinearFactor]] | None = None
     turn: float = 0.0
+    points: tuple[Any, NDArray[np.bool_]] | None = None
+    """Surveyed points with the moments that were found, and which of them are held."""
 
 
 def factors_of(beside: Sequence[Observed], fit: Fit) -> list[gtsam.NonlinearFactor]:

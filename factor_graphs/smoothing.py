@@ -40,12 +40,21 @@ from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.side_measurements import Observed
+from factor_graphs.surveyed_points import (
+    PointResidual,
+    SurveyedPoints,
+    observe_points,
+    residuals_of,
+)
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.variance import BiasSteps, correlation_time_shown, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
 Array = NDArray[np.float64]
+
+Also = GnssVelocities | AntennaHeadings | SurveyedPoints
+"""What may be known beside IMU and fixes."""
 
 # Beyond 99.9 % of good relative poses one is rejected: so many in a hundred are ten times what chance takes.
 NOTABLE_REJECTION = 0.01
@@ -74,7 +83,8 @@ class Solution:
     `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
     where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
     slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
-    asked for; `notes` says in words what was repaired or is in doubt.
+    asked for; `points` the surveyed points against the trajectory; `notes` says in words what was repaired or is in
+    doubt.
     """
 
     trajectory: Trajectory
@@ -95,6 +105,7 @@ class Solution:
     vehicle: Vehicle | None = None
     wheels: Wheels | None = None
     condensed: CondensedDrive | None = None
+    points: tuple[PointResidual, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -120,7 +131,7 @@ def smooth(
     relative_poses: RelativePoses | None = None,
     wheels: WheelSpeeds | None = None,
     condensed: bool = False,
-    also: Sequence[GnssVelocities | AntennaHeadings] = (),
+    also: Sequence[Also] = (),
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
@@ -170,14 +181,24 @@ def smooth(
     if filled := len(imu) - len(samples):
         told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
         found = replace(found, notes=(told, *found.notes))
-    found = replace(found, notes=(*found.notes, *(one.verdict for one in beside)))
+    points = [
+        residual
+        for one in beside
+        if one.points is not None
+        for residual in residuals_of(
+            *one.points, found.keyframes, calibration.p_imu_antenna, calibration.time_offset_s
+        )
+    ]
+    found = replace(found, points=tuple(points), notes=(*found.notes, *(one.verdict for one in beside)))
     if not condensed:
         return found
     lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])
     return replace(found, condensed=condense(problem, fit, lacking))
 
 
-def _observe(one: GnssVelocities | AntennaHeadings, problem: Problem, fit: Fit, offset_s: float) -> Observed:
+def _observe(one: Also, problem: Problem, fit: Fit, offset_s: float) -> Observed:
+    if isinstance(one, SurveyedPoints):
+        return observe_points(one, problem, fit, offset_s)
     if isinstance(one, AntennaHeadings):
         return observe_headings(one, problem, fit, offset_s)
     return observe_velocities(one, problem, fit, offset_s)

@@ -8,6 +8,7 @@
                                                        and heading_deg,std_heading_deg between two antennas
     wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
                                                        or by `speed_unit` in log.yaml
+    control_points.csv  optional: surveyed points, see `factor_graphs.csv_log.read_points`
     log.yaml            optional: see `log_yaml.LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
                                                        intensity from 0 to 1, or to `intensity_max` in log.yaml
@@ -39,11 +40,13 @@ from factor_graphs.csv_log import (
     fix_rows,
     parse_columns,
     parse_numbers,
+    parse_points,
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
@@ -92,6 +95,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         said = f"{no_covariance} fixes: {NOT_DEFINITE}"
         skips.append(Skip("covariance", shown(drive / "gnss.csv"), said, no_covariance))
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
+    points = _points(drive / "control_points.csv", frame)
     lidars, scan_skips = _lidars(drive, about)
     calibration = calibration_of(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
@@ -108,6 +112,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         gnss=gnss,
         velocities=velocities,
         headings=headings,
+        points=points,
         wheels=wheels,
         imu_noise=about.imu_noise,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
@@ -140,6 +145,14 @@ def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
     rows = _numbers(path, WHEEL_COLUMNS, LONGEST_WHEEL_STEP_S)
     wheels, repairs = clean_wheels(rows[:, 0], rows[:, 1])
     return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
+
+
+def _points(path: Path, frame: LocalFrame) -> SurveyedPoints | None:
+    """Surveyed points; None where there is no such table."""
+    if not is_file(path):
+        return None
+    with _as_data_error():
+        return parse_points(read_bytes(path, MOST_TABLE_BYTES), frame, shown(path))
 
 
 def _numbers(

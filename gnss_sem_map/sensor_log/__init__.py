@@ -28,6 +28,7 @@ from factor_graphs.measurements import (
     ImuSamples,
     WheelSpeeds,
 )
+from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
@@ -200,6 +201,8 @@ class SensorLog:
     """Of the receiver; None: the log has none."""
     headings: AntennaHeadings | None = None
     """Between two antennas of the receiver; None: the log has none."""
+    points: SurveyedPoints | None = None
+    """Where the antenna was, by a survey; None: the log has none."""
     wheels: WheelSpeeds | None = None
     """None: the log has no wheel speed."""
     imu_noise: ImuNoise | None = None
@@ -281,6 +284,7 @@ class SensorLog:
             gnss=None if self.gnss is None else theirs.on_our_clock(self.gnss),
             velocities=None if self.velocities is None else theirs.on_our_clock(self.velocities),
             headings=None if self.headings is None else theirs.on_our_clock(self.headings),
+            points=None if self.points is None else theirs.on_our_clock(self.points),
             wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
             initial_attitude=attitude,
             conventions=None,

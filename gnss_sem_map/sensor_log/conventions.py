@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, WheelSpeeds
+from factor_graphs.surveyed_points import SurveyedPoints
 
 Array = NDArray[np.float64]
-OfReceiver = TypeVar("OfReceiver", GnssFixes, GnssVelocities, AntennaHeadings)
+OfReceiver = TypeVar("OfReceiver", GnssFixes, GnssVelocities, AntennaHeadings, SurveyedPoints)
 
 NAMED_AXES = {"flu": "x y z", "frd": "x -y -z", "rfu": "y -x z"}
 """Forward left up, forward right down, right forward up: each says where our x, y, z are among the sensor's axes."""

@@ -45,16 +45,18 @@ def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit, offs
     said = f"antenna heading: {len(kept)} of {len(headings)} used"
     if sure.sum() < FEWEST_SEEN:
         turn = _centre(off) if len(off) else 0.0
-        return Observed(f"{said}, not judged by the motion", partial(_factors, kept, problem, place), -turn)
+        return Observed(
+            f"{said}, not judged by the motion", partial(_factors, kept, problem, place), True, -turn
+        )
     mirrored = wrapped(2 * kept.azimuths[sure] - off[sure])  # -azimuth less that of the solution, sign aside
     if doubt := _mistake(off[sure], mirrored, own[sure]):
-        return Observed(f"antenna heading off: {doubt}")
+        return Observed(f"antenna heading off: {doubt}", doubtful=True)
     stamps = problem.intervals.keyframes[place.at]
     scale = noise_scale(stamps[sure], _quick(stamps[sure], off[sure])[:, None], kept.stddevs[sure, None])
     if scale > 1:
         said += f", as if of {scale:.1f} times the noise that is stated"
     noisier = AntennaHeadings(kept.stamps, kept.azimuths, kept.stddevs * scale, kept.baseline)
-    return Observed(said, partial(_factors, noisier, problem, place))
+    return Observed(said, partial(_factors, noisier, problem, place), scale > 1)
 
 
 def wrapped(angles: Array) -> Array:

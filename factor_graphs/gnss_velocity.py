@@ -44,12 +44,12 @@ def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit, o
     seen = beside_fixes(problem, fit)[place.at]
     said = f"GNSS velocity: {len(kept)} of {len(velocities)} used"
     if doubt := _mistake(kept.velocities[seen], (kept.velocities - off)[seen]):
-        return Observed(f"GNSS velocity off: {doubt}")
+        return Observed(f"GNSS velocity off: {doubt}", doubtful=True)
     scales = _noise_shown(problem, fit, place, off, kept.stddevs, seen)
     if scales.max() > 1:
         said += f", as if of {scales[0]:.1f} times (up {scales[1]:.1f} times) the noise that is stated"
     noisier = GnssVelocities(kept.stamps, kept.velocities, kept.stddevs * scales[[0, 0, 1]])
-    return Observed(said, partial(_factors, noisier, problem, place))
+    return Observed(said, partial(_factors, noisier, problem, place), scales.max() > 1)
 
 
 def _antenna_velocities(problem: Problem, fit: Fit, place: Placed) -> Array:

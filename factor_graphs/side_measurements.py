@@ -30,12 +30,14 @@ HUBER = quantile(0.95, 1) ** 0.5
 class Observed:
     """What a solution shows of a measurement beside the fixes: a verdict in words, and its factors at a solution.
 
-    `factors` are None for what does not fit, or was not used. `turn` rad: the solution does not know its heading, and
-    is to be turned by so much about up before it is one to linearise at.
+    `factors` are None for what does not fit, or was not used. `doubtful`: the verdict is worth a note. `turn` rad:
+    the solution does not know its heading, and is to be turned by so much about up before it is one to linearise
+    at.
     """
 
     verdict: str
     factors: Callable[[Fit], list[gtsam.NonlinearFactor]] | None = None
+    doubtful: bool = False
     turn: float = 0.0
     points: tuple[Any, NDArray[np.bool_]] | None = None
     """Surveyed points with the moments that were found, and which of them are held."""

@@ -72,19 +72,19 @@ UNKNOWN_HEADING = 0.35
 class Solution:
     """What the smoother found, and how far to believe it.
 
-    `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6),
-    accelerometer m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases) as the
-    graph has them: with the fixes of an inertial unit, which drift together, `keyframes` and `trajectory` say more.
-    For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
-    outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
-    `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
-    standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected, its walk aside;
-    fixes have `fix_inflation` times the standard deviations that they say;
-    `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
-    where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
-    slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
-    asked for; `points` the surveyed points against the trajectory; `notes` says in words what was repaired or is in
-    doubt.
+    `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6), accelerometer
+    m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases) as the graph has
+    them: with the fixes of an inertial unit, which drift together, `keyframes` and `trajectory` say more. For every
+    fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN outside the IMU's
+    span; `rejected`: does not fit or could not be used. For every relative pose given (r,): `relative_weights` and
+    `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the standard deviations are honest. `imu_noise` is
+    the noise used, `inflation` times the one expected, its walk aside; fixes have `fix_inflation` times the
+    standard deviations that they say; `calibration` the time offset and lever arm used; `vehicle` how the IMU sits
+    on it and what its axle slides, None where the vehicle constraint was not asked for or LiDAR odometry took its
+    place; `wheels` scale, offset, latency and slip of the wheels, None where none were given or asked for;
+    `condensed` the drive in short, None where it was not asked for; `beside` what became of measurements beside IMU
+    and fixes, in words; `points` the surveyed points against the trajectory; `notes` says in words what was
+    repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -105,6 +105,7 @@ class Solution:
     vehicle: Vehicle | None = None
     wheels: Wheels | None = None
     condensed: CondensedDrive | None = None
+    beside: tuple[str, ...] = ()
     points: tuple[PointResidual, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -189,7 +190,9 @@ def smooth(
             *one.points, found.keyframes, calibration.p_imu_antenna, calibration.time_offset_s
         )
     ]
-    found = replace(found, points=tuple(points), notes=(*found.notes, *(one.verdict for one in beside)))
+    doubts = [one.verdict for one in beside if one.doubtful]
+    verdicts = tuple(one.verdict for one in beside)
+    found = replace(found, points=tuple(points), beside=verdicts, notes=(*found.notes, *doubts))
     if not condensed:
         return found
     lacking = _lacking(fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3])

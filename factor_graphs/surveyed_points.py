@@ -148,9 +148,9 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit, offset_s:
         verdict += f"; {len(points) - len(there)} of a time or place without the drive"
     if not fits[there].all():
         verdict += f"; {_mistake(points, off, there[~fits[there]], len(there))}"
-    return Observed(
-        verdict, partial(_factors, known, problem, np.flatnonzero(held), at, late), points=(known, held)
-    )
+    factors = partial(_factors, known, problem, np.flatnonzero(held), at, late)
+    doubtful = len(there) < len(points) or not fits[there].all()
+    return Observed(verdict, factors, doubtful, points=(known, held))
 
 
 def residuals_of(

@@ -122,6 +122,7 @@ def about_solution(solution: Solution | None) -> dict[str, Any] | None:
         "vehicle_constraint": None if solution.vehicle is None else solution.vehicle.verdict,
         "wheel_speed": None if solution.wheels is None else solution.wheels.verdict,
         "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
+        **({"other_measurements": list(solution.beside)} if solution.beside else {}),
         **(
             {"surveyed_points": [_with_nulls(asdict(one)) for one in solution.points]}
             if solution.points

@@ -9,9 +9,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.simulation import random_drive
+from factor_graphs.measurements import ImuNoise
+from factor_graphs.receiver_rows import ROW_COLUMNS
+from factor_graphs.simulation import (
+    random_drive,
+    simulate_gnss,
+    simulate_headings,
+    simulate_imu,
+    simulate_velocities,
+)
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.export.navigation import write_attitude, write_sbet
+from gnss_sem_map.mapping.trajectory import smooth_log
+from gnss_sem_map.scans.lidar_odometry import TrajectorySettings
 
 FRAME = LocalFrame(49.0, 8.4, 115.0)
 WEDNESDAY_NS = int(np.datetime64("2026-01-07T01:00:00", "ns").astype(np.int64))
@@ -63,6 +74,46 @@ def test_an_sbet_has_time_place_attitude_and_motion(tmp_path: Path) -> None:
         ).max()
         < 0.2
     )
+
+
+def test_what_a_csv_log_has_beside_fixes_takes_part(tmp_path: Path) -> None:
+    """Correlations, velocity, heading and surveyed points of the files come to the smoother, and are told."""
+    rng, lever = np.random.default_rng(1), np.array([0.5, 0.3, 1.0])
+    motion, stamps = random_drive(60.0, rng), np.arange(0.5, 59.0)
+    imu = simulate_imu(motion, np.arange(0, 60, 0.02), FRAME, ImuNoise(), rng)
+    fixes = simulate_gnss(motion, stamps, (1.0, 1.0, 2.0), lever, rng)
+    velocities = simulate_velocities(motion, stamps, (0.05, 0.05, 0.1), lever, rng)
+    headings = simulate_headings(motion, stamps, 0.01, rng=rng)
+    place = motion.poses([30.0])[0]
+    point = FRAME.to_geodetic((place[:3, 3] + place[:3, :3] @ lever)[None])
+    tables = {
+        "imu": (["stamp_s", "ax", "ay", "az", "wx", "wy", "wz"], [imu.stamps, imu.specific_force, imu.angular_rate]),
+        "gnss": (
+            ROW_COLUMNS,
+            [stamps, *FRAME.to_geodetic(fixes.positions), fixes.stddevs, np.tile([0.3, 0, 0], (len(stamps), 1)),
+             velocities.velocities, velocities.stddevs, np.degrees(headings.azimuths), np.degrees(headings.stddevs)],
+        ),
+    }  # fmt: skip
+    for name, (columns, values) in tables.items():
+        head = ",".join(columns)
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack(values), "%.12g", ",", header=head, comments="")
+    (tmp_path / "control_points.csv").write_text(
+        "name,type,stamp_s,lat_deg,lon_deg,alt_m\nP,control,30,"
+        + ",".join(f"{x[0]:.10f}" for x in point)
+        + "\n"
+    )
+    (tmp_path / "log.yaml").write_text("p_imu_antenna: [0.5, 0.3, 1]\np_imu_antenna2: [1.5, 0.3, 1]\n")
+    log = open_drive(tmp_path)
+    found = smooth_log(log, TrajectorySettings())
+    assert log.gnss is not None
+    assert log.gnss.correlations is not None
+    assert [verdict.split(":")[0] for verdict in found.beside] == [
+        "GNSS velocity",
+        "antenna heading",
+        "surveyed points",
+    ]
+    assert found.points[0].used
+    assert max(abs(found.points[0].d_east_m), abs(found.points[0].d_north_m)) < 0.05
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (10, 0, 90), (0, 20, 180), (-5, 8, 300), (3, -30, 45)])

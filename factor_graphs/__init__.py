@@ -12,21 +12,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from factor_graphs.csv_log import read_csv, read_wheels
+    from factor_graphs.csv_log import read_csv, read_headings, read_points, read_velocities, read_wheels
     from factor_graphs.geodesy import LocalFrame
-    from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
+    from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, WheelSpeeds
     from factor_graphs.smoothing import smooth
+    from factor_graphs.surveyed_points import SurveyedPoints
     from factor_graphs.trajectory import Trajectory
     from factor_graphs.trajectory_plot import write_trajectory_plot
     from factor_graphs.tum import write_covariance_tum, write_tum
 
 __all__ = [
+    "AntennaHeadings",
     "GnssFixes",
+    "GnssVelocities",
     "ImuSamples",
     "LocalFrame",
+    "SurveyedPoints",
     "Trajectory",
     "WheelSpeeds",
     "read_csv",
+    "read_headings",
+    "read_points",
+    "read_velocities",
     "read_wheels",
     "smooth",
     "write_covariance_tum",
@@ -35,12 +42,18 @@ __all__ = [
 ]
 
 _PLACES = {
+    "AntennaHeadings": "measurements",
     "GnssFixes": "measurements",
+    "GnssVelocities": "measurements",
     "ImuSamples": "measurements",
     "LocalFrame": "geodesy",
+    "SurveyedPoints": "surveyed_points",
     "Trajectory": "trajectory",
     "WheelSpeeds": "measurements",
     "read_csv": "csv_log",
+    "read_headings": "csv_log",
+    "read_points": "csv_log",
+    "read_velocities": "csv_log",
     "read_wheels": "csv_log",
     "smooth": "smoothing",
     "write_covariance_tum": "tum",

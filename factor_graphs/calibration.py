@@ -74,10 +74,10 @@ def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
     T, velocities = motion_from(fit.values)
     unit, x, y, z = gtsam.noiseModel.Unit.Create(3), *problem.p_imu_antenna
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    scales = (np.sqrt(fit.weights)[:, None] / problem.fixes.stddevs)[:, :, None]
+    W = problem.fixes.whitening * np.sqrt(fit.weights)[:, None, None]
     R, p = T[problem.at, :3, :3], T[problem.at, :3, 3]
-    by_pose = np.concatenate([-R @ lever, R], axis=2) * scales
-    by_calibration = np.concatenate([velocities[problem.at, :, None], R], axis=2) * scales
-    off = (problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna) * scales[:, :, 0]
+    by_pose = W @ np.concatenate([-R @ lever, R], axis=2)
+    by_calibration = W @ np.concatenate([velocities[problem.at, :, None], R], axis=2)
+    off = np.einsum("mij,mj->mi", W, problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna)
     for i, pose, calibration, right in zip(problem.at.tolist(), by_pose, by_calibration, off, strict=True):
         yield gtsam.JacobianFactor(X(i), pose, C(0), calibration, right, unit)

@@ -114,7 +114,7 @@ def _posed(
             for first, last in group.blocks:
                 kept[first : last + 1], shifts[first : last + 1] = True, middle - group.offset
     rows = np.flatnonzero(problem.used)[kept]
-    some = GnssFixes(fixes.stamps[rows], fixes.positions[rows] + shifts[kept], fixes.stddevs[rows])
+    some = replace(fixes[rows], positions=fixes.positions[rows] + shifts[kept])
     posed, used = pose(some), np.zeros(len(fixes), np.bool_)
     used[rows] = posed.used
     return replace(posed, used=used, common_stddevs=(common[0], common[1], common[2]))

@@ -11,20 +11,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.errors import MeasurementError, RepairWarning
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import (
+    AntennaHeadings,
     GnssFixes,
+    GnssVelocities,
     ImuSamples,
     WheelSpeeds,
-    clean_gnss,
     clean_imu,
     clean_wheels,
     far_off,
     unit_fault,
 )
+from factor_graphs.receiver_rows import GNSS_COLUMNS as GNSS_COLUMNS
+from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.surveyed_points import SurveyedPoints, to_points
 from factor_graphs.valid_fixes import valid_fixes
 
 if TYPE_CHECKING:
@@ -34,11 +38,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 IMU_COLUMNS = ("stamp_s", "ax", "ay", "az", "wx", "wy", "wz")
-GNSS_COLUMNS = ("stamp_s", "lat_deg", "lon_deg", "alt_m", "std_e_m", "std_n_m", "std_u_m")
 WHEEL_COLUMNS = ("stamp_s", "speed_mps")
 # Usual steps are far shorter; stamps in milliseconds instead of seconds make them longer.
 LONGEST_IMU_STEP_S, LONGEST_FIX_STEP_S, LONGEST_WHEEL_STEP_S = 0.5, 100.0, 5.0
+MAY_LACK = ("stamp_s", "std_e_m", "std_n_m", "std_u_m")
+POINT_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "easting_m", "northing_m", "height_m", "epsg", *MAY_LACK)
 LONGEST_HEADER = 10_000
+NOT_DEFINITE = "their covariance is not positive definite; used without correlations"
 NUMBER = r"^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?$"
 # A table with a larger share of damaged rows is another kind of table; its first row is in line 2.
 MOST_DAMAGED, FIRST_ROW = 0.5, 2
@@ -47,24 +53,86 @@ MOST_DAMAGED, FIRST_ROW = 0.5, 2
 def read_csv(folder: Path | str) -> tuple[ImuSamples, GnssFixes, LocalFrame]:
     """Read `imu.csv` and `gnss.csv` of a folder; the local frame has its origin at the first valid fix.
 
-    IMU columns: stamp_s; ax, ay, az, specific force, m/s²; wx, wy, wz, rad/s; x forward, y left, z up. GNSS columns:
-    stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m. Other columns are ignored. Rows that are
-    damaged, without a value, with a repeated stamp, or without a valid fix are dropped, and rows out of order are
-    sorted: a RepairWarning says how many. Raises MeasurementError for a file that is missing, holds no such table, has
-    more damaged rows than others, or has stamps in another unit than seconds.
+    IMU columns: stamp_s; ax, ay, az, specific force, m/s²; wx, wy, wz, rad/s; x forward, y left, z up. GNSS
+    columns: stamp_s; lat_deg, lon_deg, alt_m on WGS 84; std_e_m, std_n_m, std_u_m; if they are there, corr_en,
+    corr_eu, corr_nu, the correlations of the errors. Other columns are ignored. Rows that are damaged, without a
+    value, with a repeated stamp, or without a valid fix are dropped, and rows out of order are sorted: a
+    RepairWarning says how many. Raises MeasurementError for a file that is missing, holds no such table, has more
+    damaged rows than others, or has stamps in another unit than seconds.
     """
     imu_csv, gnss_csv = Path(folder) / "imu.csv", Path(folder) / "gnss.csv"
     imu_rows = _numbers(imu_csv, IMU_COLUMNS, LONGEST_IMU_STEP_S)
     imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
-    gnss_rows, invalid = fix_rows(_numbers(gnss_csv, GNSS_COLUMNS, LONGEST_FIX_STEP_S), str(gnss_csv))
+    gnss_rows, invalid = _receiver_rows(gnss_csv)
     frame = LocalFrame(*(float(value) for value in gnss_rows[0, 1:4]))
-    fixes, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
+    fixes, gnss_repairs, no_covariance = fixes_of(gnss_rows, frame)
     told = [f"{gnss_csv}: {n} rows dropped: {why}" for why, n in invalid.items()]
+    told += [f"{gnss_csv}: {no_covariance} rows: {NOT_DEFINITE}"] if no_covariance else []
     for path, repairs in ((imu_csv, imu_repairs), (gnss_csv, gnss_repairs)):
         told += [f"{path}: {repairs}"] if repairs.dropped or repairs.out_of_order else []
     for message in told:
         warnings.warn(message, RepairWarning, stacklevel=2)
     return imu, fixes, frame
+
+
+def read_velocities(folder: Path | str) -> GnssVelocities | None:
+    """Read the velocities in `gnss.csv` of a folder, for `smooth(..., also=...)`; None where there are none.
+
+    Columns: ve_mps, vn_mps, vu_mps, east, north, up, and std_ve_mps, std_vn_mps, std_vu_mps; without those of up it is
+    not measured. Rows are repaired, and errors raised, as by `read_csv`.
+    """
+    path = Path(folder) / "gnss.csv"
+    rows, _ = _receiver_rows(path)
+    velocities, repairs = velocities_of(rows, LocalFrame(*(float(value) for value in rows[0, 1:4])))
+    if repairs is not None and (repairs.dropped or repairs.out_of_order):
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    return velocities
+
+
+def read_headings(folder: Path | str, baseline: ArrayLike | None = None) -> AntennaHeadings | None:
+    """Read the headings in `gnss.csv` of a folder, for `smooth(..., also=...)`; None where there are none.
+
+    Columns: heading_deg, clockwise from north; std_heading_deg. `baseline` (3,) m from the main antenna to the second
+    one in the imu frame; None: the heading is that of the imu's x axis. Rows are repaired, and errors raised, as by
+    `read_csv`.
+    """
+    path = Path(folder) / "gnss.csv"
+    rows, _ = _receiver_rows(path)
+    headings, repairs = headings_of(rows, LocalFrame(*(float(value) for value in rows[0, 1:4])), baseline)
+    if repairs is not None and (repairs.dropped or repairs.out_of_order):
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    return headings
+
+
+def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:
+    """Read surveyed points, for `smooth(..., also=...)`.
+
+    Columns: name; type, control or check; lat_deg, lon_deg, alt_m, or easting_m, northing_m, height_m and epsg; if they
+    are there, stamp_s and std_e_m, std_n_m, std_u_m. Heights are above the ellipsoid. Raises MeasurementError as
+    `surveyed_points.to_points` does, and for a row that is damaged.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise MeasurementError(
+            f"{path}: cannot be read ({error.strerror}); expected a table of points"
+        ) from None
+    return parse_points(content, frame, str(path))
+
+
+def parse_points(content: bytes, frame: LocalFrame, where: str) -> SurveyedPoints:
+    """Surveyed points of the content of a CSV file; see `read_points`."""
+    header = names_in(content)
+    numbers = [name for name in POINT_COLUMNS if name in header]
+    types = {"name": "string", "type": "string"} | dict.fromkeys(numbers, "float64")
+    table = parse_columns(content, types, where)
+    names, kinds = ([str(text).strip() for text in table[column].to_pylist()] for column in ("name", "type"))
+    values = {name: table[name].to_numpy().astype(np.float64) for name in numbers}
+    for name in [name for name in numbers if name not in MAY_LACK]:
+        if np.isnan(values[name]).any():
+            row = int(np.flatnonzero(np.isnan(values[name]))[0])
+            raise MeasurementError(f"{where}: point {names[row]} has no {name}; expected a number")
+    return to_points(values, tuple(names), tuple(kinds), frame, where)
 
 
 def read_wheels(folder: Path | str) -> WheelSpeeds | None:
@@ -84,7 +152,7 @@ def read_wheels(folder: Path | str) -> WheelSpeeds | None:
 
 
 def fix_rows(rows: Array, where: str) -> tuple[Array, dict[str, int]]:
-    """Of rows of GNSS_COLUMNS (n, 7) the valid fixes, in file order, and the number of invalid rows of each kind.
+    """Of rows (n, c) that begin with GNSS_COLUMNS the valid fixes, in file order; how many of each kind are invalid.
 
     Raises MeasurementError when no row is a valid fix.
     """
@@ -102,13 +170,21 @@ def fix_rows(rows: Array, where: str) -> tuple[Array, dict[str, int]]:
     return near[valid], invalid
 
 
-def parse_numbers(content: bytes, columns: tuple[str, ...], where: str, longest_step_s: float) -> Array:
-    """The named columns of a CSV file, whatever their order, (n, len(columns)); the first is a stamp, s.
+def parse_numbers(
+    content: bytes, columns: tuple[str, ...], where: str, longest_step_s: float, more: tuple[str, ...] = ()
+) -> Array:
+    """The named columns of a CSV file, whatever their order, (n, c), then those of `more`; the first is a stamp, s.
 
-    A cell without a value is NaN. Raises MeasurementError as `parse_columns` does, and for stamps in another unit.
+    A cell without a value is NaN, and so is a column of `more` that is not there. Raises MeasurementError as
+    `parse_columns` does, and for stamps in another unit.
     """
-    table = parse_columns(content, dict.fromkeys(columns, "float64"), where)
-    rows = np.column_stack([table[name].to_numpy() for name in columns]).astype(np.float64)
+    header = names_in(content)
+    there = [*columns, *(name for name in more if name in header)]
+    table = parse_columns(content, dict.fromkeys(there, "float64"), where)
+    rows = np.full((table.num_rows, len(columns) + len(more)), np.nan)
+    for k, name in enumerate([*columns, *more]):
+        if name in there:
+            rows[:, k] = table[name].to_numpy()
     if fault := unit_fault(rows[:, 0], longest_step_s):
         raise MeasurementError(f"{where}: {fault}")
     return rows
@@ -122,12 +198,11 @@ def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table
     import pyarrow as pa
 
     expected = f"expected numbers in columns {','.join(types)}; a stamp is a number of seconds"
-    header = content[:LONGEST_HEADER].partition(b"\n")[0].decode("utf-8-sig", "replace")
-    names = [name.strip().strip('"') for name in header.split(",")]
-    if not header.strip():
+    names = names_in(content)
+    if names == [""]:
         raise MeasurementError(f"{where}: empty; {expected}")
     if wrong := [name for name in types if names.count(name) != 1]:
-        found = " ".join(header.split())[:200]
+        found = " ".join(",".join(names).split())[:200]
         raise MeasurementError(f"{where}: column {wrong[0]} is missing or repeated in {found}; {expected}")
     try:
         table = _read(content, names, types)
@@ -139,6 +214,12 @@ def parse_columns(content: bytes, types: Mapping[str, str], where: str) -> Table
     if table.num_rows == 0:
         raise MeasurementError(f"{where}: no rows; {expected}")
     return table
+
+
+def names_in(content: bytes) -> list[str]:
+    """The names of the columns of a CSV file, in its order."""
+    header = content[:LONGEST_HEADER].partition(b"\n")[0].decode("utf-8-sig", "replace")
+    return [name.strip().strip('"') for name in header.split(",")]
 
 
 def _read(
@@ -200,11 +281,17 @@ def _without_damage(content: bytes, names: list[str], types: Mapping[str, str]) 
     return pa.table(columns).take(pa.array(rows, mask=rows < 0))
 
 
-def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
+def _receiver_rows(path: Path) -> tuple[Array, dict[str, int]]:
+    return fix_rows(_numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, MORE_COLUMNS), str(path))
+
+
+def _numbers(
+    path: Path, columns: tuple[str, ...], longest_step_s: float, more: tuple[str, ...] = ()
+) -> Array:
     try:
         content = path.read_bytes()
     except OSError as error:
         raise MeasurementError(
             f"{path}: cannot be read ({error.strerror}); expected a table with columns {','.join(columns)}"
         ) from None
-    return parse_numbers(content, columns, str(path), longest_step_s)
+    return parse_numbers(content, columns, str(path), longest_step_s, more)

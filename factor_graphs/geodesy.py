@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import Transformer
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 
@@ -80,6 +81,16 @@ class LocalFrame:
             np.sin(origin) * np.sin(lat) + np.cos(origin) * outwards,
         ])  # fmt: skip
         return np.asarray(-_normal_gravity(lat, alt_m)[:, None] * up)
+
+    def axes_at(self, points: ArrayLike) -> Array:
+        """Axes east, north, up at points in the map frame (n, 3) m, in the map's axes: R_map_local (n, 3, 3).
+
+        A receiver's velocity and heading are in these: at 49° latitude, 10 km east of the origin north turns by 0.1°.
+        """
+        lat_deg, lon_deg, _ = self.to_geodetic(points)
+        R_earth_local = Rotation.from_euler("ZX", np.column_stack([lon_deg + 90, 90 - lat_deg]), degrees=True)
+        R_earth_map = Rotation.from_euler("ZX", [self.lon_deg + 90, 90 - self.lat_deg], degrees=True)
+        return np.asarray((R_earth_map.inv() * R_earth_local).as_matrix())
 
     @property
     def earth_rate(self) -> Array:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.chi_square import quantile
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import EstimationError
-from factor_graphs.model import motion_from
+from factor_graphs.model import from_values, motion_from, to_values
 from factor_graphs.problem import Fit, Problem, fit_as_expected
 
 Array = NDArray[np.float64]
@@ -60,6 +60,16 @@ def stddevs_of_heading(R_map_imu: Array, covariances: Array) -> Array:
     up = R_map_imu[:, 2]
     variances: Array = np.einsum("ki,kij,kj->k", up, covariances[:, :3, :3], up)
     return np.sqrt(variances)
+
+
+def turned_to(problem: Problem, fit: Fit, turn: float) -> tuple[Problem, Fit]:
+    """A solution that does not know its heading, turned by `turn` rad about up: another measurement knows it."""
+    if turn == 0.0:
+        return problem, fit
+    T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
+    turned = _turned(replace(problem, guess=(T, velocities)), float(np.degrees(turn)))
+    found = replace(fit, values=to_values(turned.guess[0], velocities, biases))
+    return replace(turned, heading_in_doubt=False), found
 
 
 def _is_slow(problem: Problem) -> bool:

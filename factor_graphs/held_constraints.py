@@ -1,5 +1,6 @@
 """What a road vehicle cannot do, and what its wheels say, held in the graph, linearised until that is good enough."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -20,6 +21,7 @@ from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
 from factor_graphs.model import from_values, zero_velocity_factors
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
+from factor_graphs.side_measurements import Observed, factors_of
 from factor_graphs.slip import Slip
 from factor_graphs.slip_variance import found_slip
 from factor_graphs.vehicle import BodyMotion, Vehicle, body_motion, observe
@@ -122,9 +124,14 @@ class _Held:
 
 
 def constrain(
-    problem: Problem, by_fixes: Fit, speeds: WheelSpeeds | None = None
+    problem: Problem,
+    by_fixes: Fit,
+    speeds: WheelSpeeds | None = None,
+    beside: Sequence[Observed] = (),
 ) -> tuple[Fit, list[gtsam.NonlinearFactor], Vehicle | None, Wheels | None]:
     """Add what a road vehicle cannot do, and what its wheels say, linearised at the solution, and again at the next.
+
+    Measurements `beside` are held in `by_fixes` already, and stay.
 
     Slip is looked at again once it is held, for a heading that drifts looks like slip until then; and the IMU's noise,
     which a vehicle that is known to stand shows better. Vehicle and wheels are None where they are not wanted.
@@ -142,7 +149,7 @@ def constrain(
         if held.settled and stood is not None and np.array_equal(stands, stood):
             break
         start, stood = held.with_shared(problem, fit), stands
-        factors = held.factors(problem, start, stands)
+        factors = [*held.factors(problem, start, stands), *factors_of(beside, start)]
         if not factors:
             break
         fit = fit_noise_from(start, problem, factors, held.tolerance)
@@ -152,8 +159,14 @@ def constrain(
             held = held.seen_in(problem, fit, speeds)
     # wheels that fitted only until they were held
     if held.wheels is not None and held.wheels.doubt and settings.wheel_speed != "on":
-        return *constrain(problem, by_fixes)[:3], replace(held.wheels, held=False)
+        return *constrain(problem, by_fixes, beside=beside)[:3], replace(held.wheels, held=False)
     return fit, factors, held.axle or vehicle, held.wheels or wheels
+
+
+def hold_beside(problem: Problem, fit: Fit, beside: Sequence[Observed]) -> Fit:
+    """The solution with measurements beside the fixes; the same where none of them is used."""
+    factors = factors_of(beside, fit)
+    return fit_noise_from(fit, problem, factors, RELATIVE_TOLERANCE) if factors else fit
 
 
 def _observed(

@@ -156,7 +156,7 @@ def _update(problem: Problem, state: _State, m: int) -> tuple[_State, float, boo
 
     kalman = KalmanFilter(dim_x=15, dim_z=3)
     kalman.H[:, THETA], kalman.H[:, P] = -state.R @ _cross(problem.p_imu_antenna), np.eye(3)
-    kalman.R = np.diag(problem.fixes.stddevs[m] ** 2)
+    kalman.R = problem.fixes.covariances[m]
     kalman.P = state.covariance
     innovation = problem.fixes.positions[m] - state.p - state.R @ problem.p_imu_antenna
     kalman.update(innovation)

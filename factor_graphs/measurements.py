@@ -5,6 +5,7 @@ them, repair what has one obvious repair, and report every row that they dropped
 """
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.errors import MeasurementError
 from factor_graphs.filled_gaps import filled_in
 from factor_graphs.imu_noise import ImuNoise as ImuNoise
+from factor_graphs.position_covariances import are_correlations, covariances_of
 
 Array = NDArray[np.float64]
 
@@ -21,6 +23,10 @@ LARGEST_OF_IMU = 1e6
 # Faster than this, m/s, and than so many usual speeds (in whatever unit), a wheel speed is a code for "not available";
 # so is what is larger than the last, in any unit.
 LARGEST_OF_WHEELS, LARGEST_OF_USUAL, LARGEST_OF_ANY = 150.0, 10.0, 1e6
+# Standard deviation, m/s, of a component of velocity that is not measured: no vehicle is as fast.
+UNMEASURED = 1e3
+# Antennas nearer to each other than this show no heading.
+LEAST_BASELINE_M = 0.05
 # A longer step than so many usual ones is a gap: where one row is lost it is of two, with some jitter.
 LONGEST_STEP = 2.5
 # Rows farther than a break from all others are of the same drive when they are many, or within a day.
@@ -54,13 +60,15 @@ class ImuSamples:
 class GnssFixes:
     """Antenna positions in the map frame with the receiver's own standard deviations.
 
-    `stamps` (m,) s, strictly increasing; `positions` (m, 3) m; `stddevs` (m, 3) m, positive. No fix at all
-    is a legal value. Raises MeasurementError as `ImuSamples` does, and for a stddev that is not positive.
+    `stamps` (m,) s, strictly increasing; `positions` (m, 3) m; `stddevs` (m, 3) m, positive; `correlations` (m, 3) of
+    the errors east-north, east-up and north-up, None: not correlated. No fix at all is a legal value. Raises
+    MeasurementError as `ImuSamples` does, for a stddev that is not positive, and for correlations of no covariance.
     """
 
     stamps: Array
     positions: Array
     stddevs: Array
+    correlations: Array | None = None
 
     def __post_init__(self) -> None:
         _freeze(self)
@@ -70,12 +78,31 @@ class GnssFixes:
             raise MeasurementError(
                 f"GnssFixes.stddevs[{row}] is {self.stddevs[row]} m; expected positive values"
             )
+        if self.correlations is not None and not (possible := are_correlations(self.correlations)).all():
+            row = int(np.flatnonzero(~possible)[0])
+            raise MeasurementError(
+                f"GnssFixes.correlations[{row}] is {self.correlations[row]}; expected those of a positive definite"
+                " covariance: make them with factor_graphs.position_covariances"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssFixes":
-        return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows])
+        correlations = None if self.correlations is None else self.correlations[rows]
+        return GnssFixes(self.stamps[rows], self.positions[rows], self.stddevs[rows], correlations)
+
+    @cached_property
+    def covariances(self) -> Array:
+        """(m, 3, 3) m², of the errors east, north, up."""
+        return covariances_of(self.stddevs, self.correlations)
+
+    @cached_property
+    def whitening(self) -> Array:
+        """(m, 3, 3) 1/m: the matrices W that make unit noise of the errors, WᵀW being the inverse covariance."""
+        if self.correlations is None:
+            return np.eye(3) / self.stddevs[:, :, None]
+        return np.linalg.inv(np.linalg.cholesky(self.covariances))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +122,70 @@ class WheelSpeeds:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+
+@dataclass(frozen=True, eq=False)
+class GnssVelocities:
+    """Velocity of the antenna in the map frame as a receiver measures it, by Doppler or by its filter.
+
+    `stamps` (n,) s on the clock of the fixes, strictly increasing; `velocities` (n, 3) m/s; `stddevs` (n, 3) m/s,
+    positive, and UNMEASURED for what is not measured: speed and course say nothing of up. Raises MeasurementError as
+    `GnssFixes` does.
+    """
+
+    stamps: Array
+    velocities: Array
+    stddevs: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "GnssVelocities")
+        if np.any(self.stddevs <= 0):
+            row = int(np.argwhere(self.stddevs <= 0)[0, 0])
+            raise MeasurementError(
+                f"GnssVelocities.stddevs[{row}] is {self.stddevs[row]} m/s; expected positive values"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "GnssVelocities":
+        return GnssVelocities(self.stamps[rows], self.velocities[rows], self.stddevs[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class AntennaHeadings:
+    """Azimuth of the baseline between two antennas of a receiver, clockwise from the map's north.
+
+    `stamps` (n,) s on the clock of the fixes, strictly increasing; `azimuths` (n,) rad; `stddevs` (n,) rad, positive;
+    `baseline` (3,) m, from the main antenna to the second one in the imu frame. Raises MeasurementError as `GnssFixes`
+    does, and for a baseline that shows no heading: of two antennas that are one, or one above the other.
+    """
+
+    stamps: Array
+    azimuths: Array
+    stddevs: Array
+    baseline: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        _check(self, "AntennaHeadings")
+        if np.any(self.stddevs <= 0):
+            row = int(np.flatnonzero(self.stddevs <= 0)[0])
+            raise MeasurementError(
+                f"AntennaHeadings.stddevs[{row}] is {self.stddevs[row]} rad; expected positive values"
+            )
+        if not (level := float(np.linalg.norm(self.baseline[:2]))) >= LEAST_BASELINE_M:
+            raise MeasurementError(
+                f"the two antennas are {level:.3f} m apart in the plane of the imu, expected {LEAST_BASELINE_M} m or"
+                " more: p_imu_antenna2 is the place of the second antenna"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "AntennaHeadings":
+        return AntennaHeadings(self.stamps[rows], self.azimuths[rows], self.stddevs[rows], self.baseline)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,13 +249,16 @@ def measured(imu: ImuSamples) -> ImuSamples:
     return imu[~filled] if filled.any() else imu
 
 
-def clean_gnss(stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike) -> tuple[GnssFixes, Repairs]:
+def clean_gnss(
+    stamps: ArrayLike, positions: ArrayLike, stddevs: ArrayLike, correlations: ArrayLike | None = None
+) -> tuple[GnssFixes, Repairs]:
     """Raw fixes -> fixes in order of time, once each, and the report of what was repaired.
 
-    `stamps` (m,) s; `positions` (m, 3) m in the map frame; `stddevs` (m, 3) m. Raises MeasurementError for
-    another shape and for a stddev that is not positive.
+    `stamps` (m,) s; `positions` (m, 3) m in the map frame; `stddevs` (m, 3) m; `correlations` (m, 3) as in `GnssFixes`,
+    with NaN or zeros where they are not known. Raises MeasurementError as `GnssFixes` does.
     """
-    columns, repairs = _clean("GNSS", stamps, positions, stddevs)
+    given = [] if correlations is None else [np.nan_to_num(np.asarray(correlations, np.float64))]
+    columns, repairs = _clean("GNSS", stamps, positions, stddevs, *given)
     return GnssFixes(*columns), repairs
 
 
@@ -182,6 +276,37 @@ def clean_wheels(stamps: ArrayLike, speeds: ArrayLike) -> tuple[WheelSpeeds, Rep
     kept = cleaned[sensible]
     repairs = replace(repairs, absurd=int(np.count_nonzero(~sensible)), gaps=gaps(kept))
     return WheelSpeeds(kept, values[sensible]), repairs
+
+
+def clean_velocities(
+    stamps: ArrayLike, velocities: ArrayLike, stddevs: ArrayLike
+) -> tuple[GnssVelocities, Repairs]:
+    """Raw GNSS velocities -> those in order of time, once each, and the report of what was repaired.
+
+    Shapes and units as in `GnssVelocities`. An upward component without a value becomes one that is not measured; rows
+    without east and north, or with a stddev of theirs that is not positive, are dropped. Raises MeasurementError for
+    another shape.
+    """
+    v, s = (np.array(c, np.float64) for c in (velocities, stddevs))
+    known = np.isfinite(v) & (s > 0) & (np.abs(v) < UNMEASURED)
+    flat = ~known[..., 2]
+    v[flat, 2], s[flat, 2], known[flat, 2] = 0.0, UNMEASURED, True
+    v[~known.all(axis=-1)] = np.nan
+    columns, repairs = _clean("GNSS velocity", stamps, v, s)
+    return GnssVelocities(*columns), repairs
+
+
+def clean_headings(
+    stamps: ArrayLike, azimuths: ArrayLike, stddevs: ArrayLike, baseline: ArrayLike
+) -> tuple[AntennaHeadings, Repairs]:
+    """Raw headings -> those in order of time, once each, and the report of what was repaired.
+
+    Shapes and units as in `AntennaHeadings`; rows with a stddev that is not positive are dropped. Raises
+    MeasurementError as it does.
+    """
+    s = np.asarray(stddevs, np.float64)
+    columns, repairs = _clean("antenna heading", stamps, azimuths, np.where(s > 0, s, np.nan), width=())
+    return AntennaHeadings(columns[0], columns[1], columns[2], np.asarray(baseline, np.float64)), repairs
 
 
 def far_off(stamps: Array) -> NDArray[np.bool_]:
@@ -247,18 +372,24 @@ def _clean(
     return columns, Repairs(sensor, n, missing, repeated, out_of_order, int(off.sum()), gaps(columns[0]))
 
 
-def _freeze(value: ImuSamples | GnssFixes | WheelSpeeds) -> None:
+def _freeze(value: "Measurements") -> None:
     for f in fields(value):
-        array = np.array(getattr(value, f.name), dtype=np.float64)
+        if (given := getattr(value, f.name)) is None:
+            continue
+        array = np.array(given, dtype=np.float64)
         array.setflags(write=False)
         object.__setattr__(value, f.name, array)
 
 
-def _check(value: ImuSamples | GnssFixes | WheelSpeeds, what: str) -> None:
+def _check(value: "Measurements", what: str) -> None:
     n = len(value.stamps) if value.stamps.ndim == 1 else -1
     for f in fields(value):
-        array = getattr(value, f.name)
-        expected = (n,) if f.name in ("stamps", "speeds") else (n, 3)
+        if (array := getattr(value, f.name)) is None:
+            continue
+        of_one = f.name in ("stamps", "speeds", "azimuths") or (
+            f.name == "stddevs" and hasattr(value, "azimuths")
+        )
+        expected = (3,) if f.name == "baseline" else (n,) if of_one else (n, 3)
         if array.shape != expected:
             raise MeasurementError(f"{what}.{f.name} has shape {array.shape}; expected {expected}")
         if not np.isfinite(array).all():
@@ -273,3 +404,6 @@ def _check(value: ImuSamples | GnssFixes | WheelSpeeds, what: str) -> None:
             f"{what}.stamps go from {value.stamps[row]} to {value.stamps[row + 1]} s at row {row + 1}; "
             "expected strictly increasing: sort and drop repeats with clean_imu/clean_gnss/clean_wheels"
         )
+
+
+Measurements = ImuSamples | GnssFixes | GnssVelocities | AntennaHeadings | WheelSpeeds

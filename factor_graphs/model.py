@@ -81,8 +81,13 @@ def gnss_factors(
     loss: gtsam.noiseModel.mEstimator.Base | None,
 ) -> Iterator[gtsam.GPSFactorArm]:
     """Every fix holds the antenna of its keyframe's pose."""
-    for keyframe, position, stddevs in zip(keyframes.tolist(), fixes.positions, fixes.stddevs, strict=True):
-        model: gtsam.noiseModel.Base = gtsam.noiseModel.Diagonal.Sigmas(stddevs)
+    models = (
+        map(gtsam.noiseModel.Diagonal.Sigmas, fixes.stddevs)
+        if fixes.correlations is None
+        else map(gtsam.noiseModel.Gaussian.Covariance, fixes.covariances)
+    )
+    for keyframe, position, stated in zip(keyframes.tolist(), fixes.positions, models, strict=True):
+        model: gtsam.noiseModel.Base = stated
         if loss is not None:
             model = gtsam.noiseModel.Robust.Create(loss, model)
         yield gtsam.GPSFactorArm(X(keyframe), position, p_imu_antenna, model)

@@ -45,6 +45,7 @@ RELATIVE_GOOD_MEAN = 6 * probability_below(RELATIVE_GATE, 8) / probability_below
 CARRIED_S = 0.025
 # The cost stands still when it changes by less than this share; by the second where another solution begins there.
 RELATIVE_TOLERANCE, ROUGH = 1e-5, 1e-3
+NOWHERE = np.empty(0)
 
 LOSSES: dict[str, gtsam.noiseModel.mEstimator.Base | None] = {
     "quadratic": None,
@@ -95,8 +96,7 @@ class Problem:
 
     def with_fix_noise(self, of_fixes: float) -> "Problem":
         """The same with fixes of so many times the standard deviations that they say."""
-        f = self.fixes
-        fixes = GnssFixes(f.stamps, f.positions, f.stddevs * (of_fixes / self.of_fixes))
+        fixes = replace(self.fixes, stddevs=self.fixes.stddevs * (of_fixes / self.of_fixes))
         return replace(self, fixes=fixes, of_fixes=of_fixes)
 
     def antennas_found(self, T: Array, velocities: Array) -> Array:
@@ -148,14 +148,19 @@ def pose_problem(
     p_imu_antenna: Array,
     attitude: AttitudePrior | None,
     relative: RelativePoses = NO_RELATIVE_POSES,
+    also_at: Array = NOWHERE,
 ) -> Problem:
-    """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes."""
+    """Choose the fixes and keyframes, and make the first guess; raises MeasurementError below three fixes.
+
+    `also_at` (n,) s: where other measurements want keyframes.
+    """
     used, notes = usable_fixes(fixes, imu, settings.max_speed_mps)
     relative_used = np.all((relative.stamps >= imu.stamps[0]) & (relative.stamps <= imu.stamps[-1]), axis=1)
     relative = relative[relative_used]
     correlation_times_s = correlation_times(fixes[used], settings, relative.stamps)
     kept = decorrelate(fixes[used], correlation_times_s, settings.min_fix_stddev_m)
-    own = kept.stamps[~_near(kept.stamps, relative.stamps.ravel())]
+    own = np.concatenate([kept.stamps, also_at[(also_at >= imu.stamps[0]) & (also_at <= imu.stamps[-1])]])
+    own = own[~_near(own, relative.stamps.ravel())]
     intervals = split(imu, np.concatenate([own, relative.stamps.ravel()]), settings.keyframe_interval_s)
     if intervals.blind.any():
         silent = np.diff(intervals.keyframes)[intervals.blind].sum()
@@ -314,7 +319,7 @@ def _squares(problem: Problem, values: gtsam.Values) -> Array:
     T, velocities = motion_from(values)
     R, p = T[problem.at, :3, :3], T[problem.at, :3, 3]
     off = problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna
-    squares: Array = np.sum((off / problem.fixes.stddevs) ** 2, axis=1)
+    squares: Array = np.sum(np.einsum("mij,mj->mi", problem.fixes.whitening, off) ** 2, axis=1)
     return squares
 
 

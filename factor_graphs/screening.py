@@ -1,5 +1,7 @@
 """Which fixes can be used at all, before any estimation, and how much a crowd of them weighs."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -107,4 +109,4 @@ def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev
     apart = (here - first) * t - (sums[here] - sums[first]) + (sums[last] - sums[here]) - (last - here) * t
     white = white_share(fixes) ** 2
     crowd = white + (1 - white) * np.maximum(last - first - apart / time, 1.0)[:, None]
-    return GnssFixes(fixes.stamps, fixes.positions, np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))
+    return replace(fixes, stddevs=np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))

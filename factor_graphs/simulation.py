@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import (
+    AntennaHeadings,
+    GnssFixes,
+    GnssVelocities,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+)
 from factor_graphs.rigid_motion import Mounted, RigidMotion, turn_rates
 
 Array = NDArray[np.float64]
@@ -249,6 +256,39 @@ def simulate_gnss(
     seen = np.logical_and.reduce([(t < a) | (t > b) for a, b in outages], initial=True)
     seen = np.broadcast_to(seen, t.shape)
     return GnssFixes(t[seen], positions[seen], np.tile(claimed, (int(seen.sum()), 1)))
+
+
+def simulate_velocities(
+    motion: RigidMotion,
+    stamps: ArrayLike,
+    stddevs: ArrayLike,
+    p_imu_antenna: ArrayLike = (0.0, 0.0, 0.0),
+    rng: np.random.Generator | None = None,
+) -> GnssVelocities:
+    """What a GNSS receiver says of the velocity of its antenna, `stddevs` (3,) m/s; exact when `rng` is None."""
+    t, claimed = np.asarray(stamps, np.float64), np.broadcast_to(np.asarray(stddevs, np.float64), (3,))
+    step, lever = 1e-3, np.asarray(p_imu_antenna, np.float64)
+    before, after = (
+        T[:, :3, 3] + T[:, :3, :3] @ lever for T in (motion.poses(t - step), motion.poses(t + step))
+    )
+    velocities = (after - before) / (2 * step)
+    if rng is not None:
+        velocities = velocities + claimed * rng.standard_normal((len(t), 3))
+    return GnssVelocities(t, velocities, np.tile(claimed, (len(t), 1)))
+
+
+def simulate_headings(
+    motion: RigidMotion,
+    stamps: ArrayLike,
+    stddev: float,
+    baseline: ArrayLike = (1.0, 0.0, 0.0),
+    rng: np.random.Generator | None = None,
+) -> AntennaHeadings:
+    """What a receiver says of the azimuth of a baseline (3,) m in the imu frame; exact when `rng` is None."""
+    t, b = np.asarray(stamps, np.float64), np.asarray(baseline, np.float64)
+    east, north, _ = (motion.poses(t)[:, :3, :3] @ b).T
+    azimuths = np.arctan2(east, north) + (0.0 if rng is None else stddev * rng.standard_normal(len(t)))
+    return AntennaHeadings(t, azimuths % (2 * np.pi), np.full(len(t), stddev), b)
 
 
 def simulate_wheels(

@@ -1,12 +1,13 @@
 """The batch smoother: IMU, GNSS and what else there is in, the most probable trajectory out, with covariance."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.antenna_heading import observe_headings
 from factor_graphs.calibration import Calibration
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
@@ -21,21 +22,40 @@ from factor_graphs.fitting import (
     reject,
 )
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.gnss_velocity import observe_velocities
 from factor_graphs.gyroscope_bias import large_gyroscope_bias
-from factor_graphs.heading import of_any_heading, stddevs_of_heading, with_heading
-from factor_graphs.held_constraints import constrain
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
+from factor_graphs.heading import of_any_heading, stddevs_of_heading, turned_to, with_heading
+from factor_graphs.held_constraints import constrain, hold_beside
+from factor_graphs.measurements import (
+    AntennaHeadings,
+    GnssFixes,
+    GnssVelocities,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+    measured,
+)
 from factor_graphs.model import from_values
-from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
+from factor_graphs.problem import GATE, NOWHERE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting
 from factor_graphs.settings import SmootherSettings as SmootherSettings
+from factor_graphs.side_measurements import Observed
+from factor_graphs.surveyed_points import (
+    PointResidual,
+    SurveyedPoints,
+    observe_points,
+    residuals_of,
+)
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.variance import BiasSteps, correlation_time_shown, imu_noise_shown
 from factor_graphs.vehicle import Vehicle
 from factor_graphs.wheels import Wheels
 
 Array = NDArray[np.float64]
+
+Also = GnssVelocities | AntennaHeadings | SurveyedPoints
+"""What may be known beside IMU and fixes."""
 
 # Beyond 99.9 % of good relative poses one is rejected: so many in a hundred are ten times what chance takes.
 NOTABLE_REJECTION = 0.01
@@ -53,18 +73,19 @@ UNKNOWN_HEADING = 0.35
 class Solution:
     """What the smoother found, and how far to believe it.
 
-    `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6),
-    accelerometer m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases) as the
-    graph has them: with the fixes of an inertial unit, which drift together, `keyframes` and `trajectory` say more.
-    For every fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN
-    outside the IMU's span; `rejected`: does not fit or could not be used. For every relative pose given (r,):
-    `relative_weights` and `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the
-    standard deviations are honest. `imu_noise` is the noise used, `inflation` times the one expected, its walk aside;
-    fixes have `fix_inflation` times the standard deviations that they say;
-    `calibration` the time offset and lever arm used; `vehicle` how the IMU sits on it and what its axle slides, None
-    where the vehicle constraint was not asked for or LiDAR odometry took its place; `wheels` scale, offset, latency and
-    slip of the wheels, None where none were given or asked for; `condensed` the drive in short, None where it was not
-    asked for; `notes` says in words what was repaired or is in doubt.
+    `trajectory`: dense, at every IMU stamp; `keyframes` (k): the graph's own states; `biases` (k, 6), accelerometer
+    m/s² then gyroscope rad/s; `state_covariances` (k, 15, 15) of (pose tangent, velocity, biases) as the graph has
+    them: with the fixes of an inertial unit, which drift together, `keyframes` and `trajectory` say more. For every
+    fix given (m,): `fix_weights`, from 0 to 1; `fix_residuals` (m, 3) m, fix minus antenna, NaN outside the IMU's
+    span; `rejected`: does not fit or could not be used. For every relative pose given (r,): `relative_weights` and
+    `relative_rejected`, likewise. `chi2_per_dof` is about 1 when the standard deviations are honest. `imu_noise` is
+    the noise used, `inflation` times the one expected, its walk aside; fixes have `fix_inflation` times the
+    standard deviations that they say; `calibration` the time offset and lever arm used; `vehicle` how the IMU sits
+    on it and what its axle slides, None where the vehicle constraint was not asked for or LiDAR odometry took its
+    place; `wheels` scale, offset, latency and slip of the wheels, None where none were given or asked for;
+    `condensed` the drive in short, None where it was not asked for; `beside` what became of measurements beside IMU
+    and fixes, in words; `points` the surveyed points against the trajectory; `notes` says in words what was
+    repaired or is in doubt.
     """
 
     trajectory: Trajectory
@@ -85,6 +106,8 @@ class Solution:
     vehicle: Vehicle | None = None
     wheels: Wheels | None = None
     condensed: CondensedDrive | None = None
+    beside: tuple[str, ...] = ()
+    points: tuple[PointResidual, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -110,14 +133,16 @@ def smooth(
     relative_poses: RelativePoses | None = None,
     wheels: WheelSpeeds | None = None,
     condensed: bool = False,
+    also: Sequence[Also] = (),
 ) -> Solution:
     """Estimate the trajectory of a road vehicle from its IMU and GNSS fixes.
 
-    `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first
-    IMU stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
-    its wheels rolled; none of them need be given. What fills gaps of the IMU with straight lines is not believed. With
-    `condensed` the solution says what is needed to bind it to other drives or to itself (`sessions.bind`). Raises
-    MeasurementError with fewer than three usable fixes, and EstimationError when the optimiser stops at its limit.
+    `p_imu_antenna` (3,) m is the lever arm. `initial_attitude` is what is known of the attitude at the first IMU
+    stamp, `relative_poses` how the vehicle moved between moments (LiDAR odometry or the like), `wheels` how fast
+    its wheels rolled, `also` what else the receiver says; none of them need be given. What fills gaps of the IMU
+    with straight lines is not believed. With `condensed` the solution says what is needed to bind it to other
+    drives or to itself (`sessions.bind`). Raises MeasurementError with fewer than three usable fixes, and
+    EstimationError when the optimiser stops at its limit.
     """
     settings = settings or SmootherSettings()
     given = np.asarray(p_imu_antenna, dtype=np.float64)
@@ -130,19 +155,23 @@ def smooth(
         samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
-        shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
+        shifted = replace(fixes, stamps=fixes.stamps + calibration.time_offset_s)
         lever = calibration.p_imu_antenna
+        also_at = np.concatenate([NOWHERE, *(one.stamps for one in also)]) + calibration.time_offset_s
 
         def pose(some: GnssFixes) -> Problem:
-            return pose_problem(samples, some, frame, settings, lever, initial_attitude, relative)
+            return pose_problem(samples, some, frame, settings, lever, initial_attitude, relative, also_at)
 
         return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
 
     problem, fit, calibration = calibrate(fit_to, settings, given)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
+    beside = [_observe(one, problem, fit, calibration.time_offset_s) for one in also]
+    problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
     by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
-        fit, constraints, vehicle, odometer = constrain(problem, by_fixes, wheels)
+        held = hold_beside(problem, by_fixes, beside)
+        fit, constraints, vehicle, odometer = constrain(problem, held, wheels, beside)
         fit, steps = reject(problem, fit, constraints), BiasSteps(k)
         covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
         if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
@@ -157,12 +186,31 @@ def smooth(
     if filled := len(imu) - len(samples):
         told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
         found = replace(found, notes=(told, *found.notes))
+    points = [
+        residual
+        for one in beside
+        if one.points is not None
+        for residual in residuals_of(
+            *one.points, found.keyframes, calibration.p_imu_antenna, calibration.time_offset_s
+        )
+    ]
+    doubts = [one.verdict for one in beside if one.doubtful]
+    verdicts = tuple(one.verdict for one in beside)
+    found = replace(found, points=tuple(points), beside=verdicts, notes=(*found.notes, *doubts))
     if not condensed:
         return found
     lacking = _lacking(
         problem, fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3]
     )
     return replace(found, condensed=condense(problem, fit, lacking))
+
+
+def _observe(one: Also, problem: Problem, fit: Fit, offset_s: float) -> Observed:
+    if isinstance(one, SurveyedPoints):
+        return observe_points(one, problem, fit, offset_s)
+    if isinstance(one, AntennaHeadings):
+        return observe_headings(one, problem, fit, offset_s)
+    return observe_velocities(one, problem, fit, offset_s)
 
 
 def _solution(

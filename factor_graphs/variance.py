@@ -77,7 +77,7 @@ def fix_noise_shown(problem: Problem, fit: Fit, covariances: Array) -> float:
     at, (x, y, z) = problem.at[good], problem.p_imu_antenna
     R_map_imu = motion_from(fit.values)[0][at, :3, :3]
     lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    rows = np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2) / problem.fixes.stddevs[good, :, None]
+    rows = problem.fixes.whitening[good] @ np.concatenate([-R_map_imu @ lever, R_map_imu], axis=2)
     taken = np.sum((rows @ covariances[at, :6, :6]) * rows)
     expected = GOOD_MEAN / 3 * (3 * good.sum() - taken)
     return _corrected(problem.of_fixes, float(fit.squares[good].sum()), float(expected), ENOUGH)

@@ -296,3 +296,5 @@ def trajectory(
         for part in parts:
             if part is not None:
                 typer.echo(part.verdict)
+        for verdict in () if found.solution is None else found.solution.beside:
+            typer.echo(verdict)

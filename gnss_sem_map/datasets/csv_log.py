@@ -2,9 +2,13 @@
 
     imu.csv             stamp_s,ax,ay,az,wx,wy,wz      specific force m/s², rad/s; x forward, y left, z up;
                                                        or by `imu_axes`, `force_unit`, `rate_unit` in log.yaml
-    gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna
+    gnss.csv            stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m      position of the antenna; optional:
+                                                       corr_en,corr_eu,corr_nu of its errors, and its velocity
+                                                       ve_mps,vn_mps,vu_mps,std_ve_mps,std_vn_mps,std_vu_mps,
+                                                       and heading_deg,std_heading_deg between two antennas
     wheels.csv          stamp_s,speed_mps              optional: below zero in reverse, if the sensor tells; m/s,
                                                        or by `speed_unit` in log.yaml
+    control_points.csv  optional: surveyed points, see `factor_graphs.csv_log.read_points`
     log.yaml            optional: see `log_yaml.LogFile`
     lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
                                                        intensity from 0 to 1, or to `intensity_max` in log.yaml
@@ -31,14 +35,18 @@ from factor_graphs.csv_log import (
     LONGEST_FIX_STEP_S,
     LONGEST_IMU_STEP_S,
     LONGEST_WHEEL_STEP_S,
+    NOT_DEFINITE,
     WHEEL_COLUMNS,
     fix_rows,
     parse_columns,
     parse_numbers,
+    parse_points,
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import WheelSpeeds, clean_gnss, clean_imu, clean_wheels
+from factor_graphs.measurements import WheelSpeeds, clean_imu, clean_wheels
+from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
@@ -72,13 +80,22 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(drive / "imu.csv"))
     gnss_rows, fix_skips = _fix_rows(drive, about, imu.stamps)
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
-    gnss, gnss_repairs = clean_gnss(gnss_rows[:, 0], frame.to_map(*gnss_rows[:, 1:4].T), gnss_rows[:, 4:7])
+    gnss, gnss_repairs, no_covariance = fixes_of(gnss_rows, frame)
+    velocities, velocity_repairs = velocities_of(gnss_rows, frame)
+    with _as_data_error():
+        headings, heading_repairs = headings_of(gnss_rows, frame, about.baseline)
+    cleaned = {"imu.csv": (imu_repairs,), "gnss.csv": (gnss_repairs, velocity_repairs, heading_repairs)}
     skips = [
         Skip("samples", shown(drive / name), str(repairs))
-        for name, repairs in (("imu.csv", imu_repairs), ("gnss.csv", gnss_repairs))
-        if repairs.dropped
+        for name, all_repairs in cleaned.items()
+        for repairs in all_repairs
+        if repairs is not None and repairs.dropped
     ]
+    if no_covariance:
+        said = f"{no_covariance} fixes: {NOT_DEFINITE}"
+        skips.append(Skip("covariance", shown(drive / "gnss.csv"), said, no_covariance))
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
+    points = _points(drive / "control_points.csv", frame)
     lidars, scan_skips = _lidars(drive, about)
     calibration = calibration_of(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
@@ -93,6 +110,9 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         frame=frame,
         imu=imu,
         gnss=gnss,
+        velocities=velocities,
+        headings=headings,
+        points=points,
         wheels=wheels,
         imu_noise=about.imu_noise,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
@@ -105,7 +125,7 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, li
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     path, skips = drive / "gnss.csv", []
     if about.gnss_file is None:
-        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S)
+        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, MORE_COLUMNS)
     elif is_file(path):
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
     else:
@@ -127,10 +147,20 @@ def _wheels(path: Path) -> tuple[WheelSpeeds | None, list[Skip]]:
     return wheels, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 
 
-def _numbers(path: Path, columns: tuple[str, ...], longest_step_s: float) -> Array:
-    """The named columns of a CSV file, whatever their order: (n, len(columns)); the first is a stamp, s."""
+def _points(path: Path, frame: LocalFrame) -> SurveyedPoints | None:
+    """Surveyed points; None where there is no such table."""
+    if not is_file(path):
+        return None
     with _as_data_error():
-        return parse_numbers(_content(path, columns), columns, shown(path), longest_step_s)
+        return parse_points(read_bytes(path, MOST_TABLE_BYTES), frame, shown(path))
+
+
+def _numbers(
+    path: Path, columns: tuple[str, ...], longest_step_s: float, more: tuple[str, ...] = ()
+) -> Array:
+    """The named columns of a CSV file, whatever their order: (n, c), as `parse_numbers` has them."""
+    with _as_data_error():
+        return parse_numbers(_content(path, columns), columns, shown(path), longest_step_s, more)
 
 
 def _content(path: Path, columns: tuple[str, ...]) -> bytes:

@@ -98,6 +98,10 @@ class LogFile(SensorConventions):
     p_imu_antenna: tuple[float, float, float] = Field(
         (0, 0, 0), description="GNSS antenna in the imu frame, m."
     )
+    p_imu_antenna2: tuple[float, float, float] | None = Field(
+        None,
+        description="Second antenna of a receiver that tells heading, m; default: the heading is that of the IMU.",
+    )
     T_imu_lidar: Matrix4 | None = Field(
         None, description="LiDAR to IMU; default: that of the IMU, and the pre-flight check is amber."
     )
@@ -123,6 +127,11 @@ class LogFile(SensorConventions):
     intensity_max: float = Field(
         1.0, gt=0, description="Number for an intensity of 1 in the scans of the only LiDAR."
     )
+
+    @property
+    def baseline(self) -> Array | None:
+        """From the antenna to the second one, (3,) m, in the imu frame."""
+        return None if self.p_imu_antenna2 is None else np.subtract(self.p_imu_antenna2, self.p_imu_antenna)
 
     @property
     def all_lidars(self) -> list[tuple[str, LidarFile]]:

@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuSamples, clean_gnss, clean_imu
+from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, clean_imu
+from factor_graphs.position_covariances import split_covariances
+from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
@@ -68,10 +71,11 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
     fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
     epoch_ns = int(fix_ns[0])
-    gnss, frame, invalid = _usable(fixes, shown(drive))
+    gnss, velocities, frame, invalid = _usable(fixes, shown(drive))
     skips += invalid
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
+    headings = _headings(fixes, frame, rig.gnss, calibration.p_imu_antenna)
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
@@ -91,6 +95,8 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         frame=frame,
         imu=samples,
         gnss=gnss,
+        velocities=velocities,
+        headings=headings,
         imu_noise=rig.imu.noise,
         initial_attitude=attitude,
         attitude_of_unit=True,
@@ -102,7 +108,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 def _fixes(
     bag: Bag, about: GnssTopic, folder: Path, imu: Messages, clock: Clock
 ) -> tuple[Array, NDArray[np.int64], list[Skip]]:
-    """Rows (n, 7) of stamp s, degrees, m and standard deviations m; their Unix times; and the skipped fixes."""
+    """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`; their Unix times; and the skipped fixes."""
     if about.file is not None:
         drive_ns = _span_ns(bag, imu, clock)
         found = read_gnss_file(about.file, folder, None, drive_ns)
@@ -110,19 +116,22 @@ def _fixes(
     assert about.topic is not None
     messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps)
-    rows, stamps, lost = [], [], {"no fix": 0, "its covariance is unknown": 0}
+    rows, stamps, covariances = [], [], []
+    lost = {"no fix": 0, "its covariance is unknown": 0}
     for k in np.flatnonzero(believed).tolist():
         fix = decode(bag, messages, k)
-        stddevs: Array | tuple[float, float, float] | None = about.stddevs_m
+        covariance = None if about.stddevs_m is None else np.diag(np.square(about.stddevs_m))
         if fix.position_covariance_type != roles.UNKNOWN_COVARIANCE:
-            with np.errstate(invalid="ignore"):  # a variance below zero: no valid fix
-                stddevs = np.sqrt(np.asarray(fix.position_covariance, np.float64)[[0, 4, 8]])
+            covariance = np.asarray(fix.position_covariance, np.float64).reshape(3, 3)
+            if fix.position_covariance_type == roles.DIAGONAL_COVARIANCE:
+                covariance = covariance * np.eye(3)
         if fix.status.status == NO_FIX:
             lost["no fix"] += 1
-        elif stddevs is None:
+        elif covariance is None:
             lost["its covariance is unknown"] += 1
         else:
-            rows.append([fix.latitude, fix.longitude, fix.altitude, *stddevs])
+            rows.append([fix.latitude, fix.longitude, fix.altitude])
+            covariances.append(covariance)
             stamps.append(int(said[k]))
     told = {why: count for why, count in lost.items() if count}
     if not rows:
@@ -133,10 +142,14 @@ def _fixes(
         )
     skips += [Skip("fix", messages.topic, f"{count} messages: {why}", count) for why, count in told.items()]
     ns = np.array(stamps, np.int64)
-    return np.column_stack([(ns - ns[0]) * 1e-9, np.array(rows)]), ns, skips
+    stddevs, correlations, wrong = split_covariances(np.array(covariances))
+    if count := int((wrong & (stddevs > 0).all(axis=1)).sum()):  # others are no fixes
+        skips.append(Skip("covariance", messages.topic, f"{count} fixes: {NOT_DEFINITE}", count))
+    table = np.column_stack([(ns - ns[0]) * 1e-9, np.array(rows), stddevs])
+    return with_more(table, correlations=correlations), ns, skips
 
 
-def _usable(rows: Array, where: str) -> tuple[GnssFixes, LocalFrame, list[Skip]]:
+def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, LocalFrame, list[Skip]]:
     """The valid fixes of rows as `_fixes` makes them, in the local frame at the first one, and the skipped ones."""
     valid, invalid = valid_fixes(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
     if not valid.any():
@@ -145,11 +158,25 @@ def _usable(rows: Array, where: str) -> tuple[GnssFixes, LocalFrame, list[Skip]]
         )
     rows = rows[valid]
     frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
-    gnss, repairs = clean_gnss(rows[:, 0], frame.to_map(*rows[:, 1:4].T), rows[:, 4:7])
+    gnss, repairs, no_covariance = fixes_of(rows, frame)
+    velocities, _ = velocities_of(rows, frame)
     skips = [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
     if repairs.dropped:
         skips.append(Skip("samples", where, str(repairs)))
-    return gnss, frame, skips
+    if no_covariance:
+        skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
+    return gnss, velocities, frame, skips
+
+
+def _headings(
+    rows: Array, frame: LocalFrame, about: GnssTopic, p_imu_antenna: Array
+) -> AntennaHeadings | None:
+    """Headings in a file of positions."""
+    second = about.p_imu_antenna2
+    try:
+        return headings_of(rows, frame, None if second is None else np.subtract(second, p_imu_antenna))[0]
+    except MeasurementError as error:
+        raise DataError(f"rig.yaml: gnss: {error}") from None
 
 
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:

@@ -37,6 +37,7 @@ MANY_MOVERS = 40
 """Number of moving objects on the page, those of most points first."""
 TITLES = {"accuracy": "accuracy", "iou": "IoU"}
 LIGHTER = " Lighter: no camera saw it, its class is inferred."
+POINTS = "surveyed_points"
 MAPS = {"map": "before refinement", "refined": "after refinement"}
 
 
@@ -72,7 +73,8 @@ def write_report(folder: Path | str, run: Mapping[str, Any], metrics: Mapping[st
         "dynamic": _shares(metrics.get("dynamic", {})),
         "path": _path(tracks, moved),
         "band": _band(tracks),
-        "trajectory": run.get("trajectory") or {},
+        "trajectory": {name: x for name, x in (run.get("trajectory") or {}).items() if name != POINTS},
+        "points": [tuple(point.values()) for point in (run.get("trajectory") or {}).get(POINTS, ())],
         "trajectory_scores": _with_percentages(metrics.get("trajectory", {})),
         "findings": run.get("preflight", {}).get("findings", ()),
         "counts": run.get("counts", {}),

@@ -18,6 +18,8 @@ FILES = {
     "trajectory_kitti.txt": "the poses as 3 x 4 matrices, for KITTI tools",
     "trajectory.geojson": "the track in WGS 84, for web maps and QGIS",
     "trajectory_wgs84.parquet": "the track in WGS 84 with time, speed and standard deviations, as GeoParquet",
+    "trajectory.sbet": "the same as SBET, for tools of inertial post-processing",
+    "trajectory_attitude.csv": "roll, pitch, heading, standard deviations and fixes along the track",
     "objects.parquet": "what moved: a row per object with its track, size, speed and evidence, as GeoParquet",
     "objects.geojson": "the same in WGS 84, for web maps and QGIS",
     "map": "the map before refinement, with all evidence, as Parquet tiles",

@@ -191,4 +191,5 @@ def smooth_log(
         relative_poses,
         log.wheels,
         condensed=relative_poses is not None and settings.revisits.enabled,
+        also=[one for one in (log.velocities, log.headings, log.points) if one is not None],
     )

@@ -122,7 +122,18 @@ def about_solution(solution: Solution | None) -> dict[str, Any] | None:
         "vehicle_constraint": None if solution.vehicle is None else solution.vehicle.verdict,
         "wheel_speed": None if solution.wheels is None else solution.wheels.verdict,
         "p_imu_antenna_m": np.asarray(solution.calibration.p_imu_antenna).tolist(),
+        **({"other_measurements": list(solution.beside)} if solution.beside else {}),
+        **(
+            {"surveyed_points": [_with_nulls(asdict(one)) for one in solution.points]}
+            if solution.points
+            else {}
+        ),
     }
+
+
+def _with_nulls(values: dict[str, Any]) -> dict[str, Any]:
+    """The same for JSON, which has no NaN."""
+    return {key: None if value != value else value for key, value in values.items()}
 
 
 def _about_refinement(report: RefinementReport) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.smoothing import Solution
 from factor_graphs.trajectory import Trajectory
@@ -18,10 +20,12 @@ from factor_graphs.trajectory_plot import write_trajectory_plot
 from gnss_sem_map.config import DeliverySettings, Settings
 from gnss_sem_map.dynamics.movers import movers_of
 from gnss_sem_map.evaluation.preflight.findings import Preflight
+from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.exported import Exported, sure_part
 from gnss_sem_map.export.formats import write_exports
 from gnss_sem_map.export.georeference import Georeference, check_delivery
 from gnss_sem_map.export.movers import DriveOfMovers, write_movers
+from gnss_sem_map.export.navigation import write_attitude, write_sbet
 from gnss_sem_map.export.report import write_report
 from gnss_sem_map.export.run_files import FILES
 from gnss_sem_map.export.trajectories import (
@@ -275,6 +279,18 @@ def write_trajectory_files(folder: Path, located: Located, delivery: DeliverySet
     if frame is not None:
         write_geojson(trajectory, frame, folder / "trajectory.geojson")
         write_geoparquet(trajectory, frame, located.log.epoch_ns, folder / "trajectory_wgs84.parquet")
+        _write_navigation(folder, located, frame)
+
+
+def _write_navigation(folder: Path, located: Located, frame: LocalFrame) -> None:
+    """Write the SBET, where the log has dates, and the table of attitudes and fixes."""
+    trajectory, log, solution = located.trajectory, located.log, located.solution
+    times = log.epoch_ns + np.round(1e9 * trajectory.stamps[[0, -1]]).astype(np.int64)
+    if are_dates(times).all():
+        write_sbet(trajectory, frame, log.epoch_ns, folder / "trajectory.sbet")
+    fixes = None if log.gnss is None or solution is None else log.gnss.stamps
+    rejected = None if fixes is None or solution is None else solution.rejected
+    write_attitude(trajectory, frame, folder / "trajectory_attitude.csv", fixes, rejected)
 
 
 def write_plot(folder: Path, log: SensorLog, solution: Solution | None) -> None:

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import (
+    AntennaHeadings,
+    GnssFixes,
+    GnssVelocities,
+    ImuNoise,
+    ImuSamples,
+    WheelSpeeds,
+)
+from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
 from gnss_sem_map.sensor_log.cameras import NAME, Camera, is_rigid
@@ -189,6 +197,12 @@ class SensorLog:
     """Origin of the map; None when the drive has no georeference."""
     imu: ImuSamples | None = None
     gnss: GnssFixes | None = None
+    velocities: GnssVelocities | None = None
+    """Of the receiver; None: the log has none."""
+    headings: AntennaHeadings | None = None
+    """Between two antennas of the receiver; None: the log has none."""
+    points: SurveyedPoints | None = None
+    """Where the antenna was, by a survey; None: the log has none."""
     wheels: WheelSpeeds | None = None
     """None: the log has no wheel speed."""
     imu_noise: ImuNoise | None = None
@@ -267,7 +281,10 @@ class SensorLog:
         return replace(
             late,
             imu=None if self.imu is None else theirs.imu_in_ours(self.imu),
-            gnss=None if self.gnss is None else theirs.fixes_in_ours(self.gnss),
+            gnss=None if self.gnss is None else theirs.on_our_clock(self.gnss),
+            velocities=None if self.velocities is None else theirs.on_our_clock(self.velocities),
+            headings=None if self.headings is None else theirs.on_our_clock(self.headings),
+            points=None if self.points is None else theirs.on_our_clock(self.points),
             wheels=None if self.wheels is None else theirs.wheels_in_ours(self.wheels),
             initial_attitude=attitude,
             conventions=None,

@@ -5,7 +5,8 @@ Ours: x forward, y left, z up; specific force in m/s² (at rest it points up), a
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
-from factor_graphs.measurements import GnssFixes, ImuSamples, WheelSpeeds
+from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, WheelSpeeds
+from factor_graphs.surveyed_points import SurveyedPoints
 
 Array = NDArray[np.float64]
+OfReceiver = TypeVar("OfReceiver", GnssFixes, GnssVelocities, AntennaHeadings, SurveyedPoints)
 
 NAMED_AXES = {"flu": "x y z", "frd": "x -y -z", "rfu": "y -x z"}
 """Forward left up, forward right down, right forward up: each says where our x, y, z are among the sensor's axes."""
@@ -98,11 +101,11 @@ class SensorConventions(BaseModel):
         variances = np.diag((turn * unit.stddevs**2) @ turn.T)
         return AttitudePrior(unit.R_map_imu @ turn.T, np.sqrt(variances))
 
-    def fixes_in_ours(self, fixes: GnssFixes) -> GnssFixes:
-        """The same fixes on our clock."""
+    def on_our_clock(self, of_receiver: OfReceiver) -> OfReceiver:
+        """The same measurements of the receiver on our clock."""
         if not self.gnss_time_offset_s:
-            return fixes
-        return GnssFixes(fixes.stamps + self.gnss_time_offset_s, fixes.positions, fixes.stddevs)
+            return of_receiver
+        return replace(of_receiver, stamps=of_receiver.stamps + self.gnss_time_offset_s)
 
     def wheels_in_ours(self, wheels: WheelSpeeds) -> WheelSpeeds:
         """The same wheel speeds in our unit."""

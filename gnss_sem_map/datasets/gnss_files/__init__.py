@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.datasets.gnss_files import nmea, rtklib, sbet
 from gnss_sem_map.datasets.gnss_files.positions import Positions
 from gnss_sem_map.datasets.gnss_files.time_systems import LEAP_S, gps_minus_utc_s
@@ -56,7 +57,7 @@ class FileFixes:
     """Rows of a file of positions on the clock of a log."""
 
     rows: Array
-    """(n, 7) stamp s, latitude and longitude °, height m, standard deviations east, north, up m."""
+    """(n, 18) as `receiver_rows.ROW_COLUMNS`: stamp s, latitude and longitude °, height m, their deviations m, ..."""
     stamps_ns: NDArray[np.int64]
     """(n,) Unix time, ns."""
     skips: list[Skip]
@@ -87,7 +88,8 @@ def read_gnss_file(
     stddevs = found.stddevs if about.stddevs_m is None else np.tile(about.stddevs_m, (len(stamps_ns), 1))
     zero = int(stamps_ns[0]) if epoch_ns is None else epoch_ns
     rows = np.column_stack([(stamps_ns - zero) * 1e-9, found.geodetic, stddevs])
-    return FileFixes(rows, stamps_ns, found.skips)
+    more = found.more if about.stddevs_m is None else found.more | {"correlations": np.full((1, 3), np.nan)}
+    return FileFixes(with_more(rows, **more), stamps_ns, found.skips)
 
 
 def _inside(folder: Path, name: str) -> Path:

@@ -1,4 +1,6 @@
-"""NMEA 0183: positions of GGA, dates of RMC or ZDA, standard deviations of GST; parsed by `pynmeagps`.
+"""NMEA 0183: positions of GGA, dates of RMC or ZDA, standard deviations of GST, speed and course of RMC or VTG.
+
+And headings of HDT or THS. Parsed by `pynmeagps`. VTG, HDT and THS have no time: it is that of the sentence before.
 
 GGA's height is above the geoid; with the geoid's own height, which it also tells, it is above the ellipsoid.
 """
@@ -21,7 +23,13 @@ from gnss_sem_map.sensor_log import Skip
 STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0.3, 0.5)}
 """Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
-USED = ("GGA", "RMC", "ZDA", "GST")
+USED = ("GGA", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
+TIMELESS = ("VTG", "HDT", "THS")
+MPS_PER_KNOT, VELOCITY_STDDEV_MPS = 1852 / 3600, 0.1
+"""NMEA does not tell how good a velocity is; receivers of all makes promise 0.03 to 0.1 m/s. What the drive shows is
+larger where it is."""
+AT_REST_MPS = 0.1
+"""Slower than this, receivers leave the course out."""
 
 
 def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
@@ -31,6 +39,9 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
         raise DataError(f"{shown(path)}: NMEA needs pynmeagps; {how_to_install('ros')}")
     now: int | None = None  # by the last sentence with a date
     deviations: dict[int, tuple[float, float, float]] = {}
+    velocities: dict[int, tuple[float, float]] = {}
+    headings: dict[int, float] = {}
+    clock: int | None = None  # of the last sentence with a time
     fixes: list[tuple[int, bool, list[float]]] = []
     lost: dict[str, int] = {}
     for line in read_lines(path):
@@ -39,10 +50,15 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
             if why:
                 lost[why] = lost.get(why, 0) + 1
             continue
+        if sentence.msgID not in TIMELESS:
+            clock = _clock_ns(sentence.time)
+        if clock is not None and (velocity := _velocity(sentence)) is not None:
+            velocities[clock] = velocity
+        if clock is not None and (heading := _heading(sentence)) is not None:
+            headings[clock] = heading
         if sentence.msgID in ("RMC", "ZDA"):
             now = _moment_ns(sentence) or now
             continue
-        clock = _clock_ns(sentence.time)
         if sentence.msgID == "GST" and clock is not None:
             deviations[clock] = (sentence.stdLong, sentence.stdLat, sentence.stdAlt)
         elif sentence.msgID == "GGA":
@@ -58,7 +74,15 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
             f"{shown(path)}: found no GGA sentence with a fix"
             + (f" ({'; '.join(skip.reason for skip in skips)})" if skips else "; expected NMEA 0183")
         )
-    return _joined(path, fixes, deviations, near_ns, skips)
+    found = _joined(path, fixes, deviations, near_ns, skips)
+    flat = np.array([velocities.get(int(stamp % DAY_NS), (np.nan, np.nan)) for stamp in found.stamps_ns])
+    up = np.full(len(flat), np.nan)
+    found.more["headings_deg"] = np.array([headings.get(int(s % DAY_NS), np.nan) for s in found.stamps_ns])
+    found.more["velocities"] = np.column_stack([flat, up])
+    found.more["velocity_stddevs"] = np.where(
+        np.isfinite(found.more["velocities"]), VELOCITY_STDDEV_MPS, np.nan
+    )
+    return found
 
 
 def _joined(
@@ -86,6 +110,33 @@ def _joined(
         for one, by_quality in zip(given, table[:, 3:].tolist(), strict=True)
     ])  # fmt: skip
     return Positions(stamps, table[:, :3], stddevs, "utc", skips)
+
+
+def _velocity(sentence: Any) -> tuple[float, float] | None:
+    """East and north, m/s, of a sentence with speed and course; None where it tells nothing."""
+    if sentence.msgID == "RMC" and sentence.status == "A":
+        speed, course = sentence.spd, sentence.cog
+    elif sentence.msgID == "VTG":
+        speed, course = sentence.sogn, sentence.cogt
+    else:
+        return None
+    if not isinstance(speed, float | int):
+        return None
+    speed *= MPS_PER_KNOT
+    if not isinstance(course, float | int):
+        return (0.0, 0.0) if speed < AT_REST_MPS else None
+    return speed * float(np.sin(np.radians(course))), speed * float(np.cos(np.radians(course)))
+
+
+def _heading(sentence: Any) -> float | None:
+    """Degrees from true north, of a measurement; None where it tells nothing."""
+    if sentence.msgID == "HDT":
+        said = sentence.headingT
+    elif sentence.msgID == "THS" and sentence.mi == "A":  # others: dead reckoning, by hand, simulated, void
+        said = sentence.headt
+    else:
+        return None
+    return float(said) if isinstance(said, float | int) else None
 
 
 def _sentence(line: str) -> tuple[Any | None, str]:

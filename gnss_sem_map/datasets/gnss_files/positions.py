@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -23,3 +23,5 @@ class Positions:
     """(n, 3) east, north, up, m."""
     time: Literal["utc", "gps"]
     skips: list[Skip]
+    more: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """What else it tells, (n, 3) each, by the names of `receiver_rows.with_more`; NaN where a row does not."""

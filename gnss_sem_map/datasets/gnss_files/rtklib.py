@@ -1,7 +1,8 @@
 """RTKLIB's solution files (.pos): latitude, longitude, height in degrees and metres.
 
 Format: RTKLIB manual, appendix B.1. The standard deviations of the solution are too small where its quality is not a
-fixed ambiguity: no row counts as better than its quality flag.
+fixed ambiguity: no row counts as better than its quality flag. Covariances (sdne, sdeu, sdun) are the square roots of
+their size, with their sign. Velocities (out-outvel=on) follow age and ratio.
 """
 
 from __future__ import annotations
@@ -18,13 +19,23 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import read_lines, shown
 from gnss_sem_map.sensor_log import Skip
 
-BEST_M = {1: (0.01, 0.02), 2: (0.3, 0.5), 3: (1.0, 2.0), 4: (0.6, 1.0), 5: (2.0, 4.0), 6: (0.1, 0.2)}
+BEST_M: dict[float, tuple[float, float]] = {
+    1: (0.01, 0.02),
+    2: (0.3, 0.5),
+    3: (1.0, 2.0),
+    4: (0.6, 1.0),
+    5: (2.0, 4.0),
+    6: (0.1, 0.2),
+}
 """Horizontal and vertical standard deviations, m, that no row of a quality is better than: fix, float, SBAS, DGPS,
 single, PPP."""
 FIRST_NS, END_NS = (
     int(np.datetime64(f"{year}-01-01", "ns").astype(np.int64)) for year in (FIRST_YEAR, LAST_YEAR + 1)
 )
 COLUMNS = "date time latitude longitude height Q ns sdn sde sdu"
+VELOCITIES, LEAST_VELOCITY_STDDEV = "vn(m/s)", 0.01
+"""Name of the first column of velocities; no velocity is believed more than by the second, m/s."""
+NOTHING = (float("nan"),) * 9
 
 
 def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
@@ -35,15 +46,19 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     del near_ns, accuracy, has_stddevs  # it has its own date and deviations
     lines = read_lines(path)
     time = _checked_header(path, [line for line in lines if line.startswith("%")])
-    rows = [_row(line) for line in lines if line.strip() and not line.startswith("%")]
+    has_velocities = any(line.startswith("%") and VELOCITIES in line for line in lines)
+    rows = [_row(line, has_velocities) for line in lines if line.strip() and not line.startswith("%")]
     found = [row for row in rows if row is not None]
     if not found:
         raise DataError(f"{shown(path)}: found no solution among {len(rows)} lines, expected {COLUMNS}")
     lost = len(rows) - len(found)
     reason = f"{lost} lines: no solution of a known quality, or no time of a drive"
     skips = [Skip("fix", shown(path), reason, lost)] if lost else []
-    table = np.array([row[1:] for row in found])
-    return Positions(np.array([row[0] for row in found], np.int64), table[:, :3], table[:, 3:], time, skips)
+    table, more = np.array([row[1] for row in found]), np.array([row[2] for row in found])
+    return Positions(
+        np.array([row[0] for row in found], np.int64), table[:, :3], table[:, 3:], time, skips,
+        dict(zip(("correlations", "velocities", "velocity_stddevs"), np.hsplit(more, 3), strict=True)),
+    )  # fmt: skip
 
 
 def _checked_header(path: Path, header: list[str]) -> Literal["utc", "gps"]:
@@ -70,19 +85,32 @@ def _checked_header(path: Path, header: list[str]) -> Literal["utc", "gps"]:
     return "utc" if "UTC" in columns else "gps"
 
 
-def _row(line: str) -> tuple[int, float, float, float, float, float, float] | None:
-    """Stamp, ns; latitude, longitude, height; deviations east, north, up; None for a line that is none of a drive."""
+def _row(line: str, has_velocities: bool) -> tuple[int, tuple[float, ...], tuple[float, ...]] | None:
+    """Stamp, ns; latitude, longitude, height, deviations; correlations and velocity; None if it is none of a drive."""
     words = line.replace(",", " ").split()
     try:
         stamp = _stamp_ns(words[0], words[1])
         if not FIRST_NS <= stamp < END_NS:
             return None
         lat, lon, height = map(float, words[2:5])
-        across, up = BEST_M[int(words[5])]
+        across, up = BEST_M[float(words[5])]  # tools write 1.0
         sdn, sde, sdu = map(float, words[7:10]) if len(words) >= 10 else (across, across, up)
+        more = NOTHING if len(words) < 13 else _more([float(word) for word in words[7:24]], has_velocities)
     except (ValueError, IndexError, KeyError, OverflowError):
         return None
-    return stamp, lat, lon, height, max(sde, across), max(sdn, across), max(sdu, up)
+    return stamp, (lat, lon, height, max(sde, across), max(sdn, across), max(sdu, up)), more
+
+
+def _more(columns: list[float], has_velocities: bool) -> tuple[float, ...]:
+    """Correlations, velocity and its deviations, each east, north, up, by the columns from sdn on; NaN: not told."""
+    sdn, sde, sdu, sdne, sdeu, sdun = columns[:6]
+    pairs = ((sdne, sde * sdn), (sdeu, sde * sdu), (sdun, sdn * sdu))
+    correlations = tuple(root * abs(root) / size if size > 0 else 0.0 for root, size in pairs)
+    if not has_velocities or len(columns) < 14:
+        return correlations + NOTHING[3:]
+    vn, ve, vu, *deviations = columns[8:14]
+    sdvn, sdve, sdvu = (max(one, LEAST_VELOCITY_STDDEV) for one in deviations)
+    return (*correlations, ve, vn, vu, sdve, sdvn, sdvu)
 
 
 def _stamp_ns(first: str, second: str) -> int:

@@ -61,6 +61,10 @@ class GnssTopic(_Section):
     p_imu_antenna: tuple[float, float, float] | None = Field(
         None, description="Antenna in the imu frame, m; default: by the static transforms."
     )
+    p_imu_antenna2: tuple[float, float, float] | None = Field(
+        None,
+        description="Second antenna, m, where a file tells headings; default: the heading is that of the IMU.",
+    )
 
 
 class LidarTopic(_Topic):

@@ -11,7 +11,7 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
 
 IMU, GNSS, INFO = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo"
-UNKNOWN_COVARIANCE = 0
+UNKNOWN_COVARIANCE, DIAGONAL_COVARIANCE = 0, 2
 """NavSatFix.position_covariance_type."""
 KINDS = {
     "IMU": (IMU,),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,7 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     kept = kept[thawed]
     are_radians = _look_like_radians(kept, frame)
     if are_radians:
-        kept = GnssFixes(kept.stamps, kept.positions * RADIANS, kept.stddevs)
+        kept = replace(kept, positions=kept.positions * RADIANS)
     return Fixes(kept, int(np.sum(~credible)), frozen, are_radians, _moves_from(fixes))
 
 

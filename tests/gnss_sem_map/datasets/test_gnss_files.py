@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ import ros
 from pynmeagps import GET, NMEAMessage
 from ros import START_NS
 
+from factor_graphs.geodesy import LocalFrame
+from factor_graphs.receiver_rows import fixes_of, velocities_of
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.gnss_files import FileFixes, GnssFile, read_gnss_file
 from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, WEEK_NS, gps_minus_utc_s
@@ -70,7 +73,7 @@ def test_no_row_is_better_than_its_quality(tmp_path: Path) -> None:
     path = pos(
         tmp_path, [pos_row(START_NS + LEAP_NS + q * 10**9, q, "0.0040 0.9000 0.0090") for q in (1, 2, 5)]
     )
-    stddevs = read(path).rows[:, 4:]
+    stddevs = read(path).rows[:, 4:7]
     assert stddevs.tolist() == [[0.9, 0.01, 0.02], [0.9, 0.3, 0.5], [2.0, 2.0, 4.0]]
 
 
@@ -97,6 +100,39 @@ def test_a_pos_file_by_week_or_in_utc(tmp_path: Path) -> None:
 def test_other_forms_of_pos_are_refused_with_the_option(tmp_path: Path, header: str, said: str) -> None:
     with pytest.raises(DataError, match=said):
         read(pos(tmp_path, [pos_row(START_NS)], header))
+
+
+VELOCITY_COLUMNS = (
+    "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s) ratio"
+    " vn(m/s) ve(m/s) vu(m/s) sdvn sdve sdvu sdvne sdveu sdvun"
+)
+
+
+def test_covariances_and_velocities_of_a_pos_file(tmp_path: Path) -> None:
+    """sdne is the root of the covariance with its sign: -0.5^2 of 1 m and 0.5 m is a correlation of -0.5."""
+    row = pos_row(START_NS + LEAP_NS, 1, "1.0 0.5 2.0 -0.5 0.6 0.0 0.0 3.1 1.5 -2.0 0.1 0.05 0.06 0.09 0 0 0")
+    found = read(pos(tmp_path, [row], VELOCITY_COLUMNS))
+    np.testing.assert_allclose(found.rows[0, 7:10], [-0.5, 0.36, 0.0])
+    np.testing.assert_allclose(found.rows[0, 10:16], [-2.0, 1.5, 0.1, 0.06, 0.05, 0.09])
+    without = read(pos(tmp_path, [row]))  # the header does not tell that there are velocities
+    np.testing.assert_allclose(without.rows[0, 7:10], [-0.5, 0.36, 0.0])
+    assert np.isnan(without.rows[0, 10:]).all()
+
+
+def test_velocities_of_a_real_walk() -> None:
+    """They are those of its positions: summed up they lead to the same place within their noise."""
+    path = Path(os.environ.get("GNSS_SEM_MAP_DATA", "../shared/data")) / "gnss_imu_walk" / "gnss_1730_sf.pos"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    found = read(path, None)
+    rows = found.rows
+    frame = LocalFrame(*rows[0, 1:4].tolist())
+    velocities, _ = velocities_of(rows, frame)
+    fixes, _, _ = fixes_of(rows, frame)
+    assert velocities is not None
+    v, dt = velocities.velocities, np.diff(fixes.stamps)
+    way = np.sum((v[1:] + v[:-1]) / 2 * dt[:, None], axis=0)
+    assert np.linalg.norm(way - (fixes.positions[-1] - fixes.positions[0])) < 0.02 * np.abs(v * 0.25).sum()
 
 
 def test_lines_of_no_solution_are_counted(tmp_path: Path) -> None:
@@ -132,6 +168,49 @@ def rmc(ns: int) -> str:
     ).serialize().decode()  # fmt: skip
 
 
+def motion(ns: int, kind: str, knots: float, course: float | str) -> str:
+    time = moment(ns)
+    if kind == "VTG":
+        return NMEAMessage(
+            "GN", "VTG", GET, cogt=course, cogtUnit="T", sogn=knots, sognUnit="N", sogk=0.0, sogkUnit="K"
+        ).serialize().decode()  # fmt: skip
+    return NMEAMessage(
+        "GN", "RMC", GET, time=time.time(), status="A", lat=49.0, lon=8.4, NS="N", EW="E", spd=knots, cog=course,
+        date=time.date(),
+    ).serialize().decode()  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["RMC", "VTG"])
+def test_speed_and_course_of_nmea(tmp_path: Path, kind: str) -> None:
+    """10 knots are 5.144 m/s; 120 degrees are south of east. At rest there is no course, and none is needed."""
+    ns = [START_NS + k * 10**9 for k in range(3)]
+    given = [(10.0, 120.0), (0.02, ""), (3.0, "")]
+    sentences = [
+        gga(t) + motion(t, kind, knots, course) for t, (knots, course) in zip(ns, given, strict=True)
+    ]
+    found = read(nmea(tmp_path, rmc(ns[0] - 10**9), *sentences)).rows[:, 10:16]
+    speed = 10 * 1852 / 3600
+    np.testing.assert_allclose(
+        found[0, :2], [speed * np.sin(np.pi / 1.5), speed * np.cos(np.pi / 1.5)], atol=1e-6
+    )
+    assert found[1, :2].tolist() == [0.0, 0.0]
+    assert np.isnan(found[2]).all()
+    assert np.isnan(found[:, 2]).all()
+
+
+@pytest.mark.parametrize("kind", ["HDT", "THS"])
+def test_headings_of_nmea(tmp_path: Path, kind: str) -> None:
+    """Degrees from true north, of the fix before; THS says whether it is measured (A) or dead reckoning (E)."""
+    fields = ({"headingT": 123.4, "headingTu": "T"}, {"headt": 123.4, "mi": "A"})[kind == "THS"]
+    bad = ({"headingT": "", "headingTu": "T"}, {"headt": 123.4, "mi": "E"})[kind == "THS"]
+    sentences = [NMEAMessage("GN", kind, GET, **one).serialize().decode() for one in (fields, bad)]
+    times = [START_NS, START_NS + 10**9]
+    text = [gga(t) + sentence for t, sentence in zip(times, sentences, strict=True)]
+    found = read(nmea(tmp_path, rmc(START_NS - 10**9), *text)).rows[:, 16]
+    assert found[0] == 123.4
+    assert np.isnan(found[1])
+
+
 def gst(ns: int) -> str:
     return NMEAMessage(
         "GN", "GST", GET, time=moment(ns).time(), rangeRms=1.0, stdLat=0.11, stdLong=0.12, stdAlt=0.2
@@ -157,7 +236,7 @@ def test_nmea_accuracy_by_gst_else_by_quality_and_dilution(tmp_path: Path) -> No
         gga(START_NS + 2 * 10**9),
         gst(START_NS + 2 * 10**9),
     ]
-    stddevs = read(nmea(tmp_path, *sentences)).rows[:, 4:]
+    stddevs = read(nmea(tmp_path, *sentences)).rows[:, 4:7]
     np.testing.assert_allclose(stddevs, [[0.02, 0.02, 0.03], [3.0, 3.0, 6.0], [0.12, 0.11, 0.2]])
 
 
@@ -226,7 +305,7 @@ def test_an_sbet_finds_its_week_and_is_thinned(tmp_path: Path) -> None:
     path = sbet(tmp_path, week_seconds(START_NS + LEAP_NS) + np.arange(0, 2, 0.005))
     found = read(path, stddevs_m=(0.02, 0.02, 0.05))
     np.testing.assert_allclose(found.rows[:, 0], np.arange(20) * 0.1, atol=6e-3)
-    np.testing.assert_allclose(found.rows[0, 1:], [49.0, 8.4, 160.0, 0.02, 0.02, 0.05])
+    np.testing.assert_allclose(found.rows[0, 1:7], [49.0, 8.4, 160.0, 0.02, 0.02, 0.05])
 
 
 def test_an_sbet_needs_its_accuracy(tmp_path: Path) -> None:
@@ -237,7 +316,7 @@ def test_an_sbet_needs_its_accuracy(tmp_path: Path) -> None:
     errors = np.zeros((3, 10))
     errors[:, 0], errors[:, 1:4] = seconds[[0, 200, 399]], [0.1, 0.2, 0.3]
     errors.tofile(tmp_path / "smrmsg.out")
-    np.testing.assert_allclose(read(path, accuracy="smrmsg.out").rows[:, 4:], [[0.2, 0.1, 0.3]] * 20)
+    np.testing.assert_allclose(read(path, accuracy="smrmsg.out").rows[:, 4:7], [[0.2, 0.1, 0.3]] * 20)
 
 
 def test_other_bytes_are_no_sbet(tmp_path: Path) -> None:

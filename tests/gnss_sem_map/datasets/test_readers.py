@@ -26,6 +26,28 @@ def true_trajectory(log: SensorLog, driven: Street) -> Trajectory:
     return Trajectory(stamps - shift, driven.motion.poses(stamps), driven.motion.velocities(stamps))
 
 
+def test_headings_and_velocities_of_a_csv_log(tmp_path: Path) -> None:
+    """Against the map's north; the second antenna is where log.yaml says; one that is the first is refused."""
+    (tmp_path / "imu.csv").write_text(
+        "stamp_s,ax,ay,az,wx,wy,wz\n" + "".join(f"{k / 10},0,0,9.81,0,0,0\n" for k in range(30))
+    )
+    (tmp_path / "gnss.csv").write_text(
+        "stamp_s,lat_deg,lon_deg,alt_m,std_e_m,std_n_m,std_u_m,ve_mps,vn_mps,std_ve_mps,std_vn_mps,heading_deg\n"
+        "0,49,8,100,1,1,2,1.5,-2,0.1,0.1,90\n1,49,8,100,1,1,2,,,,,\n2,49,8,100,1,1,2,1,0,0.1,0.1,350\n"
+    )
+    (tmp_path / "log.yaml").write_text("p_imu_antenna: [0.5, 0, 1]\np_imu_antenna2: [1.5, 0, 1]\n")
+    log = open_drive(tmp_path)
+    assert log.velocities is not None
+    assert log.headings is not None
+    np.testing.assert_allclose(log.velocities.velocities, [[1.5, -2, 0], [1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(log.headings.azimuths), [90, 350])
+    np.testing.assert_allclose(log.headings.stddevs, 0.007)
+    assert log.headings.baseline.tolist() == [1.0, 0.0, 0.0]
+    (tmp_path / "log.yaml").write_text("p_imu_antenna: [0.5, 0, 1]\np_imu_antenna2: [0.5, 0, 1]\n")
+    with pytest.raises(DataError, match=r"two antennas are 0\.000 m apart"):
+        open_drive(tmp_path)
+
+
 def test_a_raw_sweep_lands_on_the_street_when_every_point_moves_at_its_own_stamp(small_drive: Street) -> None:
     log = open_drive(small_drive.drive)
     trajectory = true_trajectory(log, small_drive)

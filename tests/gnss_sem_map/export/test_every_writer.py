@@ -16,6 +16,7 @@ from gnss_sem_map.export.copc import write_copc
 from gnss_sem_map.export.exported import Exported
 from gnss_sem_map.export.flight import write_flight
 from gnss_sem_map.export.geopackage import write_geopackage
+from gnss_sem_map.export.navigation import write_attitude, write_sbet
 from gnss_sem_map.export.pictures import write_perspective, write_topview
 from gnss_sem_map.export.point_cloud import write_laz, write_ply, write_removed
 from gnss_sem_map.export.raster import write_topview_geotiff
@@ -40,6 +41,8 @@ WRITERS: dict[str, Writer] = {
     "trajectory.tum": lambda m, t, f, path: write_tum(t, path),
     "trajectory_kitti.txt": lambda m, t, f, path: write_kitti(t, path),
     "trajectory.geojson": lambda m, t, f, path: write_geojson(t, f, path),
+    "trajectory.sbet": lambda m, t, f, path: write_sbet(t, f, 10**18, path),
+    "trajectory_attitude.csv": lambda m, t, f, path: write_attitude(t, f, path),
     "trajectory_wgs84.parquet": lambda m, t, f, path: write_geoparquet(t, f, 10**18, path),
 }
 

@@ -315,6 +315,23 @@ def test_missing_and_circular_transforms(tmp_path: Path) -> None:
         open_drive(ros.write(tmp_path / "circle", rig))
 
 
+def test_covariances_of_fixes_are_used_and_what_is_none_is_counted(tmp_path: Path) -> None:
+    """Off-diagonals of all fixes but one whose matrix is not positive definite, and one that has none by its type."""
+    rig = ros.drive()
+    fixes = [message for topic, _, message in rig.messages if topic == "/fix"]
+    for message, covariance in zip(fixes, (0.2, 0.3, 0.2, 0.2, 0.2), strict=True):
+        message.position_covariance_type = 3
+        message.position_covariance[[1, 3]] = covariance
+    fixes[-1].position_covariance_type = 2
+    log = open_drive(ros.write(tmp_path / "drive", rig))
+    assert log.gnss is not None
+    assert log.gnss.correlations is not None
+    np.testing.assert_allclose(log.gnss.correlations[:, 0], [0.8, 0.0, 0.8, 0.8, 0.0])
+    np.testing.assert_allclose(log.gnss.stddevs, np.tile([0.5, 0.5, 1.0], (5, 1)))
+    [skip] = [skip for skip in log.skips if skip.what == "covariance"]
+    assert (skip.where, skip.frames) == ("/fix", 1)
+
+
 def test_fixes_without_fix_or_covariance_are_counted(tmp_path: Path) -> None:
     rig = ros.drive()
     rig.fix(START_NS + 50_000_000, status=-1)

@@ -27,6 +27,16 @@ def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
     return np.asarray((fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1]))
 
 
+def are_new(fixes: GnssFixes) -> Mask:
+    """The fixes whose position is not that of the fix before, (m,).
+
+    Noise alone moves a measured position, so rows that are the same are one measurement written again: by a logger
+    faster than the receiver, or by a receiver that has none. Its moment is that of the first row.
+    """
+    changed = np.any(np.diff(fixes.positions, axis=0) != 0, axis=1)
+    return np.append(np.ones(min(len(fixes), 1), dtype=bool), changed)
+
+
 def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
     """The fixes that a vehicle can have driven to from the others, (m,).
 

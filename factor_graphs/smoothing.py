@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
+from factor_graphs.clock_check import checked
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
@@ -27,7 +28,7 @@ from factor_graphs.held_constraints import constrain
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, WheelSpeeds, measured
 from factor_graphs.problem import GATE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import are_drifting
+from factor_graphs.screening import are_drifting, are_new
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.variance import BiasSteps, correlation_time_shown, imu_noise_shown
@@ -42,6 +43,8 @@ NOTABLE_REJECTION = 0.01
 ANOTHER_UNIT = 2.0
 # A correlation time of the fixes so many times that of the settings is worth a word.
 NOTABLE_CORRELATION = 2.0
+# A fix with less weight than this is taken for an outlier.
+HALF = 0.5
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
@@ -124,7 +127,7 @@ def smooth(
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
 
     relative, samples = relative_poses or NO_RELATIVE_POSES, measured(imu)
-    bias = large_gyroscope_bias(samples, fixes)
+    bias = large_gyroscope_bias(samples, fixes[are_new(fixes)])
     if bias.any():
         samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
 
@@ -134,7 +137,11 @@ def smooth(
         problem = pose_problem(samples, shifted, frame, settings, lever, initial_attitude, relative)
         return fit_noise(with_heading(problem))
 
-    problem, fit, calibration = calibrate(fit_to, settings, given)
+    problem, fit, estimated = calibrate(fit_to, settings, given)
+    of_noise = max(fit.inflation, problem.of_fixes)
+    calibration = checked(estimated, samples, fixes[problem.used][fit.weights > HALF], of_noise)
+    if calibration.refused:
+        problem, fit = fit_to(calibration)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
     by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
@@ -222,7 +229,9 @@ def _of_calibration(
     Where the clock is d s off, the trajectory is so much further on its way; where the antenna is dl m off, so is it.
     """
     covariances = np.zeros((len(R_map_imu), 6, 6))
-    if calibration.time_offset_stddev_s and (settings.estimate_time_offset or calibration.time_offset_s):
+    if calibration.time_offset_stddev_s and (
+        settings.estimate_time_offset or calibration.time_offset_s or calibration.refused
+    ):
         in_imu = np.einsum("kij,ki->kj", R_map_imu, velocities) * calibration.time_offset_stddev_s
         covariances[:, 3:, 3:] += in_imu[:, :, None] * in_imu[:, None]
     if calibration.p_imu_antenna_stddevs is not None:
@@ -273,6 +282,11 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
+    if calibration.refused:
+        yield (
+            f"{calibration.refused}: not taken, a deviation of {calibration.time_offset_stddev_s:.2f} s in its place;"
+            " check axes and units of the IMU, or correct the stamps of the fixes"
+        )
     if rejected := np.count_nonzero(fit.squares > REJECTION):  # of others the problem's notes tell
         is_most = 2 * rejected > len(problem.used)
         asked = ": do all come from one antenna, with its lever arm and their true standard deviations?"

@@ -78,7 +78,7 @@ def _row(line: str) -> tuple[int, float, float, float, float, float, float] | No
         if not FIRST_NS <= stamp < END_NS:
             return None
         lat, lon, height = map(float, words[2:5])
-        across, up = BEST_M[int(words[5])]
+        across, up = BEST_M[int(float(words[5]))]  # some tools write 1.0000000
         sdn, sde, sdu = map(float, words[7:10]) if len(words) >= 10 else (across, across, up)
     except (ValueError, IndexError, KeyError, OverflowError):
         return None

@@ -25,6 +25,9 @@ LACKING = quantile(1 - 1 / 16_000, 1)
 # Where so many times the noise is needed, the graph does not explain the drive: then the motion itself has to tell the
 # offset, to this span, s.
 UNFIT, TOLD_S = 3.0, 1.0
+# Steps of IMU samples that are means are shorter than this, s; and an offset so many standard deviations nearer to half a
+# step than to none shows it.
+OFTEN_S, SURELY = 0.02, 2.0
 
 
 def checked(found: Calibration, imu: ImuSamples, fixes: GnssFixes, of_noise: float) -> Calibration:
@@ -52,6 +55,17 @@ def checked(found: Calibration, imu: ImuSamples, fixes: GnssFixes, of_noise: flo
         time_offset_stddev_s=min(float(np.sqrt(np.mean(supported**2))), abs(offset)),
         refused=f"the graph finds the fixes {offset:+.2f} s after their stamps, but {why}",
     )
+
+
+def stamps_are_ends(found: Calibration, imu: ImuSamples) -> bool:
+    """Whether the stamps of IMU samples are the ends of the intervals that they are means of, by the time offset found.
+
+    Then the fixes look late by half an interval, which no receiver is: what takes time to send comes after its moment.
+    Slower units than OFTEN_S write what is of one moment.
+    """
+    step = float(np.median(np.diff(imu.stamps)))
+    near = abs(found.time_offset_s - step / 2) < step / 4
+    return step < OFTEN_S and near and (found.time_offset_stddev_s or np.inf) < step / 4 / SURELY
 
 
 def supported_offsets(imu: ImuSamples, fixes: GnssFixes, p_imu_antenna: Array, farthest_s: float) -> Array:

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.calibration import Calibration
-from factor_graphs.clock_check import checked
+from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.dense import densify
@@ -130,6 +130,8 @@ def smooth(
     bias = large_gyroscope_bias(samples, fixes[are_new(fixes)])
     if bias.any():
         samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
+    if settings.imu_sample_instant == "end":
+        samples = samples.at_middle()
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = GnssFixes(fixes.stamps + calibration.time_offset_s, fixes.positions, fixes.stddevs)
@@ -138,6 +140,10 @@ def smooth(
         return fit_noise(with_heading(problem))
 
     problem, fit, estimated = calibrate(fit_to, settings, given)
+    are_ends = settings.imu_sample_instant is None and stamps_are_ends(estimated, samples)
+    if are_ends:
+        samples = samples.at_middle()
+        problem, fit, estimated = calibrate(fit_to, settings, given)
     of_noise = max(fit.inflation, problem.of_fixes)
     calibration = checked(estimated, samples, fixes[problem.used][fit.weights > HALF], of_noise)
     if calibration.refused:
@@ -159,6 +165,9 @@ def smooth(
         found = replace(found, biases=found.biases + np.append(np.zeros(3), bias), notes=(told, *found.notes))
     if filled := len(imu) - len(samples):
         told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
+        found = replace(found, notes=(told, *found.notes))
+    if are_ends:
+        told = "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
         found = replace(found, notes=(told, *found.notes))
     if not condensed:
         return found

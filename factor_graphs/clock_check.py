@@ -25,8 +25,8 @@ LACKING = quantile(1 - 1 / 16_000, 1)
 # Where so many times the noise is needed, the graph does not explain the drive: then the motion itself has to tell the
 # offset, to this span, s.
 UNFIT, TOLD_S = 3.0, 1.0
-# Steps of IMU samples that are means are shorter than this, s; and an offset so many standard deviations nearer to half a
-# step than to none shows it.
+# Steps of IMU samples that are means are shorter than this, s; and an offset so many standard deviations nearer to half
+# a step than to none shows it.
 OFTEN_S, SURELY = 0.02, 2.0
 
 

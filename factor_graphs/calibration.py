@@ -30,13 +30,14 @@ HELD = 1e-6
 class Calibration:
     """How much later than its stamp a fix is, s, and where the antenna is, (3,) m, with standard deviations.
 
-    A stddev is None for what was taken as given.
+    A stddev is None for what was taken as given. `refused`: why an offset that was found is not applied, or nothing.
     """
 
     time_offset_s: float
     p_imu_antenna: Array
     time_offset_stddev_s: float | None = None
     p_imu_antenna_stddevs: Array | None = None
+    refused: str = ""
 
 
 def correct(

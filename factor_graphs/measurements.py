@@ -55,6 +55,11 @@ class ImuSamples:
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "ImuSamples":
         return ImuSamples(self.stamps[rows], self.specific_force[rows], self.angular_rate[rows])
 
+    def at_middle(self) -> "ImuSamples":
+        """The same, each at the middle of the usual interval that ends at its stamp: of that it is the mean."""
+        earlier = float(np.median(np.diff(self.stamps))) / 2
+        return ImuSamples(self.stamps - earlier, self.specific_force, self.angular_rate)
+
 
 @dataclass(frozen=True, eq=False)
 class GnssFixes:

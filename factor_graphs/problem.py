@@ -29,7 +29,7 @@ from factor_graphs.model import (
     to_values,
 )
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import correlation_times, decorrelate, inside, plausible
+from factor_graphs.screening import are_new, correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
@@ -199,20 +199,21 @@ def _near(stamps: Array, others: Array) -> NDArray[np.bool_]:
 def usable_fixes(
     fixes: GnssFixes, imu: ImuSamples, max_speed_mps: float
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which fixes (n,) are within the IMU's span and need no impossible speed, and what is to be said of the others.
+    """Which fixes (n,) are new, within the IMU's span, and need no impossible speed; and what to say of the others.
 
     Raises MeasurementError below three.
     """
-    within = inside(fixes, imu)
-    used = within.copy()
-    used[within] = plausible(fixes[within], max_speed_mps)
+    within, new = inside(fixes, imu), are_new(fixes)
+    used = within & new
+    used[used] = plausible(fixes[used], max_speed_mps)
     notes = []
-    if np.any(~within):
-        notes.append(f"{np.sum(~within)} of {len(fixes)} fixes outside the IMU's span: not used")
-    if np.any(within & ~used):
-        notes.append(
-            f"{np.sum(within & ~used)} of {len(fixes)} fixes need more than {max_speed_mps:g} m/s: not used"
-        )
+    for unused, why in (
+        (~within, "outside the IMU's span: not used"),
+        (within & ~new, "repeat the position before them: each position used once, at its first stamp"),
+        (within & new & ~used, f"need more than {max_speed_mps:g} m/s: not used"),
+    ):
+        if unused.any():
+            notes.append(f"{unused.sum()} of {len(fixes)} fixes {why}")
     if used.sum() < 3:
         raise MeasurementError(
             f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."

@@ -29,6 +29,16 @@ def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
     return np.asarray((fixes.stamps >= imu.stamps[0]) & (fixes.stamps <= imu.stamps[-1]))
 
 
+def are_new(fixes: GnssFixes) -> Mask:
+    """The fixes whose position is not that of the fix before, (m,).
+
+    Noise alone moves a measured position, so rows that are the same are one measurement written again: by a logger
+    faster than the receiver, or by a receiver that has none. Its moment is that of the first row.
+    """
+    changed = np.any(np.diff(fixes.positions, axis=0) != 0, axis=1)
+    return np.append(np.ones(min(len(fixes), 1), dtype=bool), changed)
+
+
 def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:
     """The fixes that a vehicle can have driven to from the others, (m,).
 
@@ -59,8 +69,12 @@ def _agreeing(fixes: GnssFixes, runs: list[NDArray[np.intp]], believed: int, max
 
 def are_drifting(fixes: GnssFixes) -> bool:
     """Whether they are an inertial unit's positions, whose errors last for a minute, not a receiver's."""
-    often = len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
-    return often and white_share(fixes) < FILTERED
+    return are_frequent(fixes) and white_share(fixes) < FILTERED
+
+
+def are_frequent(fixes: GnssFixes) -> bool:
+    """Whether they come so often that a vehicle's way between them is smooth."""
+    return len(fixes) > 1 and float(np.median(np.diff(fixes.stamps))) < DRIFTING_BELOW_S
 
 
 def white_share(fixes: GnssFixes) -> float:
@@ -109,4 +123,6 @@ def decorrelate(fixes: GnssFixes, correlation_times_s: Array | float, min_stddev
     apart = (here - first) * t - (sums[here] - sums[first]) + (sums[last] - sums[here]) - (last - here) * t
     white = white_share(fixes) ** 2
     crowd = white + (1 - white) * np.maximum(last - first - apart / time, 1.0)[:, None]
-    return replace(fixes, stddevs=np.maximum(fixes.stddevs, min_stddev_m) * np.sqrt(crowd))
+    # what scatters as it claims needs no floor; of rare fixes the scatter is their way
+    floor = min_stddev_m * (np.sqrt(1 - white) if are_frequent(fixes) else 1.0)
+    return replace(fixes, stddevs=np.maximum(fixes.stddevs, floor) * np.sqrt(crowd))

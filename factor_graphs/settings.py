@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from factor_graphs.measurements import ImuNoise
 
+SampleInstant = Literal["end", "middle"]
+
 
 class SmootherSettings(BaseModel):
     """How the trajectory is estimated; the defaults need no tuning for a road vehicle."""
@@ -15,6 +17,11 @@ class SmootherSettings(BaseModel):
     imu_noise: ImuNoise | None = Field(
         None,
         description="What the IMU's data sheet promises; default: what the log says, or a consumer unit's.",
+    )
+    imu_sample_instant: SampleInstant | None = Field(
+        None,
+        description="What the stamp of an IMU sample names: the end or the middle of the interval whose mean it is."
+        " Empty: the end where precise fixes show it, else the middle.",
     )
     inflate_imu_noise: bool = Field(
         True, description="Multiply the IMU noise until the residuals fit their standard deviations."
@@ -29,7 +36,11 @@ class SmootherSettings(BaseModel):
         ge=0,
         description="Likewise for an inertial unit's positions, where relative poses hold the track's shape.",
     )
-    min_fix_stddev_m: float = Field(0.02, gt=0, description="No fix is trusted more than this.")
+    min_fix_stddev_m: float = Field(
+        0.02,
+        gt=0,
+        description="No fix is trusted more than this, unless many a second scatter as they claim.",
+    )
     max_speed_mps: float = Field(70.0, gt=0, description="A fix that would need more speed is dropped.")
     estimate_time_offset: bool | None = Field(
         None,

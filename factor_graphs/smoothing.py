@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.antenna_heading import observe_headings
 from factor_graphs.calibration import Calibration
+from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
 from factor_graphs.covariances import keyframe_covariances
@@ -38,7 +39,7 @@ from factor_graphs.measurements import (
 from factor_graphs.model import from_values
 from factor_graphs.problem import GATE, NOWHERE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import are_drifting
+from factor_graphs.screening import are_drifting, are_new
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.side_measurements import Observed
 from factor_graphs.surveyed_points import (
@@ -63,6 +64,8 @@ NOTABLE_REJECTION = 0.01
 ANOTHER_UNIT = 2.0
 # A correlation time of the fixes so many times that of the settings is worth a word.
 NOTABLE_CORRELATION = 2.0
+# A fix with less weight than this is taken for an outlier.
+HALF = 0.5
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
@@ -150,9 +153,11 @@ def smooth(
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
 
     relative, samples = relative_poses or NO_RELATIVE_POSES, measured(imu)
-    bias = large_gyroscope_bias(samples, fixes)
+    bias = large_gyroscope_bias(samples, fixes[are_new(fixes)])
     if bias.any():
         samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
+    if settings.imu_sample_instant == "end":
+        samples = samples.at_middle()
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = replace(fixes, stamps=fixes.stamps + calibration.time_offset_s)
@@ -164,7 +169,15 @@ def smooth(
 
         return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
 
-    problem, fit, calibration = calibrate(fit_to, settings, given)
+    problem, fit, estimated = calibrate(fit_to, settings, given)
+    are_ends = settings.imu_sample_instant is None and stamps_are_ends(estimated, samples)
+    if are_ends:
+        samples = samples.at_middle()
+        problem, fit, estimated = calibrate(fit_to, settings, given)
+    of_noise = max(fit.inflation, problem.of_fixes)
+    calibration = checked(estimated, samples, fixes[problem.used][fit.weights > HALF], of_noise)
+    if calibration.refused:
+        problem, fit = fit_to(calibration)
     may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
     beside = [_observe(one, problem, fit, calibration.time_offset_s) for one in also]
     problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
@@ -197,6 +210,9 @@ def smooth(
     doubts = [one.verdict for one in beside if one.doubtful]
     verdicts = tuple(one.verdict for one in beside)
     found = replace(found, points=tuple(points), beside=verdicts, notes=(*found.notes, *doubts))
+    if are_ends:
+        told = "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
+        found = replace(found, notes=(told, *found.notes))
     if not condensed:
         return found
     lacking = _lacking(
@@ -276,7 +292,9 @@ def _of_calibration(
     Where the clock is d s off, the trajectory is so much further on its way; where the antenna is dl m off, so is it.
     """
     covariances = np.zeros((len(R_map_imu), 6, 6))
-    if calibration.time_offset_stddev_s and (settings.estimate_time_offset or calibration.time_offset_s):
+    if calibration.time_offset_stddev_s and (
+        settings.estimate_time_offset or calibration.time_offset_s or calibration.refused
+    ):
         in_imu = np.einsum("kij,ki->kj", R_map_imu, velocities) * calibration.time_offset_stddev_s
         covariances[:, 3:, 3:] += in_imu[:, :, None] * in_imu[:, None]
     if calibration.p_imu_antenna_stddevs is not None:
@@ -328,6 +346,11 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
+    if calibration.refused:
+        yield (
+            f"{calibration.refused}: not taken, a deviation of {calibration.time_offset_stddev_s:.2f} s in its place;"
+            " check axes and units of the IMU, or correct the stamps of the fixes"
+        )
     if rejected := np.count_nonzero(fit.squares > REJECTION):  # of others the problem's notes tell
         is_most = 2 * rejected > len(problem.used)
         asked = ": do all come from one antenna, with its lever arm and their true standard deviations?"

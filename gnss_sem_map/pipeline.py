@@ -201,6 +201,8 @@ def _checked_and_located(
     found, sharpness = _located(
         sweeps.taking(log), settings, stats, progress, page.solution, match, registrar_of, saved, bound
     )
+    if found.solution is not None and (said := page.other_clock(found.solution.calibration.time_offset_s)):
+        stats.warnings.append(said)
     sweeps.forget()  # sections that are tasks have read their own: 35 MB
     return replace(page, solution=None), found, sharpness
 

@@ -115,6 +115,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         points=points,
         wheels=wheels,
         imu_noise=about.imu_noise,
+        imu_sample_instant=about.imu_sample_instant,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
         skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),

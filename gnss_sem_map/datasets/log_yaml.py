@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.measurements import ImuNoise
+from factor_graphs.settings import SampleInstant
 from gnss_sem_map.datasets.gnss_files import GnssFile
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import fault_of, read_yaml
@@ -117,6 +118,10 @@ class LogFile(SensorConventions):
         {}, description="Several cameras by name, in place of the keys above."
     )
     imu_noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
+    imu_sample_instant: SampleInstant | None = Field(
+        None,
+        description="What stamp_s of imu.csv names of a sample's interval; default: found, else its middle.",
+    )
     initial_attitude: InitialAttitude | None = Field(
         None, description="Attitude at the first row of imu.csv; default: by the motion."
     )

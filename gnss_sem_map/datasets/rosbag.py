@@ -98,6 +98,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         velocities=velocities,
         headings=headings,
         imu_noise=rig.imu.noise,
+        imu_sample_instant=rig.imu.sample_instant,
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),

@@ -26,8 +26,9 @@ from gnss_sem_map.voxels.reuse import VERSION
 def of_log(log: SensorLog, labels_from: str = "", label_set: LabelSet | None = None) -> str:
     """Digest of all that is read of a drive, of the labels of its images and of their classes, and of this version."""
     said = [
-        VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.conventions, _scans(log), _images(log),
-        _cameras(log), labels_from, _states(labels_from), None if label_set is None else _classes_of_map(label_set),
+        VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.imu_sample_instant, log.conventions, _scans(log),
+        _images(log), _cameras(log), labels_from, _states(labels_from),
+        None if label_set is None else _classes_of_map(label_set),
     ]  # fmt: skip
     tables = (log.imu, log.gnss, log.wheels, log.given, log.initial_attitude)
     values = (

@@ -172,15 +172,15 @@ def check_georeference(log: SensorLog, origin: LocalFrame | None, voxel_size_m: 
 def smooth_log(
     log: SensorLog, settings: TrajectorySettings, relative_poses: RelativePoses | None = None
 ) -> Solution:
-    """Smooth IMU, GNSS and wheel speed of a drive; the setting for the IMU's noise is before the drive's own.
+    """Smooth IMU, GNSS and wheel speed of a drive; settings of the IMU are before the drive's own.
 
     Raises DataError without IMU and GNSS, MeasurementError and EstimationError.
     """
     if log.imu is None or log.gnss is None or log.frame is None:
         raise DataError(f"{log.name}: found neither poses nor IMU with GNSS; expected one of them")
-    smoother = settings
-    if settings.imu_noise is None:
-        smoother = settings.model_copy(update={"imu_noise": log.imu_noise})
+    of_log = {"imu_noise": log.imu_noise, "imu_sample_instant": log.imu_sample_instant}
+    unset = {name: value for name, value in of_log.items() if getattr(settings, name) is None}
+    smoother = settings.model_copy(update=unset)
     return smooth(
         log.imu,
         log.gnss,

@@ -28,6 +28,7 @@ from factor_graphs.measurements import (
     ImuSamples,
     WheelSpeeds,
 )
+from factor_graphs.settings import SampleInstant
 from factor_graphs.surveyed_points import SurveyedPoints
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.errors import ConfigError, DataError
@@ -207,6 +208,8 @@ class SensorLog:
     """None: the log has no wheel speed."""
     imu_noise: ImuNoise | None = None
     """None: the estimator's default."""
+    imu_sample_instant: SampleInstant | None = None
+    """What the stamp of an IMU sample names of its interval; None: the estimator finds it."""
     initial_attitude: AttitudePrior | None = None
     """Attitude of the navigation unit at the first IMU stamp; None: estimated from the motion."""
     attitude_of_unit: bool = False

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from factor_graphs.measurements import ImuNoise
+from factor_graphs.settings import SampleInstant
 from gnss_sem_map.datasets.gnss_files import GnssFile
 from gnss_sem_map.datasets.ros.stamps import Clock
 from gnss_sem_map.errors import DataError
@@ -39,6 +40,9 @@ class ImuTopic(_Topic):
     """The IMU; its frame is the body frame."""
 
     noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
+    sample_instant: SampleInstant | None = Field(
+        None, description="What a stamp names of a sample's interval; default: found, else its middle."
+    )
     attitude: bool = Field(
         False,
         description="The orientation in the first message, with its covariance, is the attitude in east, north, up.",

@@ -35,7 +35,9 @@ def check(
         found = list(pool.map(lambda group: unless_left(lambda: tuple(group.check(sample))), groups))
     chosen = SensorConventions() if log.conventions is None else settings.sensors.over(log.conventions)
     findings = tuple(_on_top(finding, chosen) for some in found for finding in some)
-    return Preflight(findings, time.perf_counter() - start, sample.whole_solution)
+    lag = None if sample.diagnosis is None else sample.diagnosis.lag
+    told = lag.seconds if lag is not None and (lag.is_certain or lag.observable) else None
+    return Preflight(findings, time.perf_counter() - start, sample.whole_solution, told)
 
 
 def _on_top(finding: Finding, chosen: SensorConventions) -> Finding:

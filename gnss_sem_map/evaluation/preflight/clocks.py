@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.dead_reckoning import WINDOW_S, Complex, Windows, agreement, way_of, windows_of
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from gnss_sem_map.evaluation.preflight.dead_reckoning import WINDOW_S, Complex, Windows, agreement, windows_of
-from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral, way_of
+from gnss_sem_map.evaluation.preflight.inertial_sums import SmoothedIntegral
 from gnss_sem_map.evaluation.preflight.response import turn_gain
 from gnss_sem_map.evaluation.preflight.track import Track
 
@@ -56,11 +56,15 @@ class _Comparison:
     track: Track
 
     def likelihoods(self, lags: Array) -> Array:
-        """Logarithms, up to a constant: normal errors of the ways, and Laplace's of the turns."""
+        """Logarithms, up to a constant: of ways and turns."""
+        return np.asarray(self.by_ways_and_turns(lags).sum(axis=0))
+
+    def by_ways_and_turns(self, lags: Array) -> Array:
+        """Logarithms, (2, n), up to a constant: normal errors of the ways, and Laplace's of the turns."""
         rests, free, turns, intervals = np.array([self._misfits(lag) for lag in lags]).T
         # as many independent errors as where the fit is best, for all: elsewhere the lag itself makes them alike
         at_best = int(np.argmin(rests * turns))
-        return np.asarray(-free[at_best] * np.log(rests) - intervals[at_best] * np.log(turns))
+        return -np.array([free[at_best] * np.log(rests), intervals[at_best] * np.log(turns)])
 
     def _misfits(self, lag: float) -> tuple[float, float, float, int]:
         """Of the ways, and how many independent errors that is; of the courses, likewise."""
@@ -107,7 +111,11 @@ def _near_lag(compared: _Comparison, farthest: float) -> Lag:
     """The lag up to `farthest` s that fits best."""
     count = round(farthest / COARSE_S)
     coarse = np.linspace(-count, count, 2 * count + 1) * COARSE_S
-    scores = compared.likelihoods(coarse)
+    by_ways, by_turns = compared.by_ways_and_turns(coarse)
+    if compared.windows is not None and 2 * np.ptp(by_ways) < FOUR_SIGMA:
+        # who goes another way than the IMU feels is no vehicle: on foot a turn of the body is none of the course
+        return NO_LAG
+    scores = by_ways + by_turns
     best = float(coarse[int(np.argmax(scores))])
     fine = np.append(best + np.arange(-4, 5) * FINE_S, 0.0).astype(np.float64)
     around = compared.likelihoods(fine)

@@ -14,6 +14,8 @@ ONE_CLOCK = (
     " arrival"
 )
 """The remedy where one sensor has another clock than the others."""
+NOTABLE_LAG_S = 0.25
+"""From here a time offset of the fixes is told of, s: noise of metres hides less."""
 
 
 class Level(StrEnum):
@@ -51,6 +53,8 @@ class Preflight:
     seconds: float
     solution: Solution | None = None
     """First smoothed trajectory of the drive, where the checks computed it; else None."""
+    gnss_lag_s: float | None = None
+    """By how much a fix is later than its stamp, s; None: the checks cannot tell."""
 
     @property
     def level(self) -> Level:
@@ -61,6 +65,15 @@ class Preflight:
     def of(self, level: Level) -> tuple[Finding, ...]:
         """The findings of one level."""
         return tuple(finding for finding in self.findings if finding.level is level)
+
+    def other_clock(self, offset_s: float) -> str | None:
+        """What is to be said of a smoother that finds the fixes `offset_s` s after their stamps; None: they agree."""
+        if self.gnss_lag_s is None or abs(self.gnss_lag_s - offset_s) < NOTABLE_LAG_S:
+            return None
+        return (
+            f"the fixes are {offset_s:+.2f} s after their stamps in the trajectory, {self.gnss_lag_s:+.2f} s by the"
+            " pre-flight: they disagree; check axes and clock of the IMU, or set gnss_time_offset_s"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The page as run.json holds it."""

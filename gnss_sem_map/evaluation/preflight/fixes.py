@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.dead_reckoning import integral
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuSamples
-from factor_graphs.screening import plausible
-from gnss_sem_map.evaluation.preflight.inertial_sums import integral
+from factor_graphs.screening import are_new, plausible
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -53,6 +53,7 @@ def examine(fixes: GnssFixes, frame: LocalFrame, imu: ImuSamples, max_speed_mps:
     for first, last in frozen:
         thawed &= (kept.stamps < first) | (kept.stamps > last)
     kept = kept[thawed]
+    kept = kept[are_new(kept)]
     are_radians = _look_like_radians(kept, frame)
     if are_radians:
         kept = replace(kept, positions=kept.positions * RADIANS)

@@ -15,7 +15,7 @@ from factor_graphs.settings import SmootherSettings
 from gnss_sem_map.evaluation.preflight import poses
 from gnss_sem_map.evaluation.preflight.clocks import FARTHEST_S, LEAP_S
 from gnss_sem_map.evaluation.preflight.diagnosis import Diagnosis
-from gnss_sem_map.evaluation.preflight.findings import ONE_CLOCK, Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.findings import NOTABLE_LAG_S, ONE_CLOCK, Finding, amber, green, red
 from gnss_sem_map.evaluation.preflight.fixes import Fixes
 from gnss_sem_map.evaluation.preflight.lever_arm import check_lever_arm
 from gnss_sem_map.evaluation.preflight.sample import Sample
@@ -34,8 +34,8 @@ NOTABLE_SHARE = 0.05
 BEST_RECEIVER_M = 0.008
 # Heights of a road change slowly: a scatter of so many claimed deviations, and this much, m, is the fixes' own.
 SCATTER_RATIO, SCATTER_M = 5.0, 0.1
-# A lag is told of from the first, s, and makes a wrong map when it moves the vehicle by the second, m.
-NOTABLE_LAG_S, WRONG_LAG_M = 0.25, 2.0
+# A lag makes a wrong map when it moves the vehicle by so much, m.
+WRONG_LAG_M = 2.0
 # What stops a run is surer than what is told: twice the logarithm of the likelihood.
 FIVE_SIGMA = 25.0
 # At a constant speed an antenna ahead is a clock that is early: up to here, m, it may be either.

@@ -77,6 +77,12 @@ def test_no_row_is_better_than_its_quality(tmp_path: Path) -> None:
     assert stddevs.tolist() == [[0.9, 0.01, 0.02], [0.9, 0.3, 0.5], [2.0, 2.0, 4.0]]
 
 
+def test_a_quality_may_be_written_with_decimals(tmp_path: Path) -> None:
+    """As tables of numbers are written: 1.0000000."""
+    row = pos_row(START_NS + LEAP_NS).replace("   1   9", "   1.0000000   9.0000000")
+    assert read(pos(tmp_path, [row])).rows[0, 4:].tolist() == [0.01, 0.01, 0.02]
+
+
 def test_a_pos_file_by_week_or_in_utc(tmp_path: Path) -> None:
     week, rest = divmod(START_NS + LEAP_NS - GPS_EPOCH_NS, WEEK_NS)
     by_week = pos(tmp_path, [f"{week} {rest / 1e9:.3f} 49.0 8.4 160.0 1 9 0.01 0.01 0.02"])

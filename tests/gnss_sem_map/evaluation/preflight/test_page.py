@@ -125,3 +125,12 @@ def test_run_is_checked_from_python_too(small_drive: Street, tmp_path: Path) -> 
             tmp_path / "out",
             tmp_path / "work",
         )
+
+
+def test_another_time_offset_than_that_of_the_smoother_is_said() -> None:
+    page = Preflight((), 0.0, gnss_lag_s=-0.6)
+    assert page.other_clock(-0.55) is None
+    assert "-1.77 s after their stamps in the trajectory, -0.60 s by the pre-flight" in (
+        page.other_clock(-1.77) or ""
+    )
+    assert Preflight((), 0.0).other_clock(-1.77) is None

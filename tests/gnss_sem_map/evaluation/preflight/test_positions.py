@@ -13,11 +13,14 @@ from scipy.spatial.transform import Rotation
 from sensor_drives import FRAME, LEVER, SETTINGS, drive, findings, wrong
 
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
+from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples, clean_gnss, clean_imu
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.gnss_files import GnssFile, read_gnss_file
 from gnss_sem_map.evaluation.preflight import check
+from gnss_sem_map.evaluation.preflight.diagnosis import diagnose
 from gnss_sem_map.evaluation.preflight.findings import Level
+from gnss_sem_map.evaluation.preflight.fixes import examine
 from gnss_sem_map.sensor_log import Calibration, SensorLog, Skip
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 from gnss_sem_map.simulation import Camera, Lidar, prepare
@@ -256,3 +259,18 @@ def test_a_log_of_three_seconds_tells_nothing_of_the_clock(tmp_path: Path) -> No
     log = open_drive(write_table(short, tmp_path))
     [clock] = [one for one in findings(log) if one.check == "GNSS clock"]
     assert clock.evidence.startswith("not observable")
+
+
+def test_the_clock_of_one_who_walks_cannot_be_told_by_his_turns(real_data: Path) -> None:
+    """His course turns half a second before the IMU in his hand; graph and fixed ambiguities say 0.02 s."""
+    folder = real_data / "gnss_imu_walk"
+    rows = np.loadtxt(folder / "imu_1730_sf.csv", delimiter=",", usecols=range(7))
+    epoch_ns = round(rows[0, 0] * 1e9)
+    about = GnssFile(path="gnss_1730_sf.pos", time="utc")
+    found = read_gnss_file(about, folder, epoch_ns, (epoch_ns, round(rows[-1, 0] * 1e9))).rows
+    frame = LocalFrame(*found[0, 1:4].tolist())
+    imu, _ = clean_imu(rows[:, 0] - rows[0, 0], rows[:, 1:4] * 9.80665, rows[:, 4:7])
+    fixes, _ = clean_gnss(found[:, 0], frame.to_map(*found[:, 1:4].T), found[:, 4:7])
+    lag = diagnose(imu, examine(fixes, frame, imu, 70.0).usable, frame, None).lag
+    assert not lag.is_certain
+    assert not lag.observable

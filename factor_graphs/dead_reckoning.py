@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.measurements import GnssFixes
+from factor_graphs.measurements import GnssFixes, ImuSamples
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -20,6 +20,27 @@ Complex = NDArray[np.complex128]
 WINDOW_S = 20.0
 LEAST_FIXES = 7
 MOST_WINDOWS, MOST_FIXES = 30, 40
+
+
+def integral(stamps: Array, values: Array) -> Array:
+    """Of (n,) or (n, k) values over time, by trapezoids, from zero."""
+    step = np.diff(stamps).reshape(-1, *[1] * (values.ndim - 1))
+    parts = (values[1:] + values[:-1]) / 2 * step
+    return np.concatenate([np.zeros_like(values[:1]), np.cumsum(parts, axis=0)])
+
+
+def way_of(imu: ImuSamples, lever: complex = 0j, *, mirrored: bool = False) -> NDArray[np.complex128]:
+    """The way of a point at `lever` m (ahead + i left) of an IMU with z up: (n,) m, up to a line and a parabola.
+
+    East + i north up to a first heading: the accelerometer integrated twice along the gyroscope's heading.
+    `mirrored`: left is taken as right.
+    """
+    x, y = imu.specific_force[:, 0], imu.specific_force[:, 1] * (-1.0 if mirrored else 1.0)
+    heading = np.exp(1j * integral(imu.stamps, imu.angular_rate[:, 2]))
+    ahead = (x + 1j * y) * heading
+    twice = integral(imu.stamps, integral(imu.stamps, np.column_stack([ahead.real, ahead.imag])))
+    arm = np.conj(lever) if mirrored else lever
+    return np.asarray(twice[:, 0] + 1j * twice[:, 1] + arm * heading)
 
 
 @dataclass(frozen=True, eq=False)

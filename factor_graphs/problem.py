@@ -29,7 +29,7 @@ from factor_graphs.model import (
     to_values,
 )
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
-from factor_graphs.screening import are_new, correlation_times, decorrelate, inside, plausible
+from factor_graphs.screening import FEWEST, are_new, correlation_times, decorrelate, inside, plausible
 from factor_graphs.settings import SmootherSettings
 
 Array = NDArray[np.float64]
@@ -214,10 +214,10 @@ def usable_fixes(
     ):
         if unused.any():
             notes.append(f"{unused.sum()} of {len(fixes)} fixes {why}")
-    if used.sum() < 3:
+    if used.sum() < FEWEST:
         raise MeasurementError(
             f"{used.sum()} usable GNSS fixes of {len(fixes)} in the IMU's span {imu.stamps[0]:.3f}.."
-            f"{imu.stamps[-1]:.3f} s, expected at least 3" + "".join(f"; {note}" for note in notes)
+            f"{imu.stamps[-1]:.3f} s, expected at least {FEWEST}" + "".join(f"; {note}" for note in notes)
         )
     return used, notes
 

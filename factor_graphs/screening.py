@@ -15,6 +15,8 @@ Mask = NDArray[np.bool_]
 ALLOWANCE_M = 50.0
 # So many runs of fixes between impossible jumps are tried as the true one.
 BELIEVED_RUNS = 20
+# So many fixes make a drive.
+FEWEST = 3
 # Who reports positions more often than this, s, with less white noise than this share of what is claimed, reports what
 # a filter makes of them.
 DRIFTING_BELOW_S, FILTERED = 0.5, 0.5
@@ -30,13 +32,14 @@ def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
 
 
 def are_new(fixes: GnssFixes) -> Mask:
-    """The fixes whose position is not that of the fix before, (m,).
+    """The fixes whose position is not that of the fix before, (m,); all of them where fewer than three positions differ.
 
     Noise alone moves a measured position, so rows that are the same are one measurement written again: by a logger
-    faster than the receiver, or by a receiver that has none. Its moment is that of the first row.
+    faster than the receiver, or by a receiver that has none. Its moment is that of the first row. A receiver that
+    holds its position while it stands writes hardly any other.
     """
-    changed = np.any(np.diff(fixes.positions, axis=0) != 0, axis=1)
-    return np.append(np.ones(min(len(fixes), 1), dtype=bool), changed)
+    changed = np.append(True, np.any(np.diff(fixes.positions, axis=0) != 0, axis=1))[: len(fixes)]
+    return changed if changed.sum() >= FEWEST else np.ones(len(fixes), dtype=bool)
 
 
 def plausible(fixes: GnssFixes, max_speed_mps: float) -> Mask:

@@ -52,6 +52,17 @@ def test_fixes_that_a_logger_repeats_are_used_once_at_the_moment_of_the_first(si
     np.testing.assert_allclose(once.keyframes.positions, s.keyframes.positions, atol=1e-6)
 
 
+def test_a_receiver_may_hold_its_position_while_it_stands():
+    stamps = np.arange(0.0, 60.0, 0.01)
+    imu = ImuSamples(stamps, np.tile([0.0, 0.0, 9.81], (len(stamps), 1)), np.zeros((len(stamps), 3)))
+    held = GnssFixes(np.arange(1.0, 59.0), np.tile([1.0, 2.0, 3.0], (58, 1)), np.ones((58, 3)))
+    s = smooth(imu, held, FRAME)
+    assert not s.rejected.any()
+    np.testing.assert_allclose(
+        s.keyframes.positions, np.tile([1.0, 2.0, 3.0], (len(s.keyframes), 1)), atol=0.05
+    )
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_motion_supports_the_true_offset_and_only_what_is_near(simulate, seed):
     drive = simulate(seed, seconds=300.0, noise=ImuNoise(), moves=turned)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -37,14 +35,6 @@ def assert_same(a: Path, b: Path) -> None:
 
 def mapped(names: str, drives: Drives, out: Path, how: HowMapped) -> ManyDrives:
     return run_drives([drives.by_name[name] for name in names], out, SETTINGS, how)
-
-
-def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)]
-
-
-def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
 
 
 def run_of(places: Sequence[Path | str], drives: Drives, out: Path, *more: str | Path) -> list[str | Path]:

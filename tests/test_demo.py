@@ -10,24 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import gnss_sem_map, in_a_process
 
 from gnss_sem_map.errors import how_to_install
-
-
-def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     """Folder of the run, folder of the truth, and what was printed."""
     out = tmp_path_factory.mktemp("demo") / "demo"
-    done = gnss_sem_map("demo", "-o", out, "--seconds", "3", "--seed", "1")
+    done = in_a_process("demo", "-o", out, "--seconds", "3", "--seed", "1")
     assert done.returncode == 0, done.stderr
     (drive,) = (out.parent / "demo_drive").glob("*/*_sync")
     return out, drive / "truth", done.stdout

@@ -19,8 +19,8 @@ import pytest
 
 from gnss_sem_map.cli import commands, logs, signals
 
-OF_THE_PROCESS = ("share_one_heap", "use_huge_pages", "collect_seldom")
-"""What `main` sets once for its process."""
+OF_THE_PROCESS = ("share_one_heap", "use_huge_pages", "collect_seldom", "_close_stdout")
+"""What `main` does to its process for good."""
 
 
 def command(*words: str | Path) -> list[str]:

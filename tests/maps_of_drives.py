@@ -11,8 +11,9 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, run_drives
 from gnss_sem_map.segmentation import DEMO_CALIBRATION
 
-# with a file that they name: each result has a copy of its own
-SETTINGS = Settings(calibration=DEMO_CALIBRATION)
+# with a file that they name: each result has a copy of its own; the classifiers are soon trained
+CHOSEN = (f"calibration={DEMO_CALIBRATION}", "geometric_classifier.rows_per_fold=1000")
+SETTINGS = Settings().changed(*CHOSEN)
 OF_MOMENT = ("run.json", "report.html")
 """Files of a drive that hold times and memory."""
 
@@ -38,5 +39,5 @@ def mapped(names: str, drives: Drives, out: Path, how: HowMapped) -> ManyDrives:
 
 
 def run_of(places: Sequence[Path | str], drives: Drives, out: Path, *more: str | Path) -> list[str | Path]:
-    chosen = f"calibration={DEMO_CALIBRATION}"
-    return ["run", *places, "--segmenter", drives.labels, "--set", chosen, "--force", "-o", out, *more]
+    chosen = [word for setting in CHOSEN for word in ("--set", setting)]
+    return ["run", *places, "--segmenter", drives.labels, *chosen, "--force", "-o", out, *more]

@@ -94,14 +94,6 @@ def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_without_torch_the_demo_takes_corrupted_labels_and_says_so(tmp_path: Path) -> None:
-    done = demo_without_torch("-o", tmp_path / "demo", "--seconds", "3")
-    assert done.returncode == 0, done.stderr
-    assert "torch and safetensors are not installed: the demo takes corrupted true labels" in done.stderr
-    assert "true class images, corrupted" in done.stdout
-
-
-@pytest.mark.slow
 def test_the_corrupted_truth_can_stand_in_for_the_network(
     demo: tuple[Path, Path, str], tmp_path: Path
 ) -> None:

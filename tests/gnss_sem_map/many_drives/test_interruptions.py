@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, astuple, replace
 from pathlib import Path
 from types import ModuleType
@@ -31,6 +31,8 @@ from gnss_sem_map.errors import DataError
 from gnss_sem_map.files import work_folder
 from gnss_sem_map.files.output_folder import RESUMABLE
 from gnss_sem_map.files.ownership import CONTENT_BYTES, write_list
+from gnss_sem_map.mapping.execution import Task, path_of
+from gnss_sem_map.mapping.worker_processes import Processes
 from gnss_sem_map.runs import finished_run, many_drives, run_folder
 from gnss_sem_map.runs.drive_tasks import map_one
 from gnss_sem_map.runs.many_drives import HowMapped, add_drive, remove_drive, run_drives
@@ -249,15 +251,12 @@ def call_of_map_one(drives: Drives, work: Path) -> tuple[Path, Path, tuple[Any, 
     return settings, folder, (asdict(source), str(settings), astuple(frame), str(folder), True, "")
 
 
-def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(
-    drives: Drives, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_that_is_still_being_mapped_elsewhere_is_waited_for(drives: Drives, tmp_path: Path) -> None:
     """A cluster calls a task again when it takes its worker for lost; the first call may go on."""
     _, folder, words = call_of_map_one(drives, tmp_path)
-    calls = calls_of_the_pipeline(monkeypatch)
-    with ThreadPoolExecutor(2) as threads:
-        assert list(threads.map(lambda _: map_one(*words), range(2))) == ["", ""]
-    assert calls == ["a"]
+    task = Task("a", path_of(map_one), words)
+    with closing(Processes(2)) as processes:
+        assert [reason for _, reason in processes.run([task, replace(task)])] == ["", ""]
     assert (folder / "run.json").is_file()
     assert [path.name for path in folder.parent.iterdir()] == ["a"]
 

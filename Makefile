@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 PYTEST := $(BIN)/pytest -n $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)') --dist loadfile --no-loadscope-reorder
 PACKAGE := $(VENV)/.package
 TOOLS := $(VENV)/.tools
+KERNELS := $(VENV)/.kernels
 # What is imported is compiled once, also where the environment says that nothing is to be kept.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -23,7 +24,7 @@ define install
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c $(CONSTRAINTS) -e '$(1)'; }
 endef
 
-.PHONY: test test-newest test-unit test-slow test-demo test-faults check demo notebooks docs package clean
+.PHONY: kernels test test-newest test-unit test-slow test-demo test-faults check demo notebooks docs package clean
 
 $(PACKAGE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11")'
@@ -36,7 +37,14 @@ $(TOOLS): $(PACKAGE)
 	$(call install,.[dev])
 	touch $@
 
-test: $(TOOLS)
+# Compiled once: else each process of the tests would compile the same functions at the same time, a minute each.
+$(KERNELS): $(TOOLS) gnss_sem_map/cli/kernels.txt
+	$(BIN)/python -m gnss_sem_map.cli.compile_ahead
+	touch $@
+
+kernels: $(KERNELS)
+
+test: $(KERNELS)
 	$(PYTEST) -m 'not slow and not demo and not faults'
 
 # The tests with the newest of every dependency, which is what a user of pip gets; torch alone is held, or pip takes its

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,8 +11,9 @@ from gnss_sem_map.config import Settings
 from gnss_sem_map.runs.many_drives import HowMapped, ManyDrives, run_drives
 from gnss_sem_map.segmentation import DEMO_CALIBRATION
 
-# with a file that they name: each result has a copy of its own
-SETTINGS = Settings(calibration=DEMO_CALIBRATION)
+# with a file that they name: each result has a copy of its own; the classifiers are soon trained
+CHOSEN = (f"calibration={DEMO_CALIBRATION}", "geometric_classifier.rows_per_fold=1000")
+SETTINGS = Settings().changed(*CHOSEN)
 OF_MOMENT = ("run.json", "report.html")
 """Files of a drive that hold times and memory."""
 
@@ -39,14 +38,6 @@ def mapped(names: str, drives: Drives, out: Path, how: HowMapped) -> ManyDrives:
     return run_drives([drives.by_name[name] for name in names], out, SETTINGS, how)
 
 
-def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)]
-
-
-def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
-
-
 def run_of(places: Sequence[Path | str], drives: Drives, out: Path, *more: str | Path) -> list[str | Path]:
-    chosen = f"calibration={DEMO_CALIBRATION}"
-    return ["run", *places, "--segmenter", drives.labels, "--set", chosen, "--force", "-o", out, *more]
+    chosen = [word for setting in CHOSEN for word in ("--set", setting)]
+    return ["run", *places, "--segmenter", drives.labels, *chosen, "--force", "-o", out, *more]

@@ -10,24 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import gnss_sem_map, in_a_process
 
 from gnss_sem_map.errors import how_to_install
-
-
-def gnss_sem_map(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, str]:
     """Folder of the run, folder of the truth, and what was printed."""
     out = tmp_path_factory.mktemp("demo") / "demo"
-    done = gnss_sem_map("demo", "-o", out, "--seconds", "3", "--seed", "1")
+    done = in_a_process("demo", "-o", out, "--seconds", "3", "--seed", "1")
     assert done.returncode == 0, done.stderr
     (drive,) = (out.parent / "demo_drive").glob("*/*_sync")
     return out, drive / "truth", done.stdout
@@ -99,14 +91,6 @@ def test_a_missing_package_is_named_before_anything_is_simulated(tmp_path: Path)
     assert done.returncode == 1
     assert f"torch is not installed; {how_to_install('segmentation')}" in done.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_without_torch_the_demo_takes_corrupted_labels_and_says_so(tmp_path: Path) -> None:
-    done = demo_without_torch("-o", tmp_path / "demo", "--seconds", "3")
-    assert done.returncode == 0, done.stderr
-    assert "torch and safetensors are not installed: the demo takes corrupted true labels" in done.stderr
-    assert "true class images, corrupted" in done.stdout
 
 
 @pytest.mark.slow

@@ -17,10 +17,8 @@ from typing import Any
 import pytest
 import typer
 import yaml
-from pages import FENCED, PAGES, ROOT, TEXTS, Block, blocks, python
+from pages import FENCED, ROOT, TEXTS, Block, blocks, python
 
-import factor_graphs
-import gnss_sem_map
 from gnss_sem_map import config
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets.log_yaml import LogFile
@@ -28,14 +26,6 @@ from gnss_sem_map.datasets.log_yaml import LogFile
 COMMANDS: Any = typer.main.get_command(app)
 OTHERS = {"cd", "dask", "export", "git", "make", "source", "python3", ".venv/bin/pip"}
 """Programs that are not ours."""
-ELSEWHERE = {
-    "from a clone": "make, which does the same, is what CI begins with",
-    "needs several machines": "tests/gnss_sem_map/mapping/test_dask_cluster.py has a cluster on one machine",
-    "needs a Slurm cluster": "there is none",
-    "needs a Kubernetes cluster": "there is none",
-    "takes minutes": "tests/test_whole_demo.py",
-}
-"""Titles of the blocks that are parsed only, and what runs in their place."""
 
 
 BLOCKS = [block for page in TEXTS for block in blocks(page)]
@@ -54,17 +44,6 @@ IN_TEXT = sorted(
         )
     }
 )
-
-
-def test_what_no_test_runs_says_what_it_needs() -> None:
-    for block in BLOCKS:
-        assert not block.title or block.title in ELSEWHERE or block.title.startswith("needs "), block.title
-
-
-def test_every_block_says_its_language_and_every_fence_is_one() -> None:
-    assert {block.language for block in BLOCKS} == {"bash", "python", "yaml", "text", "math"}
-    fences = sum(page.read_text("utf-8").count("```") for page in TEXTS)
-    assert fences == 2 * len(BLOCKS)
 
 
 @pytest.mark.parametrize("line", LINES)
@@ -156,12 +135,6 @@ def test_a_link_leads_to_a_file_and_a_heading(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{page.name}: {link}"
 
 
-def test_every_page_is_in_the_navigation() -> None:
-    listed = re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.M)
-    made = {path for path, _ in generated().pages() if path.endswith(".md")}
-    assert sorted(listed) == sorted({page.name for page in PAGES} | made)
-
-
 # --- pages that are made -----------------------------------------------------------------------------------------
 
 
@@ -189,30 +162,3 @@ def test_every_setting_has_a_row_with_its_meaning() -> None:
     assert len(rows) + len(heads) == len(named) > 100
     assert all(f"| `{name}` |" in page or re.search(rf"^#+ .*\b{name}$", page, re.M) for name in named)
     assert not [row for row in rows if row.rstrip("| ").endswith("`")], "a setting without a meaning"
-
-
-def test_every_command_and_option_has_a_row_with_its_meaning() -> None:
-    page = generated().commands_page()
-    for name, command in COMMANDS.commands.items():
-        section = page.split(f"\n## {name}\n")[1].split("\n## ")[0]
-        rows = re.findall(r"^\| `(.*?)` \| (.+) \|$", section, re.M)
-        assert len(rows) == len([parameter for parameter in command.params if not parameter.hidden])
-        for parameter in command.params:
-            if parameter.opts[0].startswith("-"):
-                assert any(parameter.opts[-1] in names for names, _ in rows)
-
-
-def test_every_public_name_has_a_place_in_the_api() -> None:
-    page = generated().api_page()
-    places = re.findall(r"^::: (\S+)$", page, re.M)
-    public = [*gnss_sem_map.__all__, *factor_graphs.__all__]
-    assert sorted(place.rsplit(".", 1)[1] for place in places) == sorted(public)
-
-
-def test_every_benchmark_has_its_figures_its_command_and_its_commit() -> None:
-    page = generated().benchmarks_page()
-    for file in (ROOT / "benchmarks" / "results").glob("*.json"):
-        section = page.split(f"\n## {file.stem}\n")[1].split("\n## ")[0]
-        assert f"python benchmarks/{file.stem}.py" in section
-        assert "Measured on:" in section
-        assert "| figure |" in section

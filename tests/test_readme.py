@@ -30,11 +30,6 @@ README = (ROOT / "README.md").read_text("utf-8")
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, re.S)
 
 
-def test_there_are_four_snippets_of_at_most_six_lines() -> None:
-    assert len(SNIPPETS) == 4
-    assert all(len([line for line in snippet.splitlines() if line.strip()]) <= 6 for snippet in SNIPPETS)
-
-
 def test_the_snippets_run(
     small_drive: Street, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

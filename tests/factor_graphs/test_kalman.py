@@ -22,7 +22,7 @@ def test_smoothing_beats_filtering_and_the_graph_beats_both(simulate):
     for seed in range(3):
         drive = simulate(71 + seed, noise=ImuNoise(), outages=[(50.0, 70.0)])
         k = kalman_smooth(drive.imu, drive.fixes, FRAME, None, LEVER)
-        settings = SmootherSettings(standing_stddev_mps=None)
+        settings = SmootherSettings(standing_stddev_mps=None, vehicle_constraint="off")
         graph = smooth(drive.imu, drive.fixes, FRAME, settings, LEVER).keyframes
         truth = drive.motion.trajectory(graph.stamps)
         for name, t in (("filter", k.filtered), ("rts", k.smoothed), ("graph", graph)):

@@ -189,11 +189,11 @@ def test_what_binding_gains_is_what_the_mean_of_independent_errors_gains(motion)
 
 @pytest.mark.parametrize("metres", [3.0, 8.0, 30.0], ids=["a bay", "a facade", "a street"])
 def test_a_wrong_pair_bends_nothing(motion, sessions, metres):
-    """Facades look alike some metres on; each pair in turn is shifted along the street or across it."""
+    """Facades look alike some metres on; every third pair is shifted along the street or across it."""
     drives, rng = [condensed(solution) for solution in sessions], np.random.default_rng(2)
     right = pairs_of(motion, drives, rng, every=6)
     good = bind(drives, right)
-    for wrong in range(len(right)):
+    for wrong in range(0, len(right), 3):
         T = right.T.copy()
         T[wrong, :2, 3] += metres * rng.permutation([1.0, 0.0]) * rng.choice([-1, 1])
         bound = bind(drives, replace(right, T=T))

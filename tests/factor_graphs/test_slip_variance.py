@@ -73,7 +73,9 @@ def sliding(lateral: float, vertical: float, vertical_s: float = 1.0):
     return moves
 
 
-@pytest.mark.parametrize(("lateral", "vertical"), [(0.03, 0.03), (0.06, 0.05)])
+@pytest.mark.parametrize(
+    ("lateral", "vertical"), [pytest.param(0.03, 0.03, marks=pytest.mark.slow), (0.06, 0.05)]
+)
 def test_slip_that_is_held_is_found_as_large_as_it_is(simulate, lateral, vertical):
     found = []
     for seed in range(4):

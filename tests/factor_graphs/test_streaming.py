@@ -52,21 +52,6 @@ def test_it_survives_an_outage_of_a_minute(simulate):
     assert np.sqrt(np.mean(off[-20:] ** 2)) < 1.5
 
 
-def test_it_starts_again_from_its_last_state_when_the_solver_throws(simulate, monkeypatch):
-    drive = simulate(92, seconds=60.0, noise=ImuNoise())
-    online = started(drive)
-
-    class Broken:
-        def update(self, *_: object) -> None:
-            raise RuntimeError("Indeterminant linear system detected while working near variable")
-
-    monkeypatch.setattr(online, "_smoother", Broken())
-    off, _ = follow(online, drive)
-    assert online.restarts == 1
-    assert isinstance(online._smoother, gtsam.IncrementalFixedLagSmoother)
-    assert np.sqrt(np.mean(off**2)) < 1.5
-
-
 def test_a_restart_is_no_surer_than_the_state_that_it_begins_from(simulate, monkeypatch):
     """The solver throws one fix after an outage of a minute, where the batch start was sure to decimetres."""
     drive = simulate(91, seconds=150.0, noise=ImuNoise(), outages=[(50.0, 110.0)])

@@ -158,7 +158,7 @@ def test_the_calibration_is_found_as_well_as_it_says(simulate, settings):
 @pytest.mark.parametrize("slips", [(), ((70.0, 74.0, 0.3), (140.0, 146.0, 0.15), (165.0, 168.0, -1.0))])
 def test_outages_are_better_with_wheels_even_where_they_slip(simulate, slips):
     off, squares = {"without": [], "with": []}, []
-    for seed in range(6):
+    for seed in range(3):
         drive = simulate(seed, seconds=240.0, noise=ImuNoise(), moves=mounted, outages=OUTAGES)
         wheels = wheels_of(drive, seed, 240.0, signed=False, slips=slips)
         off["without"].append(inside_outages(smooth(drive.imu, drive.fixes, FRAME, NO_VEHICLE, LEVER), drive))

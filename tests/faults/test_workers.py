@@ -21,6 +21,9 @@ from gnss_sem_map.run_stats import RunStats
 from gnss_sem_map.runs.chunk_tasks import ChunkTasks
 from gnss_sem_map.runs.source import source_of
 
+pytestmark = pytest.mark.faults
+"""`mapping/test_execution.py` states the same of small tasks, at every commit."""
+
 UNGUARDED = """
 import sys
 import gnss_sem_map

@@ -50,10 +50,12 @@ def products(out: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def days(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The same street on two days; read only. No image is looked at, so they are small."""
+    """The same street on two days; read only. Half the columns, and small images, at which nothing looks."""
     folder = tmp_path_factory.mktemp("days")
-    camera = Camera(62, 18, 36.0, 30.5, 8.6)
-    return [simulate(folder, SECONDS, SEED, camera=camera, session=session) for session in (0, 1)]
+    camera, lidar = Camera(62, 18, 36.0, 30.5, 8.6), Lidar(columns=1040)
+    return [
+        simulate(folder, SECONDS, SEED, lidar=lidar, camera=camera, session=session) for session in (0, 1)
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import typer.testing
+from commands import gnss_sem_map
 from street import Street
 
 from gnss_sem_map import simulation
@@ -25,12 +26,7 @@ from gnss_sem_map.sensor_log import Skip
 
 pytestmark = pytest.mark.integration
 
-PROGRAM = (sys.executable, "-m", "gnss_sem_map.cli")
 DOCS = Path(__file__).parents[2] / "docs"
-
-
-def program(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, text=True)
 
 
 def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tmp_path: Path) -> None:
@@ -45,7 +41,7 @@ def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tm
         "--workers",
         "1",
     )
-    done = program(*words, "--dry-run")
+    done = gnss_sem_map(*words, "--dry-run")
     assert (done.returncode, done.stderr) == (0, "")
     scans = len(list(small_drive.drive.glob("velodyne*/data/*")))
     assert f"{scans} scans over" in done.stdout
@@ -57,7 +53,7 @@ def test_a_dry_run_says_what_is_there_and_writes_nothing(small_drive: Street, tm
 
 def test_a_dry_run_tells_the_origin_that_is_given(small_drive: Street, tmp_path: Path) -> None:
     words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--dry-run")
-    done = program(*words, "--origin", "49.02,8.43,110")
+    done = gnss_sem_map(*words, "--origin", "49.02,8.43,110")
     assert done.returncode == 0, done.stderr
     assert "origin: 49.020000, 8.430000" in done.stdout
 
@@ -65,7 +61,7 @@ def test_a_dry_run_tells_the_origin_that_is_given(small_drive: Street, tmp_path:
 def test_an_origin_that_is_too_far_is_refused_before_the_work(small_drive: Street, tmp_path: Path) -> None:
     words = ("run", small_drive.drive, "--segmenter", "none", "-o", tmp_path / "out", "--force")
     for more in ((), ("--dry-run",)):
-        done = program(*words, "--origin", "48,11,0", *more)
+        done = gnss_sem_map(*words, "--origin", "48,11,0", *more)
         assert done.returncode == 1
         assert len(done.stderr.splitlines()) == 1
         assert "km from the origin of the map (48.000000, 11.000000, 0.0 m)" in done.stderr
@@ -81,7 +77,7 @@ def test_a_dry_run_refuses_what_the_run_would_refuse(small_drive: Street, tmp_pa
         (("-o", tmp_path / "new", "--segmenter", "labels:/nowhere"), "/nowhere"),
         (("-o", tmp_path / "new", "--segmenter", "none", "--crs", "4326"), "4326"),
     ):
-        done = program("run", small_drive.drive, *words, "--dry-run")
+        done = gnss_sem_map("run", small_drive.drive, *words, "--dry-run")
         assert done.returncode in (1, 2)
         assert message in done.stderr
         assert len(done.stderr.splitlines()) == 1
@@ -98,7 +94,7 @@ def test_a_dry_run_without_a_segmenter_ends_as_the_run_does(
         drives = 2 * [date / small_drive.drive.name]
         shutil.rmtree(drives[0] / "image_02")
     words = ("run", *drives, "-o", tmp_path / "new")
-    run, dry = program(*words), program(*words, "--dry-run")
+    run, dry = gnss_sem_map(*words), gnss_sem_map(*words, "--dry-run")
     assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
     assert run.returncode == 1
     assert "--segmenter none" in dry.stderr
@@ -116,7 +112,7 @@ def test_a_dry_run_of_several_drives_ends_as_the_run_does(
         "no such place": ["--align-to", tmp_path / "city.laz", "--crs", "2193"],
     }[wrong]
     words = ("-q", "run", small_drive.drive, *options, "--segmenter", "none", "-o", tmp_path / "new")
-    run, dry = program(*words), program(*words, "--dry-run")
+    run, dry = gnss_sem_map(*words), gnss_sem_map(*words, "--dry-run")
     assert run.returncode == 1
     assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
 
@@ -124,7 +120,7 @@ def test_a_dry_run_of_several_drives_ends_as_the_run_does(
 def test_a_dry_run_without_scans_ends_as_the_run_does(small_drive: Street, tmp_path: Path) -> None:
     options = ("--frames", "900:", "--segmenter", "none", "-o", tmp_path / "new")
     words = ("-q", "run", small_drive.drive, *options)
-    run, dry = program(*words), program(*words, "--dry-run")
+    run, dry = gnss_sem_map(*words), gnss_sem_map(*words, "--dry-run")
     assert (dry.returncode, dry.stderr, dry.stdout) == (run.returncode, run.stderr, run.stdout)
     assert run.returncode == 1
     assert "has no LiDAR scan to map" in dry.stderr
@@ -136,7 +132,7 @@ def test_a_dry_run_counts_on_a_damaged_scan_being_skipped(small_drive: Street, t
     drive = date / small_drive.drive.name
     for scan in drive.glob("velodyne*/data/*"):
         scan.write_bytes(b"damaged")
-    done = program("run", drive, "--segmenter", "none", "-o", tmp_path / "new", "--dry-run")
+    done = gnss_sem_map("run", drive, "--segmenter", "none", "-o", tmp_path / "new", "--dry-run")
     assert (done.returncode, done.stderr) == (0, "")
     assert "expected: about" in done.stdout
 
@@ -162,7 +158,7 @@ def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
 ) -> None:
     log = tmp_path / "log.txt"
     words = ("trajectory", small_drive.drive, "-o", tmp_path / "out")
-    loud = program("-v", "--log-file", log, *words)
+    loud = gnss_sem_map("-v", "--log-file", log, *words)
     assert loud.returncode == 0
     assert "scan matching: begins" in loud.stderr
     text = log.read_text()
@@ -170,25 +166,25 @@ def test_stages_and_warnings_go_to_terminal_and_file_as_the_options_say(
     assert "scan matching: done after" in text
     assert text.splitlines()[-1].endswith("exit code 0")
 
-    quiet = program("-q", "--log-file", log, *words)
+    quiet = gnss_sem_map("-q", "--log-file", log, *words)
     assert (quiet.returncode, quiet.stderr) == (0, "")
     assert log.read_text().count("exit code 0") == 2  # it is appended to
 
-    missing = program("--log-file", log, "trajectory", tmp_path / "nowhere", "-o", tmp_path / "other")
+    missing = gnss_sem_map("--log-file", log, "trajectory", tmp_path / "nowhere", "-o", tmp_path / "other")
     assert len(missing.stderr.splitlines()) == 1
     assert "nowhere" in log.read_text()
     assert log.read_text().splitlines()[-1].endswith("exit code 1")
 
-    no_labels = program("--log-file", log, "run", small_drive.drive, "-o", tmp_path / "other")
+    no_labels = gnss_sem_map("--log-file", log, "run", small_drive.drive, "-o", tmp_path / "other")
     assert no_labels.returncode == 1
     assert no_labels.stderr.strip() in log.read_text()
 
-    refused = program("--log-file", tmp_path / "no" / "log", *words)
+    refused = gnss_sem_map("--log-file", tmp_path / "no" / "log", *words)
     assert refused.returncode == 1
     assert len(refused.stderr.splitlines()) == 1
-    assert program("-q", "-v", *words).returncode == 2
+    assert gnss_sem_map("-q", "-v", *words).returncode == 2
 
-    inside = program("--log-file", tmp_path / "out" / "log.txt", *words)
+    inside = gnss_sem_map("--log-file", tmp_path / "out" / "log.txt", *words)
     assert inside.returncode == 2
     assert "a folder of results; choose another place" in inside.stderr
     assert not (tmp_path / "out" / "log.txt").exists()

@@ -17,7 +17,7 @@ import pyogrio
 import pytest
 from street import Street
 
-from gnss_sem_map import Run, Settings, pipeline, run
+from gnss_sem_map import Run, Settings, pipeline
 from gnss_sem_map.cli.options import delivered_in
 from gnss_sem_map.config import DeliverySettings
 from gnss_sem_map.errors import ConfigError, DataError
@@ -27,7 +27,7 @@ from gnss_sem_map.mapping import point_labels
 from gnss_sem_map.mapping.evidence import read_moving_points, write_moving_points
 from gnss_sem_map.mapping.point_labels import label_points
 from gnss_sem_map.refinement.steps import STEPS, RefinementReport, RefinementSettings
-from gnss_sem_map.runs import calibrating, merged_run
+from gnss_sem_map.runs import calibrating, finished_run, merged_run
 from gnss_sem_map.runs.about import about_map
 from gnss_sem_map.runs.classifier_fitting import fit_classifier
 from gnss_sem_map.runs.merged_run import merge_run_folders
@@ -38,6 +38,12 @@ from gnss_sem_map.voxels.semantic_map import State
 MADE_ANEW = {"run.json", "report.html", ".gnss-sem-map.json"}
 """They say how long it took."""
 EXAMPLES = Path(__file__).parents[2] / "examples"
+FEW_ROWS = Settings().changed("geometric_classifier.rows_per_fold=1000")
+"""The classifier of each run is soon trained."""
+
+
+def run(drive: Path, out: Path, segmenter: str = "none", settings: Settings = FEW_ROWS, **more: Any) -> Run:
+    return finished_run.run(drive, out, segmenter, settings, **more)
 
 
 @pytest.fixture(scope="module")

@@ -12,18 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import gnss_sem_map
 from street import Street
 
 from gnss_sem_map.voxels import map_json, tiles
 from gnss_sem_map.voxels.blocks import blocks_of
-
-
-def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "gnss_sem_map.cli", *map(str, arguments)]
-
-
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
 
 
 def run_of(small_drive: Street, out: Path, *more: str, labels: str | None = None) -> list[str | Path]:
@@ -144,7 +137,7 @@ def results_of(out: Path) -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def whole(small_drive: Street, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "out"
-    done = run(*run_of(small_drive, out, *SMALL))
+    done = gnss_sem_map(*run_of(small_drive, out, *SMALL))
     assert done.returncode == 0, done.stderr
     assert [path.name for path in out.parent.iterdir()] == ["out"], "nothing stays beside the results"
     return out
@@ -242,15 +235,17 @@ def test_two_halves_of_a_drive_merge_into_the_whole(small_drive: Street, whole: 
         "trajectory.lidar_odometry=false",
     )
     for name, frames in (("a", "0:6"), ("b", "6:12"), ("both", "0:12")):
-        done = run(*run_of(small_drive, tmp_path / name, "--frames", frames, *off))
+        done = gnss_sem_map(*run_of(small_drive, tmp_path / name, "--frames", frames, *off))
         assert done.returncode == 0, done.stderr
-    done = run("merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "merged", "--no-match", "--json")
+    done = gnss_sem_map(
+        "merge", tmp_path / "a", tmp_path / "b", "-o", tmp_path / "merged", "--no-match", "--json"
+    )
     assert done.returncode == 0, done.stderr
     both, merged = (tiles.read(tmp_path / name / "map").voxels for name in ("both", "merged"))
     for name in ("keys", "evidence", "hits"):
         np.testing.assert_array_equal(getattr(merged, name), getattr(both, name))
     assert json.loads(done.stdout)["map"]["voxels"] == len(both)
     assert (tmp_path / "merged/map.laz").is_file()
-    done = run("merge", tmp_path / "a", small_drive.labels, "-o", tmp_path / "no")
+    done = gnss_sem_map("merge", tmp_path / "a", small_drive.labels, "-o", tmp_path / "no")
     assert done.returncode == 1
     assert "no run folder here" in done.stderr

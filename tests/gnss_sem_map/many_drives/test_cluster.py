@@ -8,8 +8,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from commands import command, gnss_sem_map
 from dask_clusters import started, two_workers
-from maps_of_drives import assert_same, command, gnss_sem_map, run_of
+from maps_of_drives import assert_same, run_of
 from processes import wait_until
 from street_drives import Drives
 

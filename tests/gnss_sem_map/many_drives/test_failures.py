@@ -12,7 +12,8 @@ from typing import Any, NoReturn
 
 import pytest
 import street
-from maps_of_drives import SETTINGS, assert_same, gnss_sem_map, mapped, products, run_of
+from commands import gnss_sem_map
+from maps_of_drives import SETTINGS, assert_same, mapped, products, run_of
 from street import Street
 from street_drives import Drives
 

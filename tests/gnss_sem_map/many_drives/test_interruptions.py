@@ -18,8 +18,9 @@ from typing import Any, NoReturn
 
 import pytest
 import street_drives
+from commands import gnss_sem_map
 from damage import flipped, halved
-from maps_of_drives import SETTINGS, assert_same, gnss_sem_map, mapped, products, run_of
+from maps_of_drives import SETTINGS, assert_same, mapped, products, run_of
 from street_drives import Drives
 
 from factor_graphs.geodesy import LocalFrame

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from maps_of_drives import SETTINGS, assert_same, gnss_sem_map
+from commands import gnss_sem_map
+from maps_of_drives import SETTINGS, assert_same
 from street_drives import Drives
 from typer.testing import CliRunner
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
@@ -14,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ros
+from commands import gnss_sem_map
 from ros import START_NS, rig_yaml, sweep, with_camera
 
 from gnss_sem_map.datasets import open_drive
@@ -120,7 +119,6 @@ def test_a_wild_number_in_an_mcap_is_refused(
         read_all(tmp_path / "wild.mcap")
 
 
-@pytest.mark.integration
 @pytest.mark.parametrize(("command", "storage"), [("inspect", "mcap"), ("inspect", "bag"), ("check", "db3")])
 def test_a_command_says_in_one_line_that_a_bag_is_truncated(
     tmp_path: Path, command: str, storage: str
@@ -128,8 +126,7 @@ def test_a_command_says_in_one_line_that_a_bag_is_truncated(
     name = "drive.bag" if storage == "bag" else "drive"
     bag = ros.write(tmp_path / name, ros.drive(storage == "bag"), storage)
     damaged(bag, lambda content: content[: len(content) // 3])
-    line = [sys.executable, "-m", "gnss_sem_map.cli", command, str(bag)]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    done = gnss_sem_map(command, bag)
     assert (done.returncode, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
     assert "truncated" in done.stderr

@@ -69,7 +69,7 @@ def test_heights_in_millimetres_are_no_road(right: SensorLog, height: float) -> 
     assert any("altitude is in mm" in line for line in said)
 
 
-@pytest.mark.parametrize("late_s", [-2.0, -1.0, -0.5, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("late_s", [-1.0, 0.5, 2.0])
 def test_a_late_clock_is_found_and_its_setting_mends_it(right: SensorLog, late_s: float) -> None:
     fixes = fixes_of(right)
     late = replace(right, gnss=GnssFixes(fixes.stamps + late_s, fixes.positions, fixes.stddevs))
@@ -166,7 +166,7 @@ def test_a_lever_arm_in_millimetres_is_longer_than_any_vehicle(right: SensorLog)
     )
 
 
-@pytest.mark.parametrize("off", [(2.0, 0.0, 0.0), (-2.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, -2.0, 0.0)])
+@pytest.mark.parametrize("off", [(2.0, 0.0, 0.0), (0.0, -2.0, 0.0)])
 def test_an_antenna_elsewhere_is_found_in_the_turns(off: tuple[float, float, float]) -> None:
     good = drive(4, 120.0, ImuNoise(), stddev_m=0.02, every_s=0.2)
     assert wrong(findings(good)) == []
@@ -174,7 +174,7 @@ def test_an_antenna_elsewhere_is_found_in_the_turns(off: tuple[float, float, flo
     assert any("antenna" in line for line in wrong(findings(replace(good, calibration=calibration))))
 
 
-@pytest.mark.parametrize("seconds", [10.0, 30.0, 100.0])
+@pytest.mark.parametrize("seconds", [10.0, 100.0])
 def test_stamps_may_be_unix_time(seconds: float) -> None:
     """There, a float is no finer than 0.2 us."""
     log, unix_s = drive(4, seconds, ImuNoise()), 1_700_000_000.0

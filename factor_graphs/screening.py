@@ -32,7 +32,7 @@ def inside(fixes: GnssFixes, imu: ImuSamples) -> Mask:
 
 
 def are_new(fixes: GnssFixes) -> Mask:
-    """The fixes whose position is not that of the fix before, (m,); all of them where fewer than three positions differ.
+    """The fixes whose position is not that of the fix before, (m,); all where fewer than three positions differ.
 
     Noise alone moves a measured position, so rows that are the same are one measurement written again: by a logger
     faster than the receiver, or by a receiver that has none. Its moment is that of the first row. A receiver that

@@ -147,17 +147,11 @@ def smooth(
     drives or to itself (`sessions.bind`). Raises MeasurementError with fewer than three usable fixes, and
     EstimationError when the optimiser stops at its limit.
     """
-    settings = settings or SmootherSettings()
+    settings, relative = settings or SmootherSettings(), relative_poses or NO_RELATIVE_POSES
     given = np.asarray(p_imu_antenna, dtype=np.float64)
     if given.shape != (3,) or not np.isfinite(given).all():
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
-
-    relative, samples = relative_poses or NO_RELATIVE_POSES, measured(imu)
-    bias = large_gyroscope_bias(samples, fixes[are_new(fixes)])
-    if bias.any():
-        samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
-    if settings.imu_sample_instant == "end":
-        samples = samples.at_middle()
+    inertial = _Inertial.of(imu, fixes, settings)
 
     def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
         shifted = replace(fixes, stamps=fixes.stamps + calibration.time_offset_s)
@@ -165,60 +159,112 @@ def smooth(
         also_at = np.concatenate([NOWHERE, *(one.stamps for one in also)]) + calibration.time_offset_s
 
         def pose(some: GnssFixes) -> Problem:
+            samples = inertial.samples
             return pose_problem(samples, some, frame, settings, lever, initial_attitude, relative, also_at)
 
         return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
 
     problem, fit, estimated = calibrate(fit_to, settings, given)
-    are_ends = settings.imu_sample_instant is None and stamps_are_ends(estimated, samples)
-    if are_ends:
-        samples = samples.at_middle()
+    if settings.imu_sample_instant is None and stamps_are_ends(estimated, inertial.samples):
+        inertial = inertial.at_middle()
         problem, fit, estimated = calibrate(fit_to, settings, given)
-    of_noise = max(fit.inflation, problem.of_fixes)
-    calibration = checked(estimated, samples, fixes[problem.used][fit.weights > HALF], of_noise)
+    of_noise, fitting = max(fit.inflation, problem.of_fixes), fixes[problem.used][fit.weights > HALF]
+    calibration = checked(estimated, inertial.samples, fitting, of_noise)
     if calibration.refused:
         problem, fit = fit_to(calibration)
-    may_inflate = settings.inflate_imu_noise and len(problem.relative) == 0
     beside = [_observe(one, problem, fit, calibration.time_offset_s) for one in also]
     problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
+    held = _constrained(problem, fit, wheels, beside)
+    found = _solution(problem, held, fixes, calibration)
+    found = replace(
+        found,
+        biases=found.biases + np.append(np.zeros(3), inertial.bias),
+        points=_point_residuals(beside, found.keyframes, calibration),
+        beside=tuple(one.verdict for one in beside),
+        notes=(*inertial.notes(), *found.notes, *(one.verdict for one in beside if one.doubtful)),
+    )
+    if not condensed:
+        return found
+    R = found.keyframes.T_map_imu[:, :3, :3]
+    lacking = _lacking(problem, fixes[problem.used], held.covariances[:, :6, :6], R)
+    return replace(found, condensed=condense(problem, held.fit, lacking))
+
+
+@dataclass(frozen=True, eq=False)
+class _Inertial:
+    """The samples of the IMU as the graph has them, and what was done to them."""
+
+    samples: ImuSamples
+    filled: int
+    """So many samples filled gaps."""
+    bias: Array
+    """(3,) rad/s, taken from the gyroscope."""
+    are_ends: bool = False
+    """The fixes show that the stamps were the ends of intervals."""
+
+    @classmethod
+    def of(cls, imu: ImuSamples, fixes: GnssFixes, settings: SmootherSettings) -> "_Inertial":
+        samples = measured(imu)
+        filled, bias = len(imu) - len(samples), large_gyroscope_bias(samples, fixes[are_new(fixes)])
+        if bias.any():
+            samples = ImuSamples(samples.stamps, samples.specific_force, samples.angular_rate - bias)
+        return cls(samples.at_middle() if settings.imu_sample_instant == "end" else samples, filled, bias)
+
+    def at_middle(self) -> "_Inertial":
+        """The same with stamps that are found to be ends moved to the middle."""
+        return replace(self, samples=self.samples.at_middle(), are_ends=True)
+
+    def notes(self) -> Iterator[str]:
+        """In words."""
+        if self.are_ends:
+            yield "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
+        if self.filled:
+            count = self.filled + len(self.samples)
+            yield f"{self.filled} of {count} samples of the IMU fill gaps with straight lines: not believed"
+        if self.bias.any():
+            said = ", ".join(f"{value:.2f}" for value in np.degrees(self.bias))
+            yield f"the gyroscope turns by ({said}) deg/s at rest: taken out"
+
+
+@dataclass(frozen=True, eq=False)
+class _Constrained:
+    """The fit with all that is held in it, covariances (k, 15, 15) of its states and of what all of them share."""
+
+    fit: Fit
+    vehicle: Vehicle | None
+    wheels: Wheels | None
+    covariances: Array
+    of_shared: Array
+
+
+def _constrained(
+    problem: Problem, fit: Fit, speeds: WheelSpeeds | None, beside: Sequence[Observed]
+) -> _Constrained:
+    """Hold vehicle, wheels and all measurements beside the fixes, and reject what does not fit.
+
+    Where the IMU then shows other noise than it is believed to have, the noise is estimated, by the fixes alone, and
+    everything is held again.
+    """
+    may_inflate = problem.settings.inflate_imu_noise and len(problem.relative) == 0
     by_fixes, k = fit, len(problem.intervals.keyframes)
     for is_last in (not may_inflate, True):
         held = hold_beside(problem, by_fixes, beside)
-        fit, constraints, vehicle, odometer = constrain(problem, held, wheels, beside)
+        fit, constraints, vehicle, wheels = constrain(problem, held, speeds, beside)
         fit, steps = reject(problem, fit, constraints), BiasSteps(k)
         covariances, of_shared = keyframe_covariances(fit.graph, fit.values, k, None if is_last else steps)
         if is_last or imu_noise_shown(problem, fit, covariances, steps) == (fit.inflation, fit.of_walk):
             break
         by_fixes = fit_noise_by_components(problem, by_fixes)
-    shared_stddevs = np.sqrt(of_shared.diagonal())
-    found = _solution(problem, fit, fixes, calibration, vehicle, odometer, covariances, shared_stddevs)
-    if bias.any():
-        said = ", ".join(f"{value:.2f}" for value in np.degrees(bias))
-        told = f"the gyroscope turns by ({said}) deg/s at rest: taken out"
-        found = replace(found, biases=found.biases + np.append(np.zeros(3), bias), notes=(told, *found.notes))
-    if filled := len(imu) - len(samples):
-        told = f"{filled} of {len(imu)} samples of the IMU fill gaps with straight lines: not believed"
-        found = replace(found, notes=(told, *found.notes))
-    points = [
-        residual
-        for one in beside
-        if one.points is not None
-        for residual in residuals_of(
-            *one.points, found.keyframes, calibration.p_imu_antenna, calibration.time_offset_s
-        )
-    ]
-    doubts = [one.verdict for one in beside if one.doubtful]
-    verdicts = tuple(one.verdict for one in beside)
-    found = replace(found, points=tuple(points), beside=verdicts, notes=(*found.notes, *doubts))
-    if are_ends:
-        told = "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
-        found = replace(found, notes=(told, *found.notes))
-    if not condensed:
-        return found
-    lacking = _lacking(
-        problem, fixes[problem.used], covariances[:, :6, :6], found.keyframes.T_map_imu[:, :3, :3]
-    )
-    return replace(found, condensed=condense(problem, fit, lacking))
+    return _Constrained(fit, vehicle, wheels, covariances, of_shared)
+
+
+def _point_residuals(
+    beside: Sequence[Observed], keyframes: Trajectory, calibration: Calibration
+) -> tuple[PointResidual, ...]:
+    """Of all surveyed points."""
+    offset, lever = calibration.time_offset_s, calibration.p_imu_antenna
+    placed = [one.points for one in beside if one.points is not None]
+    return tuple(residual for one in placed for residual in residuals_of(*one, keyframes, lever, offset))
 
 
 def _observe(one: Also, problem: Problem, fit: Fit, offset_s: float) -> Observed:
@@ -229,17 +275,10 @@ def _observe(one: Also, problem: Problem, fit: Fit, offset_s: float) -> Observed
     return observe_velocities(one, problem, fit, offset_s)
 
 
-def _solution(
-    problem: Problem,
-    fit: Fit,
-    fixes: GnssFixes,
-    calibration: Calibration,
-    vehicle: Vehicle | None,
-    wheels: Wheels | None,
-    covariances: Array,
-    shared_stddevs: Array,
-) -> Solution:
+def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibration: Calibration) -> Solution:
+    fit, vehicle, wheels, covariances = held.fit, held.vehicle, held.wheels, held.covariances
     T, velocities, biases = from_values(fit.values, len(problem.intervals.keyframes))
+    shared_stddevs = np.sqrt(held.of_shared.diagonal())
     if vehicle is not None and vehicle.held:
         vehicle = replace(vehicle, mounting_stddevs=shared_stddevs[:5])
     if wheels is not None and wheels.held:

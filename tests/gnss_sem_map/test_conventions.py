@@ -74,7 +74,7 @@ def test_the_accelerometer_may_have_axes_of_its_own() -> None:
 
 def test_where_nothing_is_said_nothing_is_touched() -> None:
     assert SensorConventions().imu_in_ours(IMU) is IMU
-    assert SensorConventions().fixes_in_ours(FIXES) is FIXES
+    assert SensorConventions().on_our_clock(FIXES) is FIXES
 
 
 def test_settings_win_over_the_drive_and_leave_the_rest_to_it() -> None:

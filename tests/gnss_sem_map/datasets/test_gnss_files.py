@@ -80,7 +80,7 @@ def test_no_row_is_better_than_its_quality(tmp_path: Path) -> None:
 def test_a_quality_may_be_written_with_decimals(tmp_path: Path) -> None:
     """As tables of numbers are written: 1.0000000."""
     row = pos_row(START_NS + LEAP_NS).replace("   1   9", "   1.0000000   9.0000000")
-    assert read(pos(tmp_path, [row])).rows[0, 4:].tolist() == [0.01, 0.01, 0.02]
+    assert read(pos(tmp_path, [row])).rows[0, 4:7].tolist() == [0.01, 0.01, 0.02]
 
 
 def test_a_pos_file_by_week_or_in_utc(tmp_path: Path) -> None:

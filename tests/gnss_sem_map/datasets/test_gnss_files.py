@@ -125,13 +125,9 @@ def test_covariances_and_velocities_of_a_pos_file(tmp_path: Path) -> None:
     assert np.isnan(without.rows[0, 10:]).all()
 
 
-def test_velocities_of_a_real_walk() -> None:
+def test_velocities_of_a_real_walk(real_data: Path) -> None:
     """They are those of its positions: summed up they lead to the same place within their noise."""
-    path = Path(os.environ.get("GNSS_SEM_MAP_DATA", "../shared/data")) / "gnss_imu_walk" / "gnss_1730_sf.pos"
-    if not path.exists():
-        pytest.skip(f"no {path}")
-    found = read(path, None)
-    rows = found.rows
+    rows = read(real_data / "gnss_imu_walk" / "gnss_1730_sf.pos", None).rows
     frame = LocalFrame(*rows[0, 1:4].tolist())
     velocities, _ = velocities_of(rows, frame)
     fixes, _, _ = fixes_of(rows, frame)

@@ -20,6 +20,7 @@ from factor_graphs.measurements import (
     GnssFixes,
     GnssVelocities,
     ImuSamples,
+    Repairs,
     WheelSpeeds,
     clean_imu,
     clean_wheels,
@@ -81,11 +82,9 @@ def read_velocities(folder: Path | str) -> GnssVelocities | None:
     Columns: ve_mps, vn_mps, vu_mps, east, north, up, and std_ve_mps, std_vn_mps, std_vu_mps; without those of up it is
     not measured. Rows are repaired, and errors raised, as by `read_csv`.
     """
-    path = Path(folder) / "gnss.csv"
-    rows, _ = _receiver_rows(path)
-    velocities, repairs = velocities_of(rows, LocalFrame(*(float(value) for value in rows[0, 1:4])))
-    if repairs is not None and (repairs.dropped or repairs.out_of_order):
-        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    rows, frame = _rows_in_frame(folder)
+    velocities, repairs = velocities_of(rows, frame)
+    _warn(Path(folder) / "gnss.csv", repairs)
     return velocities
 
 
@@ -96,12 +95,22 @@ def read_headings(folder: Path | str, baseline: ArrayLike | None = None) -> Ante
     one in the imu frame; None: the heading is that of the imu's x axis. Rows are repaired, and errors raised, as by
     `read_csv`.
     """
-    path = Path(folder) / "gnss.csv"
-    rows, _ = _receiver_rows(path)
-    headings, repairs = headings_of(rows, LocalFrame(*(float(value) for value in rows[0, 1:4])), baseline)
-    if repairs is not None and (repairs.dropped or repairs.out_of_order):
-        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=2)
+    rows, frame = _rows_in_frame(folder)
+    headings, repairs = headings_of(rows, frame, baseline)
+    _warn(Path(folder) / "gnss.csv", repairs)
     return headings
+
+
+def _rows_in_frame(folder: Path | str) -> tuple[Array, LocalFrame]:
+    """Valid rows of `gnss.csv`, and the local frame of the first."""
+    rows, _ = _receiver_rows(Path(folder) / "gnss.csv")
+    return rows, LocalFrame(*(float(value) for value in rows[0, 1:4]))
+
+
+def _warn(path: Path, repairs: Repairs | None) -> None:
+    """Of rows that a reader of the caller dropped or sorted."""
+    if repairs is not None and (repairs.dropped or repairs.out_of_order):
+        warnings.warn(f"{path}: {repairs}", RepairWarning, stacklevel=3)
 
 
 def read_points(path: Path | str, frame: LocalFrame) -> SurveyedPoints:

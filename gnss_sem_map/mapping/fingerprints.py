@@ -29,10 +29,17 @@ def of_log(log: SensorLog, labels_from: str = "", label_set: LabelSet | None = N
         VERSION, log.name, log.epoch_ns, log.frame, log.imu_noise, log.imu_sample_instant, log.conventions, _scans(log),
         _images(log), _cameras(log), labels_from, _states(labels_from),
         None if label_set is None else _classes_of_map(label_set),
+        None if log.points is None else log.points.names,
     ]  # fmt: skip
-    tables = (log.imu, log.gnss, log.wheels, log.given, log.initial_attitude)
+    tables = (
+        log.imu, log.gnss, log.velocities, log.headings, log.points, log.wheels, log.given, log.initial_attitude,
+    )  # fmt: skip
     values = (
-        getattr(table, column.name) for table in tables if table is not None for column in fields(table)
+        getattr(table, column.name)
+        for table in tables
+        if table is not None
+        for column in fields(table)
+        if column.name != "names"
     )
     arrays = [np.asarray(value, np.float64) for value in values if value is not None]
     return _digest(said, [*_calibration(log), log.calibration.p_imu_antenna, *arrays])

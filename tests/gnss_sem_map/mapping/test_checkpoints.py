@@ -13,11 +13,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chunks import Maps, assert_same, by_chunks
 from damage import flipped, halved
 from street import Street
 
+from factor_graphs.measurements import AntennaHeadings, GnssVelocities
+from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.errors import DataError
@@ -271,6 +274,21 @@ def test_classes_that_were_changed_in_their_file_are_noticed(drive: Drive, tmp_p
     before = digests()
     file.write_text(file.read_text("utf-8").replace("sidewalk: sidewalk", "sidewalk: road"), "utf-8")
     assert digests().isdisjoint(before)
+
+
+def test_what_a_receiver_and_a_survey_say_beside_positions_changes_the_digest(drive: Drive) -> None:
+    log, at = drive.log, np.array([1.0, 2.0])
+    one, names = np.ones((2, 3)), ("A", "B")
+    control = np.ones(2, np.bool_)
+    logs = [
+        log,
+        *(replace(log, velocities=GnssVelocities(at, speed * one, one)) for speed in (1, 2)),
+        *(replace(log, headings=AntennaHeadings(at, angle * at, at, one[0])) for angle in (1, 2)),
+        *(replace(log, points=SurveyedPoints(names, place * one, one, at, control)) for place in (1, 2)),
+        replace(log, points=SurveyedPoints(names[::-1], one, one, at, control)),
+        replace(log, points=SurveyedPoints(names, one, one, at, ~control)),
+    ]
+    assert len({fingerprints.of_log(one) for one in logs}) == len(logs)
 
 
 FILL = """

@@ -27,6 +27,9 @@ CRUISE_NOISE_DENSITY = 1.5
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
 # The gyroscope's heading is tied to the course over this long, s.
 HEADING_WINDOW_S = 20.0
+# The acceleration tells where the imu looks when it agrees with the fixes by so many standard deviations of chance; so
+# far from the axis of the vehicle, rad, it looks aside.
+SURELY, LOOKING_ASIDE = 5.0, np.pi / 4
 # Over this long, s, a vehicle goes more forward than backward.
 FORWARD_WINDOW_S = 100.0
 
@@ -137,9 +140,31 @@ def attitudes(
     # the course is along the axis of the vehicle, whether it goes forward or reverses
     axis = _smooth(intervals.keyframes, ahead**2, weight, HEADING_WINDOW_S)
     axis = np.exp(0.5j * np.unwrap(np.angle(axis)))
+    off = None if attitude else _off_axis(intervals, level, turned + np.angle(axis), velocities)
+    if off is not None:
+        return _headed(turned + np.angle(axis) + off, level)
     forward = _smooth(intervals.keyframes, ahead * axis.conj(), weight, FORWARD_WINDOW_S).real
-    heading = turned + np.angle(np.where(forward < 0, -axis, axis))
+    return _headed(turned + np.angle(np.where(forward < 0, -axis, axis)), level)
+
+
+def _headed(heading: Array, level: Array) -> Array:
     return (Rotation.from_euler("z", heading[:, None]) * Rotation.from_matrix(level)).as_matrix()
+
+
+def _off_axis(intervals: ImuIntervals, level: Array, axis: Array, velocities: Array) -> float | None:
+    """How far, rad, the heading is off the axis (k,) along which it drives, by acceleration; None if that hides it.
+
+    In a turn it is accelerated to the inside, at a stop it brakes: whether it drives forward or reverses, and however
+    the imu is mounted. Forward is 0, reverse is pi; between, the imu looks aside.
+    """
+    force = np.add.reduceat(intervals.specific_force * intervals.durations[:, None], intervals.bounds[:-1])
+    gained = (force @ level.T)[:, :2] @ [1, 1j] * np.exp(0.5j * (axis[1:] + axis[:-1]))
+    products = np.diff(velocities[:, :2] @ [1, 1j]) * gained.conj()
+    if abs(products.sum()) < SURELY * np.linalg.norm(products):
+        return None
+    off = float(np.angle(products.sum()))
+    straight = np.pi * round(off / np.pi)
+    return straight if abs(off - straight) < LOOKING_ASIDE else off
 
 
 def levelled(intervals: ImuIntervals) -> Array:

@@ -33,9 +33,9 @@ SLOW_S = 20.0
 SCATTERED, MIRRORED = 0.3, 3.0
 
 
-def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit, offset_s: float) -> Observed:
-    """What a solution by the fixes shows of headings; `offset_s`: how much later than its stamp one is."""
-    place = placed(problem, headings.stamps + offset_s)
+def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit) -> Observed:
+    """What a solution by the fixes shows of headings, their stamps on the clock of the IMU."""
+    place = placed(problem, headings.stamps)
     kept = headings[place.rows]
     T = from_values(fit.values, len(problem.intervals.keyframes))[0]
     covariances, _ = keyframe_covariances(fit.graph, fit.values, len(T))

@@ -1,84 +1,225 @@
-"""Where the antenna is and how late the receiver's clock: found from the drive itself.
+"""Errors that last: of the receiver's clock, of the antenna's place, of the gyroscope's scale, found from the drive.
 
-At the optimum, a fix that is `d` seconds later than its stamp and an antenna that is `dl` metres away from
-its place move the residual by v d + R dl. One linear solve with these four unknowns beside the whole
-trajectory gives the correction and its covariance; the smoother applies it and comes back until it is small.
+At the optimum, a fix that is `d` seconds later than its stamp and an antenna that is `dl` metres away from its place
+move the residual by v d + R dl; a gyroscope that turns `s` times too much looks like a bias of s w. One elimination of
+the graph with these unknowns leaves what the drive says of them beside the whole trajectory. Then each assumption, as a
+clock that steps once, is a small problem of least squares.
 """
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import C, X
+from gtsam.symbol_shorthand import C
 from numpy.typing import NDArray
 
-from factor_graphs.elimination import by_sections, eliminate, split
-from factor_graphs.model import motion_from, relative_pose_factors
-from factor_graphs.problem import RELATIVE_LOSSES, Fit, Problem
+from factor_graphs.chi_square import quantile
+from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
+from factor_graphs.model import motion_from
+from factor_graphs.problem import Fit, Problem
 
 Array = NDArray[np.float64]
 
-# What may be wrong before anything is estimated: clock s, antenna m.
-CLOCK_STDDEV, ANTENNA_STDDEV = 0.5, 2.0
-# Held, not estimated: as good as certain, and still well conditioned.
-HELD = 1e-6
+# What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
+CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
+# Unasked, an error is corrected only beyond doubt: where chance shows as much in one of two million drives.
+DOUBT = 5e-7
+# The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
+STRETCHES, SHORTEST_S, PLACED_S = 16, 20.0, 1.0
+# Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.
+OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """How much later than its stamp a fix is, s, and where the antenna is, (3,) m, with standard deviations.
 
-    A stddev is None for what was taken as given. `refused`: why an offset that was found is not applied, or nothing.
+    A stddev is None for what was taken as given. `clock_steps`: from the first of each three numbers, s, fixes
+    are so much later still, by a standard deviation. `gyroscope_scale`: what the gyroscope reads about the vertical, less 1, where the vehicle turns by 1. `refused`: why an
+    offset that was found is not applied, or nothing.
     """
 
     time_offset_s: float
     p_imu_antenna: Array
     time_offset_stddev_s: float | None = None
     p_imu_antenna_stddevs: Array | None = None
+    clock_steps: tuple[tuple[float, float, float], ...] = ()
+    gyroscope_scale: float = 0.0
     refused: str = ""
+
+    @property
+    def begins(self) -> list[float]:
+        """Where the clock steps, s."""
+        return [begin for begin, _, _ in self.clock_steps]
+
+    def on_imu_clock(self, stamps: Array) -> Array:
+        """The moments (n,) s of what the receiver stamps."""
+        late = np.full(len(stamps), self.time_offset_s)
+        for begin, step, _ in self.clock_steps:
+            late[stamps >= begin] += step
+        return stamps + late
+
+
+def in_order(stamps: Array) -> Array:
+    """The stamps (n,) s, those that a step of the clock brings before earlier ones just after these."""
+    little = 1e-6 * np.arange(len(stamps))
+    return stamps if np.all(np.diff(stamps) > 0) else np.maximum.accumulate(stamps - little) + little
+
+
+@dataclass(frozen=True, eq=False)
+class LastingErrors:
+    """What a solution says of lasting errors x, beside all else: xᵀ `information` x / 2 - `vector`ᵀ x is the cost.
+
+    x are the offsets of the clock, s, in stretches that begin at `begins` (n,) and before the first, then the place of
+    the antenna (3,) m, then the scale of the gyroscope about the vertical.
+    """
+
+    begins: Array
+    information: Array
+    vector: Array
+
+    @classmethod
+    def of(cls, problem: Problem, fit: Fit, begins: Array) -> "LastingErrors":
+        """From a graph with or without constraints, linearised at its solution."""
+        linear, k = gtsam.GaussianFactorGraph(), len(problem.intervals.keyframes)
+        for row in _rows(problem, fit, begins):
+            linear.push_back(row)
+        groups, left = by_sections(fit.graph, k, shared_keys(fit.values, k)), list[gtsam.GaussianFactor]()
+        deque(eliminate(split(linear, groups), groups, left), maxlen=0)
+        whole = sum(factor.augmentedInformation() for factor in left)
+        return cls(begins, whole[:-1, :-1], whole[:-1, -1])
+
+    def clock(self, steps: list[float]) -> Array:
+        """The columns (d, s) of a clock that is off from the beginning, and further off from each step on."""
+        size, stretches = len(self.vector), np.concatenate([[-np.inf], self.begins])
+        columns = np.zeros((size, 1 + len(steps)))
+        for n, begin in enumerate([-np.inf, *steps]):
+            columns[: len(stretches), n] = stretches >= begin
+        return columns
+
+    @property
+    def antenna(self) -> Array:
+        """The columns (d, 3) of the place of the antenna."""
+        return np.eye(len(self.vector))[:, -4:-1]
+
+    @property
+    def scale(self) -> Array:
+        """The column (d, 1) of the scale of the gyroscope."""
+        return np.eye(len(self.vector))[:, -1:]
+
+    def estimate(self, columns: Array, stddevs: Array, before: Array | float = 0.0) -> tuple[Array, Array]:
+        """Values (c,) of the errors in some columns, if there are no others, and their covariance.
+
+        Before, they have `stddevs` (c,) about -`before`: what was corrected already.
+        """
+        covariance = np.linalg.inv(columns.T @ self.information @ columns + np.diag(1 / stddevs**2))
+        return covariance @ (columns.T @ self.vector - before / stddevs**2), covariance
+
+    def gain(self, columns: Array, stddevs: Array) -> float:
+        """By how much the squared residuals fall where there are these errors: chi-square by chance."""
+        found, covariance = self.estimate(columns, stddevs)
+        return float(found @ np.linalg.solve(covariance, found))
+
+    def clock_offset(self, steps: list[float]) -> tuple[float, float]:
+        """How late the clock is before it steps, s, and its standard deviation."""
+        found, covariance = self.estimate(self.clock(steps), np.full(1 + len(steps), CLOCK_STDDEV))
+        return float(found[0]), float(covariance[0, 0] ** 0.5)
+
+    def step(self, steps: list[float]) -> tuple[float, float]:
+        """Where the clock most likely steps once more than at `steps`, s, and by how much the squares fall then."""
+
+        def gain(of: list[float]) -> float:
+            return self.gain(self.clock(of), np.full(1 + len(of), CLOCK_STDDEV))
+
+        gains = [(gain([*steps, begin]), begin) for begin in self.begins.tolist() if begin not in steps]
+        best, begin = max(gains, default=(0.0, 0.0))
+        return begin, best - gain(steps)
 
 
 def correct(
-    problem: Problem, fit: Fit, now: Calibration, given: Array, with_time: bool, with_lever: bool
+    errors: LastingErrors, now: Calibration, given: Array, with_time: bool, with_lever: bool
 ) -> tuple[Calibration, float]:
     """The better calibration, and how many standard deviations it is away from the present one.
 
-    `given` (3,) m is the lever arm as the user gave it: the prior stays there, and at no time offset.
+    `given` (3,) m is the lever arm as the user gave it: the prior stays there, and at no time offset. Steps of the
+    clock are estimated where the present calibration has some.
     """
-    stddevs = np.array([CLOCK_STDDEV if with_time else HELD, *[ANTENNA_STDDEV if with_lever else HELD] * 3])
-    moved = np.array([now.time_offset_s, *(now.p_imu_antenna - given)])
-    linear = fit.motion.linearize(fit.values)
-    for factor in relative_pose_factors(problem.relative, problem.relative_at, RELATIVE_LOSSES[fit.loss]):
-        linear.push_back(factor.linearize(fit.values))
-    for row in _fix_rows(problem, fit):
-        linear.push_back(row)
-    linear.push_back(
-        gtsam.JacobianFactor(C(0), np.diag(1 / stddevs), -moved / stddevs, gtsam.noiseModel.Unit.Create(4))
+    of_time, of_steps, of_lever = int(with_time), len(now.clock_steps), 3 * with_lever
+    columns = np.hstack(
+        [errors.clock(now.begins)[:, 1 - of_time :], errors.antenna[:, :of_lever]]
     )
-    groups = by_sections(fit.graph, len(problem.intervals.keyframes), (C(0),))
-    (found,) = deque(eliminate(split(linear, groups), groups), maxlen=1)
-    root = np.linalg.inv(found.R())
-    step, sigma = root @ found.d(), np.sqrt(np.sum(root**2, axis=1))
-    better = Calibration(
-        now.time_offset_s + float(step[0]) if with_time else now.time_offset_s,
-        now.p_imu_antenna + step[1:] if with_lever else now.p_imu_antenna,
-        float(sigma[0]) if with_time else None,
-        sigma[1:] if with_lever else None,
-    )
-    asked = np.array([with_time, *[with_lever] * 3])
-    return better, float(np.max(np.abs(step / sigma)[asked]))
+    moved = np.array(
+        [now.time_offset_s, *(step for _, step, _ in now.clock_steps), *(now.p_imu_antenna - given)]
+    )[1 - of_time : 1 + of_steps + of_lever]
+    stddevs = np.repeat([CLOCK_STDDEV, ANTENNA_STDDEV], [of_time + of_steps, of_lever])
+    found, covariance = errors.estimate(columns, stddevs, moved)
+    sigma, better = np.sqrt(np.diag(covariance)), replace(now)
+    if with_time:
+        offset = now.time_offset_s + float(found[0])
+        better = replace(better, time_offset_s=offset, time_offset_stddev_s=float(sigma[0]))
+    if of_steps:
+        of_each = zip(now.clock_steps, found[of_time:].tolist(), sigma[of_time:].tolist(), strict=False)
+        steps = ((begin, step + more, stddev) for (begin, step, _), more, stddev in of_each)
+        better = replace(better, clock_steps=tuple(steps))
+    if with_lever:
+        better = replace(better, p_imu_antenna=now.p_imu_antenna + found[-3:], p_imu_antenna_stddevs=sigma[-3:])
+    return better, float(np.max(np.abs(found / sigma), initial=0.0))
 
 
-def _fix_rows(problem: Problem, fit: Fit) -> Iterator[gtsam.JacobianFactor]:
+def clock_errors(
+    problem: Problem, fit: Fit, now: Calibration, may_step: bool
+) -> tuple[LastingErrors, Calibration]:
+    """What a solution says of lasting errors; and the calibration, with one more step where there is one beyond doubt."""
+    first, last = problem.fixes.stamps[[0, -1]].tolist()
+    stretches = max(1, min(STRETCHES, int((last - first) / SHORTEST_S))) if may_step else 1
+    known, coarse = now.begins, None
+    while True:
+        begins = np.linspace(first, last, stretches + 1)[1:-1]
+        errors = LastingErrors.of(problem, fit, np.unique([*begins, *known]))
+        at, gain = errors.step(known)
+        if gain < quantile(1 - DOUBT / stretches, 1):
+            return coarse or errors, now
+        if (width := (last - first) / stretches) <= PLACED_S:
+            return errors, replace(now, clock_steps=(*now.clock_steps, (at, 0.0, CLOCK_STDDEV)))
+        coarse, first, last, stretches = errors, max(first, at - width), min(last, at + width), STRETCHES
+
+
+def scale_error(problem: Problem, fit: Fit) -> float:
+    """By which share the gyroscope turns too much about the vertical; 0 where that is not beyond doubt."""
+    errors, stddev = LastingErrors.of(problem, fit, np.empty(0)), np.array([SCALE_STDDEV])
+    found, _ = errors.estimate(errors.scale, stddev)
+    return float(found[0]) if errors.gain(errors.scale, stddev) > quantile(1 - DOUBT, 1) else 0.0
+
+
+def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianFactor]:
+    """The linear graph, with columns of lasting errors beside those of the IMU and of the fixes."""
+    k, size, intervals = len(problem.intervals.keyframes), len(begins) + 5, problem.intervals
     T, velocities = motion_from(fit.values)
-    unit, x, y, z = gtsam.noiseModel.Unit.Create(3), *problem.p_imu_antenna
-    lever = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    W = problem.fixes.whitening * np.sqrt(fit.weights)[:, None, None]
-    R, p = T[problem.at, :3, :3], T[problem.at, :3, 3]
-    by_pose = W @ np.concatenate([-R @ lever, R], axis=2)
-    by_calibration = W @ np.concatenate([velocities[problem.at, :, None], R], axis=2)
-    off = np.einsum("mij,mj->mi", W, problem.antennas_found(T, velocities) - p - R @ problem.p_imu_antenna)
-    for i, pose, calibration, right in zip(problem.at.tolist(), by_pose, by_calibration, off, strict=True):
-        yield gtsam.JacobianFactor(X(i), pose, C(0), calibration, right, unit)
+    turned = np.add.reduceat(intervals.angular_rate * intervals.durations[:, None], intervals.bounds[:-1])
+    up = T[:-1, 2, :3]
+    rates = np.sum(turned * up, axis=1, keepdims=True) * up / np.diff(intervals.keyframes)[:, None]
+    moving = np.einsum("mij,mi->mj", T[problem.at, :3, :3], velocities[problem.at])
+    stretch, first_fix = np.searchsorted(begins, problem.fixes.stamps, side="right"), fit.motion.size()
+    for n in range(fit.graph.size()):
+        row = fit.graph.at(n).linearize(fit.values)
+        if n < k - 1:
+            A, b = row.jacobian()
+            columns = np.zeros((len(b), size))
+            columns[:, -1] = (A[:, -9:-6] + A[:, -3:]) @ rates[n]
+            terms = [(key, A[:, i:j]) for key, (i, j) in zip(row.keys(), pairwise(OF_IMU), strict=True)]
+            row = _joined(terms, columns, b)
+        elif first_fix <= n < first_fix + len(problem.at):
+            A, b = row.jacobian()
+            columns = np.zeros((3, size))
+            columns[:, stretch[n - first_fix]], columns[:, -4:-1] = A[:, 3:] @ moving[n - first_fix], A[:, 3:]
+            row = _joined([(row.keys()[0], A)], columns, b)
+        yield row
+
+
+def _joined(terms: list[tuple[int, Array]], columns: Array, b: Array) -> gtsam.JacobianFactor:
+    """A factor of many keys: of GTSAM's constructors, only that of a conditional takes a list from Python."""
+    unit = gtsam.noiseModel.Unit.Create(len(b))
+    return gtsam.JacobianFactor(gtsam.GaussianConditional([*terms, (C(0), columns)], 1, b, unit))

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.calibration import Calibration, correct
+from factor_graphs.calibration import Calibration, clock_errors, correct
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
@@ -130,20 +130,23 @@ def calibrate(
 
     `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from.
     """
-    with_time, with_lever = settings.estimate_time_offset, settings.estimate_lever_arm
-    calibration = Calibration(0.0, given)
+    calibration, with_lever = Calibration(0.0, given), settings.estimate_lever_arm
     problem, fit = fit_to(calibration)
-    if with_time is None and problem.intervals.keyframes[-1] - problem.intervals.keyframes[0] < LONG_ENOUGH_S:
-        with_time = False
-    if with_time is False and not with_lever:
+    is_long = problem.intervals.keyframes[-1] - problem.intervals.keyframes[0] >= LONG_ENOUGH_S
+    looks = is_long if settings.estimate_time_offset is None else settings.estimate_time_offset
+    with_time = looks and (with_lever or settings.estimate_time_offset is True)
+    if not looks and not with_lever:
         return problem, fit, calibration
-    least = BEYOND_DOUBT if with_time is None and not with_lever else NEGLIGIBLE
     for _ in range(CALIBRATION_ROUNDS):
-        better, moved = correct(problem, fit, calibration, given, with_time is not False, with_lever)
-        if moved < least:
-            place = calibration.p_imu_antenna
-            return problem, fit, replace(better, time_offset_s=calibration.time_offset_s, p_imu_antenna=place)
-        calibration, least = better, NEGLIGIBLE
+        errors, calibration = clock_errors(problem, fit, calibration, looks)
+        offset, sigma = errors.clock_offset(calibration.begins)
+        with_time |= looks and abs(offset) > BEYOND_DOUBT * sigma
+        better, moved = correct(errors, calibration, given, with_time, with_lever)
+        if moved < NEGLIGIBLE:
+            of_lever, of_clock = better.p_imu_antenna_stddevs, better.time_offset_stddev_s or sigma
+            calibration = replace(calibration, p_imu_antenna_stddevs=of_lever)
+            return problem, fit, replace(calibration, time_offset_stddev_s=of_clock if looks else None)
+        calibration = better
         problem, fit = fit_to(calibration)
     return problem, fit, calibration
 

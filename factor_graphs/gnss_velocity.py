@@ -36,9 +36,9 @@ MISTAKES = {
 LOSS = gtsam.noiseModel.mEstimator.Huber.Create(quantile(0.95, 3) ** 0.5)
 
 
-def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit, offset_s: float) -> Observed:
-    """What a solution by the fixes shows of velocities; `offset_s`: how much later than its stamp one is."""
-    place = placed(problem, velocities.stamps + offset_s)
+def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -> Observed:
+    """What a solution by the fixes shows of velocities, their stamps on the clock of the IMU."""
+    place = placed(problem, velocities.stamps)
     kept = velocities[place.rows]
     off = kept.velocities - _antenna_velocities(problem, fit, place)
     seen = beside_fixes(problem, fit)[place.at]

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.antenna_heading import observe_headings
-from factor_graphs.calibration import Calibration
+from factor_graphs.calibration import Calibration, in_order, scale_error
 from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
@@ -68,6 +69,8 @@ NOTABLE_CORRELATION = 2.0
 HALF = 0.5
 # So far apart are the poses of a solution in short, s.
 IN_SHORT_S = 0.1
+# The scale of the gyroscope is corrected so many times at most: the first time, the noise of the IMU is not right yet.
+SCALE_ROUNDS = 4
 # Heading is called unobservable when its standard deviation exceeds this, rad, everywhere.
 UNKNOWN_HEADING = 0.35
 
@@ -152,30 +155,14 @@ def smooth(
     if given.shape != (3,) or not np.isfinite(given).all():
         raise MeasurementError(f"p_imu_antenna is {given.tolist()}; expected three finite values, m")
     inertial = _Inertial.of(imu, fixes, settings)
-
-    def fit_to(calibration: Calibration) -> tuple[Problem, Fit]:
-        shifted = replace(fixes, stamps=fixes.stamps + calibration.time_offset_s)
-        lever = calibration.p_imu_antenna
-        also_at = np.concatenate([NOWHERE, *(one.stamps for one in also)]) + calibration.time_offset_s
-
-        def pose(some: GnssFixes) -> Problem:
-            samples = inertial.samples
-            return pose_problem(samples, some, frame, settings, lever, initial_attitude, relative, also_at)
-
-        return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
-
-    problem, fit, estimated = calibrate(fit_to, settings, given)
-    if settings.imu_sample_instant is None and stamps_are_ends(estimated, inertial.samples):
-        inertial = inertial.at_middle()
-        problem, fit, estimated = calibrate(fit_to, settings, given)
-    of_noise, fitting = max(fit.inflation, problem.of_fixes), fixes[problem.used][fit.weights > HALF]
-    calibration = checked(estimated, inertial.samples, fitting, of_noise)
-    if calibration.refused:
-        problem, fit = fit_to(calibration)
-    beside = [_observe(one, problem, fit, calibration.time_offset_s) for one in also]
-    problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
-    held = _constrained(problem, fit, wheels, beside)
-    found = _solution(problem, held, fixes, calibration)
+    log = _Log(fixes, frame, settings, given, initial_attitude, relative, wheels, also)
+    for _ in range(SCALE_ROUNDS):
+        problem, held, calibration, beside, inertial = log.solved(inertial)
+        scale = 0.0 if problem.is_bound else scale_error(problem, held.fit)
+        if scale == 0.0:
+            break
+        inertial = inertial.scaled(scale)
+    found = _solution(problem, held, fixes, replace(calibration, gyroscope_scale=inertial.scale))
     found = replace(
         found,
         biases=found.biases + np.append(np.zeros(3), inertial.bias),
@@ -191,6 +178,51 @@ def smooth(
 
 
 @dataclass(frozen=True, eq=False)
+class _Log:
+    """What is known beside the IMU."""
+
+    fixes: GnssFixes
+    frame: LocalFrame
+    settings: SmootherSettings
+    given: Array
+    """The lever arm (3,) m as the user gave it."""
+    attitude: AttitudePrior | None
+    relative: RelativePoses
+    wheels: WheelSpeeds | None
+    also: Sequence[Also]
+
+    def solved(
+        self, inertial: "_Inertial"
+    ) -> tuple[Problem, "_Constrained", Calibration, list[Observed], "_Inertial"]:
+        """The solution with all that is held in it; the IMU's samples, their stamps moved where they are ends."""
+        problem, fit, estimated = self._calibrated(inertial)
+        if self.settings.imu_sample_instant is None and stamps_are_ends(estimated, inertial.samples):
+            inertial = inertial.at_middle()
+            problem, fit, estimated = self._calibrated(inertial)
+        of_noise, fitting = max(fit.inflation, problem.of_fixes), self.fixes[problem.used][fit.weights > HALF]
+        stepped = replace(fitting, stamps=in_order(replace(estimated, time_offset_s=0.0).on_imu_clock(fitting.stamps)))
+        calibration = checked(estimated, inertial.samples, stepped, of_noise)
+        if calibration.refused:
+            problem, fit = self._fit_to(inertial, calibration)
+        beside = [_observe(one, problem, fit, calibration) for one in self.also]
+        problem, fit = turned_to(problem, fit, sum(one.turn for one in beside))
+        return problem, _constrained(problem, fit, self.wheels, beside), calibration, beside, inertial
+
+    def _calibrated(self, inertial: "_Inertial") -> tuple[Problem, Fit, Calibration]:
+        return calibrate(partial(self._fit_to, inertial), self.settings, self.given)
+
+    def _fit_to(self, inertial: "_Inertial", calibration: Calibration) -> tuple[Problem, Fit]:
+        shifted = replace(self.fixes, stamps=in_order(calibration.on_imu_clock(self.fixes.stamps)))
+        also_at = np.concatenate([NOWHERE, *(calibration.on_imu_clock(one.stamps) for one in self.also)])
+
+        def pose(some: GnssFixes) -> Problem:
+            lever, known = calibration.p_imu_antenna, (self.attitude, self.relative, also_at)
+            return pose_problem(inertial.samples, some, self.frame, self.settings, lever, *known)
+
+        return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
+
+
+@dataclass(frozen=True, eq=False)
 class _Inertial:
     """The samples of the IMU as the graph has them, and what was done to them."""
 
@@ -201,6 +233,8 @@ class _Inertial:
     """(3,) rad/s, taken from the gyroscope."""
     are_ends: bool = False
     """The fixes show that the stamps were the ends of intervals."""
+    scale: float = 0.0
+    """The gyroscope turned by this share too much about the vertical: taken out."""
 
     @classmethod
     def of(cls, imu: ImuSamples, fixes: GnssFixes, settings: SmootherSettings) -> "_Inertial":
@@ -214,8 +248,18 @@ class _Inertial:
         """The same with stamps that are found to be ends moved to the middle."""
         return replace(self, samples=self.samples.at_middle(), are_ends=True)
 
+    def scaled(self, error: float) -> "_Inertial":
+        """The same with another error of the gyroscope's scale taken out."""
+        imu, up = self.samples, self.samples.specific_force.mean(axis=0)
+        about_up = (imu.angular_rate @ up)[:, None] * up / (up @ up)
+        rates = imu.angular_rate - error / (1 + error) * about_up
+        samples = ImuSamples(imu.stamps, imu.specific_force, rates)
+        return replace(self, samples=samples, scale=(1 + error) * (1 + self.scale) - 1)
+
     def notes(self) -> Iterator[str]:
         """In words."""
+        if self.scale:
+            yield f"the gyroscope turns by {100 * self.scale:+.2f} % too much about the vertical: taken out"
         if self.are_ends:
             yield "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
         if self.filled:
@@ -262,17 +306,17 @@ def _point_residuals(
     beside: Sequence[Observed], keyframes: Trajectory, calibration: Calibration
 ) -> tuple[PointResidual, ...]:
     """Of all surveyed points."""
-    offset, lever = calibration.time_offset_s, calibration.p_imu_antenna
     placed = [one.points for one in beside if one.points is not None]
-    return tuple(residual for one in placed for residual in residuals_of(*one, keyframes, lever, offset))
+    return tuple(residual for one in placed for residual in residuals_of(*one, keyframes, calibration.p_imu_antenna))
 
 
-def _observe(one: Also, problem: Problem, fit: Fit, offset_s: float) -> Observed:
+def _observe(one: Also, problem: Problem, fit: Fit, calibration: Calibration) -> Observed:
+    stamps = calibration.on_imu_clock(one.stamps)
     if isinstance(one, SurveyedPoints):
-        return observe_points(one, problem, fit, offset_s)
+        return observe_points(replace(one, stamps=stamps), problem, fit)
     if isinstance(one, AntennaHeadings):
-        return observe_headings(one, problem, fit, offset_s)
-    return observe_velocities(one, problem, fit, offset_s)
+        return observe_headings(replace(one, stamps=in_order(stamps)), problem, fit)
+    return observe_velocities(replace(one, stamps=in_order(stamps)), problem, fit)
 
 
 def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibration: Calibration) -> Solution:
@@ -285,7 +329,7 @@ def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibratio
         wheels = replace(wheels, stddevs=shared_stddevs[-4:])
     R, of_poses = T[:, :3, :3], covariances[:, :6, :6].copy()
     of_poses[:, 3:, 3:] += np.swapaxes(R, 1, 2) * _lacking(problem, fixes[problem.used], of_poses, R) @ R
-    of_poses += _of_calibration(calibration, problem.settings, R, velocities)
+    of_poses += _of_calibration(calibration, problem.settings, problem.intervals.keyframes, R, velocities)
     if problem.heading_in_doubt:
         of_poses += of_any_heading(R, problem.p_imu_antenna)
     keyframes = Trajectory(problem.intervals.keyframes, T, velocities, of_poses)
@@ -324,18 +368,19 @@ def _solution(problem: Problem, held: _Constrained, fixes: GnssFixes, calibratio
 
 
 def _of_calibration(
-    calibration: Calibration, settings: SmootherSettings, R_map_imu: Array, velocities: Array
+    calibration: Calibration, settings: SmootherSettings, stamps: Array, R_map_imu: Array, velocities: Array
 ) -> Array:
     """Covariance (k, 6, 6) that poses have of what was estimated beside them: clock and lever arm.
 
     Where the clock is d s off, the trajectory is so much further on its way; where the antenna is dl m off, so is it.
     """
-    covariances = np.zeros((len(R_map_imu), 6, 6))
-    if calibration.time_offset_stddev_s and (
-        settings.estimate_time_offset or calibration.time_offset_s or calibration.refused
-    ):
-        in_imu = np.einsum("kij,ki->kj", R_map_imu, velocities) * calibration.time_offset_stddev_s
-        covariances[:, 3:, 3:] += in_imu[:, :, None] * in_imu[:, None]
+    covariances, of_clock = np.zeros((len(stamps), 6, 6)), np.zeros(len(stamps))
+    if settings.estimate_time_offset or calibration.time_offset_s or calibration.refused:
+        of_clock += (calibration.time_offset_stddev_s or 0.0) ** 2
+    for begin, _, stddev in calibration.clock_steps:
+        of_clock[stamps >= begin] += stddev**2
+    in_imu = np.einsum("kij,ki->kj", R_map_imu, velocities) * np.sqrt(of_clock)[:, None]
+    covariances[:, 3:, 3:] += in_imu[:, :, None] * in_imu[:, None]
     if calibration.p_imu_antenna_stddevs is not None:
         covariances[:, 3:, 3:] += np.diag(calibration.p_imu_antenna_stddevs**2)
     return covariances
@@ -357,7 +402,7 @@ def _lacking(problem: Problem, fixes: GnssFixes, covariances: Array, R_map_imu: 
 
 
 def _residuals(keyframes: Trajectory, fixes: GnssFixes, calibration: Calibration) -> Array:
-    stamps = fixes.stamps + calibration.time_offset_s
+    stamps = calibration.on_imu_clock(fixes.stamps)
     inside = (stamps >= keyframes.start) & (stamps <= keyframes.end)
     T = keyframes.at(stamps[inside])
     off = np.full((len(fixes), 3), np.nan)
@@ -385,6 +430,8 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
         yield f"chi2 per degree of freedom is {fit.chi2_per_dof:.2f}, expected about 1: something does not fit"
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
+    for begin, step, _ in calibration.clock_steps:
+        yield f"the clock of the fixes steps at {begin:.1f} s: later ones are of {step:+.3f} s after, taken into account"
     if calibration.refused:
         yield (
             f"{calibration.refused}: not taken, a deviation of {calibration.time_offset_stddev_s:.2f} s in its place;"

@@ -125,9 +125,9 @@ def _geodetic(table: dict[str, Array]) -> tuple[Array, Array, Array]:
     return lat, lon, table["height_m"]
 
 
-def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit, offset_s: float) -> Observed:
-    """What a solution by the fixes shows of points; `offset_s`: how much later than its stamp a moment is."""
-    at, late = _keyframes(points, problem, fit, points.stamps + offset_s)
+def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observed:
+    """What a solution by the fixes shows of points, their stamps on the clock of the IMU."""
+    at, late = _keyframes(points, problem, fit, points.stamps)
     there = np.flatnonzero(at >= 0)
     off = _off(points, problem, fit, at, late)
     fits = np.zeros(len(points), np.bool_)
@@ -138,7 +138,7 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit, offset_s:
         limits = FITTING * np.sqrt(of_place + points.stddevs[there] ** 2) + LEAST_FITTING_M
         fits[there] = (np.abs(off[there]) < limits).all(axis=1)
     held = points.control & fits
-    stamps = problem.intervals.keyframes[at] + late - offset_s
+    stamps = problem.intervals.keyframes[at] + late
     known = SurveyedPoints(
         points.names, points.positions, points.stddevs, np.where(at >= 0, stamps, np.nan), points.control
     )
@@ -158,14 +158,13 @@ def residuals_of(
     held: NDArray[np.bool_],
     keyframes: Trajectory,
     p_imu_antenna: Array,
-    offset_s: float,
 ) -> tuple[PointResidual, ...]:
     """The points against a trajectory; `known` are those with the moments that were found, `held` (n,) those used."""
     rows = []
     for n, name in enumerate(known.names):
         d, stamp = np.full(3, np.nan), float(known.stamps[n])
-        if keyframes.start <= stamp + offset_s <= keyframes.end:
-            T = keyframes.at([stamp + offset_s])[0]
+        if keyframes.start <= stamp <= keyframes.end:
+            T = keyframes.at([stamp])[0]
             d = T[:3, 3] + T[:3, :3] @ p_imu_antenna - known.positions[n]
         kind = "control" if known.control[n] else "check"
         rows.append(PointResidual(name, kind, bool(held[n]), stamp, *map(float, d)))

@@ -454,10 +454,11 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
 
 def _correlation(problem: Problem, fit: Fit, fixes: GnssFixes, residuals: Array) -> Iterator[str]:
     """In words, whether the used fixes are less independent than they are taken for; an inertial unit's always are."""
-    if are_drifting(fixes) or any(problem.common_stddevs):
-        return
+    floor = problem.settings.min_fix_stddev_m
+    if are_drifting(fixes) or any(problem.common_stddevs) or np.median(fixes.stddevs) <= floor:
+        return  # what says less than the floor is not believed, whatever it scatters
     good, believed = fit.squares < GATE, problem.settings.fix_correlation_time_s
-    stddevs = problem.of_fixes * np.maximum(fixes.stddevs, problem.settings.min_fix_stddev_m)
+    stddevs = problem.of_fixes * np.maximum(fixes.stddevs, floor)
     shown = correlation_time_shown(fixes.stamps[good], (residuals / stddevs)[good])
     if shown > NOTABLE_CORRELATION * believed:
         yield (

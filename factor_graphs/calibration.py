@@ -27,8 +27,10 @@ Array = NDArray[np.float64]
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
 # Unasked, an error is corrected only beyond doubt: where chance shows as much in one of two million drives.
 DOUBT = 5e-7
+# A scale is in question where fixes and IMU alone show more than those of five good gyroscopes of six.
+QUESTIONABLE = 2.0
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
-STRETCHES, SHORTEST_S, PLACED_S = 16, 20.0, 1.0
+STRETCHES, SHORTEST_S, PLACED_S = 8, 20.0, 1.0
 # Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.
 OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 
@@ -38,7 +40,8 @@ class Calibration:
     """How much later than its stamp a fix is, s, and where the antenna is, (3,) m, with standard deviations.
 
     A stddev is None for what was taken as given. `clock_steps`: from the first of each three numbers, s, fixes
-    are so much later still, by a standard deviation. `gyroscope_scale`: what the gyroscope reads about the vertical, less 1, where the vehicle turns by 1. `refused`: why an
+    are so much later still, by a standard deviation. `gyroscope_scale`: what the gyroscope reads about the vertical, less 1, where the vehicle turns by 1, and
+    `scale_in_question` whether fixes and IMU speak for another. `refused`: why an
     offset that was found is not applied, or nothing.
     """
 
@@ -48,6 +51,7 @@ class Calibration:
     p_imu_antenna_stddevs: Array | None = None
     clock_steps: tuple[tuple[float, float, float], ...] = ()
     gyroscope_scale: float = 0.0
+    scale_in_question: bool = True
     refused: str = ""
 
     @property
@@ -106,9 +110,14 @@ class LastingErrors:
         return np.eye(len(self.vector))[:, -4:-1]
 
     @property
-    def scale(self) -> Array:
-        """The column (d, 1) of the scale of the gyroscope."""
-        return np.eye(len(self.vector))[:, -1:]
+    def scale_error(self) -> float:
+        """By which share the gyroscope turns too much about the vertical, if nothing else is wrong."""
+        return float(self.vector[-1] / (self.information[-1, -1] + SCALE_STDDEV**-2))
+
+    @property
+    def scale_gain(self) -> float:
+        """By how much the squared residuals fall then."""
+        return self.scale_error * float(self.vector[-1])
 
     def estimate(self, columns: Array, stddevs: Array, before: Array | float = 0.0) -> tuple[Array, Array]:
         """Values (c,) of the errors in some columns, if there are no others, and their covariance.
@@ -189,9 +198,8 @@ def clock_errors(
 
 def scale_error(problem: Problem, fit: Fit) -> float:
     """By which share the gyroscope turns too much about the vertical; 0 where that is not beyond doubt."""
-    errors, stddev = LastingErrors.of(problem, fit, np.empty(0)), np.array([SCALE_STDDEV])
-    found, _ = errors.estimate(errors.scale, stddev)
-    return float(found[0]) if errors.gain(errors.scale, stddev) > quantile(1 - DOUBT, 1) else 0.0
+    errors = LastingErrors.of(problem, fit, np.empty(0))
+    return errors.scale_error if errors.scale_gain > quantile(1 - DOUBT, 1) else 0.0
 
 
 def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianFactor]:

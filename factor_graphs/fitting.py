@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.calibration import Calibration, clock_errors, correct
+from factor_graphs.calibration import QUESTIONABLE, Calibration, clock_errors, correct
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
@@ -144,7 +144,8 @@ def calibrate(
         better, moved = correct(errors, calibration, given, with_time, with_lever)
         if moved < NEGLIGIBLE:
             of_lever, of_clock = better.p_imu_antenna_stddevs, better.time_offset_stddev_s or sigma
-            calibration = replace(calibration, p_imu_antenna_stddevs=of_lever)
+            in_question = not looks or errors.scale_gain > QUESTIONABLE
+            calibration = replace(calibration, p_imu_antenna_stddevs=of_lever, scale_in_question=in_question)
             return problem, fit, replace(calibration, time_offset_stddev_s=of_clock if looks else None)
         calibration = better
         problem, fit = fit_to(calibration)

@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 
 # A bias below this, rad/s (0.6 deg/s), the graph finds by itself; above the second no gyroscope is of use.
 NOTABLE, LARGEST = 0.01, 0.2
-STEP = 5e-4
+# Biases are tried in steps of so much, rad/s, then about the best of them: a window shows 1 / WINDOW_S.
+COARSE, STEP = 2e-3, 5e-4
 # The course is that of the way from one fix to another, so many s later, and at least so many rad off the heading;
 # over so many s a bias hardly changes.
 CHORD_S, LEAST_COURSE_STDDEV, WINDOW_S = 2.0, 0.05, 100.0
@@ -45,15 +46,16 @@ def large_gyroscope_bias(imu: ImuSamples, fixes: GnssFixes) -> Array:
         return nothing
     rest = _at_rest(imu, fixes)
     courses = _Courses.of(imu, fixes, up)
-    biases = np.arange(-LARGEST, LARGEST + STEP, STEP)
-    fits = np.array([courses.log_likelihood(bias) for bias in biases])
-    best = fits.max()
+    best, bias = 0.0, 0.0
+    for step, farthest in ((COARSE, LARGEST), (STEP, COARSE)):
+        biases = bias + np.arange(-farthest, farthest + step, step)
+        best, bias = max((courses.log_likelihood(one), one) for one in biases.tolist())
     if rest is not None and courses.log_likelihood(float(up @ rest)) > best - SURELY:
         return _if_large(rest)
     if best < max(AGREEING * courses.most, courses.log_likelihood(0.0) + SURELY):
         return nothing
     mean = imu.angular_rate.mean(axis=0)
-    return _if_large(biases[fits.argmax()] * up + mean - (up @ mean) * up)
+    return _if_large(bias * up + mean - (up @ mean) * up)
 
 
 @dataclass(frozen=True, eq=False)

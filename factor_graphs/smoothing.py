@@ -158,7 +158,8 @@ def smooth(
     log = _Log(fixes, frame, settings, given, initial_attitude, relative, wheels, also)
     for _ in range(SCALE_ROUNDS):
         problem, held, calibration, beside, inertial = log.solved(inertial)
-        scale = 0.0 if problem.is_bound else scale_error(problem, held.fit)
+        is_asked = calibration.scale_in_question and not problem.is_bound
+        scale = scale_error(problem, held.fit) if is_asked else 0.0
         if scale == 0.0:
             break
         inertial = inertial.scaled(scale)

@@ -173,7 +173,7 @@ def _grouped(blocks: list[_Group]) -> list[_Group]:
         else:
             groups.append(block)
     groups.sort(key=lambda group: -group.size)
-    returned = [group for group in groups if len(group.blocks) > 1]
+    returned = [group for group in groups if len(group.blocks) > 1 and CLEARLY * group.size > groups[0].size]
     if len(returned) == 1 and not groups[0].size >= CLEARLY * groups[min(1, len(groups) - 1)].size:
         groups.sort(key=lambda group: group is not returned[0])
     return groups

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from factor_graphs.chi_square import quantile
 from factor_graphs.problem import Problem
@@ -37,7 +38,7 @@ def find_jumps(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> tuple[
     the row (j,) after each jump, the jumps (j, 3) m with their variances (j, 3) m², and the rows (l,) without outliers.
     An outlier counts only where all else in its window fits, a jump only if it lasts.
     """
-    rows = np.arange(len(stamps))
+    rows = np.flatnonzero(~_spikes(stamps, stddevs, off, chain))
     for _ in range(OUTLIER_ROUNDS):
         if len(rows) <= 2 * SIDE:
             break
@@ -58,6 +59,27 @@ def find_jumps(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> tuple[
             return rows[at + SIDE], steps[at], variances[at], np.asarray(rows)
         rows = np.delete(rows, outliers)
     return np.empty(0, np.intp), np.empty((0, 3)), np.empty((0, 3)), np.asarray(rows)
+
+
+def _spikes(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> Mask:
+    """Which fixes (m,) stand out of a running median: several outliers in one window, which least squares mix up.
+
+    A median keeps the edges of what lasts, and beside one a fix has neighbours at its level. The slope, the error of the IMU's velocity, is the median of the steps.
+    """
+    found = np.zeros(len(stamps), np.bool_)
+    for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(chain)) + 1):
+        if len(rows) <= 2 * SIDE:
+            continue
+        dt = np.diff(stamps[rows])[:, None]
+        speeds = median_filter(np.diff(off[rows], axis=0) / dt, (2 * SIDE + 1, 1), mode="nearest")
+        level = off[rows] - np.concatenate([np.zeros((1, 3)), np.cumsum(speeds * dt, axis=0)])
+        beyond = np.abs(level - median_filter(level, (SIDE + 2, 1), mode="nearest"))
+        usual = np.maximum(1.4826 * np.median(beyond, axis=0), stddevs[rows])
+        least = np.maximum(SURELY * usual, LEAST_JUMP_M)
+        neighbours = np.pad(level, ((2, 2), (0, 0)), constant_values=np.inf)
+        alone = [np.any(np.abs(neighbours[i : i + len(rows)] - level) > least, axis=1) for i in (0, 1, 3, 4)]
+        found[rows] = np.any(beyond > least, axis=1) & np.all(alone, axis=0)
+    return found
 
 
 def _lasts(i: int, stamps: Array, stddevs: Array, off: Array, step: Array, variance: Array) -> bool:

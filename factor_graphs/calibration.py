@@ -16,7 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import C
 from numpy.typing import NDArray
 
-from factor_graphs.chi_square import quantile
+from factor_graphs.chi_square import probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
 from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 # What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
 # Unasked, an error is corrected only beyond doubt: where chance shows as much in one of two million drives.
-DOUBT = 5e-7
+SURELY = 5.0
+DOUBT = 1 - probability_below(SURELY**2, 1)
 # A scale is in question where fixes and IMU alone show more than those of five good gyroscopes of six.
 QUESTIONABLE = 2.0
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
@@ -39,9 +40,9 @@ OF_IMU = np.cumsum([0, 6, 3, 6, 3, 6, 6])
 class Calibration:
     """How much later than its stamp a fix is, s, and where the antenna is, (3,) m, with standard deviations.
 
-    A stddev is None for what was taken as given. `clock_steps`: from the first of each three numbers, s, fixes
-    are so much later still, by a standard deviation. `gyroscope_scale`: what the gyroscope reads about the vertical, less 1, where the vehicle turns by 1, and
-    `scale_in_question` whether fixes and IMU speak for another. `refused`: why an
+    A stddev is None for what was taken as given. `clock_steps`: from the first of each three numbers, s, fixes are so
+    much later still, by a standard deviation. `gyroscope_scale`: what the gyroscope's `upright_axis` reads, less 1,
+    where the vehicle turns by 1, and `scale_in_question` whether fixes and IMU speak for another. `refused`: why an
     offset that was found is not applied, or nothing.
     """
 
@@ -67,10 +68,17 @@ class Calibration:
         return stamps + late
 
 
+def upright_axis(specific_force: Array) -> int:
+    """The number of the imu's axis that is nearest to the vertical: about that one a vehicle turns."""
+    return int(np.abs(specific_force.mean(axis=0)).argmax())
+
+
 def in_order(stamps: Array) -> Array:
     """The stamps (n,) s, those that a step of the clock brings before earlier ones just after these."""
     little = 1e-6 * np.arange(len(stamps))
-    return stamps if np.all(np.diff(stamps) > 0) else np.maximum.accumulate(stamps - little) + little
+    return (
+        stamps if np.all(np.diff(stamps) > 0) else np.asarray(np.maximum.accumulate(stamps - little) + little)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +86,7 @@ class LastingErrors:
     """What a solution says of lasting errors x, beside all else: xᵀ `information` x / 2 - `vector`ᵀ x is the cost.
 
     x are the offsets of the clock, s, in stretches that begin at `begins` (n,) and before the first, then the place of
-    the antenna (3,) m, then the scale of the gyroscope about the vertical.
+    the antenna (3,) m, then the scale of the gyroscope about its upright axis.
     """
 
     begins: Array
@@ -93,7 +101,7 @@ class LastingErrors:
             linear.push_back(row)
         groups, left = by_sections(fit.graph, k, shared_keys(fit.values, k)), list[gtsam.GaussianFactor]()
         deque(eliminate(split(linear, groups), groups, left), maxlen=0)
-        whole = sum(factor.augmentedInformation() for factor in left)
+        whole = np.sum([factor.augmentedInformation() for factor in left], axis=0)
         return cls(begins, whole[:-1, :-1], whole[:-1, -1])
 
     def clock(self, steps: list[float]) -> Array:
@@ -125,7 +133,7 @@ class LastingErrors:
         Before, they have `stddevs` (c,) about -`before`: what was corrected already.
         """
         covariance = np.linalg.inv(columns.T @ self.information @ columns + np.diag(1 / stddevs**2))
-        return covariance @ (columns.T @ self.vector - before / stddevs**2), covariance
+        return np.asarray(covariance @ (columns.T @ self.vector - before / stddevs**2)), covariance
 
     def gain(self, columns: Array, stddevs: Array) -> float:
         """By how much the squared residuals fall where there are these errors: chi-square by chance."""
@@ -157,9 +165,7 @@ def correct(
     clock are estimated where the present calibration has some.
     """
     of_time, of_steps, of_lever = int(with_time), len(now.clock_steps), 3 * with_lever
-    columns = np.hstack(
-        [errors.clock(now.begins)[:, 1 - of_time :], errors.antenna[:, :of_lever]]
-    )
+    columns = np.hstack([errors.clock(now.begins)[:, 1 - of_time :], errors.antenna[:, :of_lever]])
     moved = np.array(
         [now.time_offset_s, *(step for _, step, _ in now.clock_steps), *(now.p_imu_antenna - given)]
     )[1 - of_time : 1 + of_steps + of_lever]
@@ -171,17 +177,21 @@ def correct(
         better = replace(better, time_offset_s=offset, time_offset_stddev_s=float(sigma[0]))
     if of_steps:
         of_each = zip(now.clock_steps, found[of_time:].tolist(), sigma[of_time:].tolist(), strict=False)
-        steps = ((begin, step + more, stddev) for (begin, step, _), more, stddev in of_each)
-        better = replace(better, clock_steps=tuple(steps))
+        steps = tuple((begin, step + more, stddev) for (begin, step, _), more, stddev in of_each)
+        better = replace(better, clock_steps=tuple(one for one in steps if abs(one[1]) > SURELY * one[2]))
+        if len(better.clock_steps) < of_steps:  # beside a larger one it looked like one
+            return better, np.inf
     if with_lever:
-        better = replace(better, p_imu_antenna=now.p_imu_antenna + found[-3:], p_imu_antenna_stddevs=sigma[-3:])
+        better = replace(
+            better, p_imu_antenna=now.p_imu_antenna + found[-3:], p_imu_antenna_stddevs=sigma[-3:]
+        )
     return better, float(np.max(np.abs(found / sigma), initial=0.0))
 
 
 def clock_errors(
     problem: Problem, fit: Fit, now: Calibration, may_step: bool
 ) -> tuple[LastingErrors, Calibration]:
-    """What a solution says of lasting errors; and the calibration, with one more step where there is one beyond doubt."""
+    """What a solution says of lasting errors; and the calibration, with one more step where that is beyond doubt."""
     first, last = problem.fixes.stamps[[0, -1]].tolist()
     stretches = max(1, min(STRETCHES, int((last - first) / SHORTEST_S))) if may_step else 1
     known, coarse = now.begins, None
@@ -197,7 +207,7 @@ def clock_errors(
 
 
 def scale_error(problem: Problem, fit: Fit) -> float:
-    """By which share the gyroscope turns too much about the vertical; 0 where that is not beyond doubt."""
+    """By which share the gyroscope turns too much about its upright axis; 0 where that is not beyond doubt."""
     errors = LastingErrors.of(problem, fit, np.empty(0))
     return errors.scale_error if errors.scale_gain > quantile(1 - DOUBT, 1) else 0.0
 
@@ -207,8 +217,8 @@ def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianF
     k, size, intervals = len(problem.intervals.keyframes), len(begins) + 5, problem.intervals
     T, velocities = motion_from(fit.values)
     turned = np.add.reduceat(intervals.angular_rate * intervals.durations[:, None], intervals.bounds[:-1])
-    up = T[:-1, 2, :3]
-    rates = np.sum(turned * up, axis=1, keepdims=True) * up / np.diff(intervals.keyframes)[:, None]
+    axis = upright_axis(intervals.specific_force)
+    rates = turned[:, axis] / np.diff(intervals.keyframes)
     moving = np.einsum("mij,mi->mj", T[problem.at, :3, :3], velocities[problem.at])
     stretch, first_fix = np.searchsorted(begins, problem.fixes.stamps, side="right"), fit.motion.size()
     for n in range(fit.graph.size()):
@@ -216,7 +226,7 @@ def _rows(problem: Problem, fit: Fit, begins: Array) -> Iterator[gtsam.GaussianF
         if n < k - 1:
             A, b = row.jacobian()
             columns = np.zeros((len(b), size))
-            columns[:, -1] = (A[:, -9:-6] + A[:, -3:]) @ rates[n]
+            columns[:, -1] = (A[:, axis - 9] + A[:, axis - 3]) * rates[n]
             terms = [(key, A[:, i:j]) for key, (i, j) in zip(row.keys(), pairwise(OF_IMU), strict=True)]
             row = _joined(terms, columns, b)
         elif first_fix <= n < first_fix + len(problem.at):

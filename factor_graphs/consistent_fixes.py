@@ -71,7 +71,7 @@ def with_consistent_fixes(
     chosen = _posed(problem, fixes, pose, believed)
     if not _fits_better(fit_as_expected(chosen), fit_as_expected(problem)):
         return problem
-    return replace(chosen, notes=(*problem.notes, *_told(problem, stretches, believed)))
+    return replace(chosen, displaced=True, notes=(*problem.notes, *_told(problem, stretches, believed)))
 
 
 def _is_clear(groups: list[_Group]) -> bool:

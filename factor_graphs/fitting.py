@@ -1,13 +1,13 @@
 """Parts of a good fit: noise of IMU and fixes, calibration, rejection, each on what the one before left."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.calibration import QUESTIONABLE, Calibration, clock_errors, correct
+from factor_graphs.calibration import QUESTIONABLE, SURELY, Calibration, clock_errors, correct
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
@@ -23,6 +23,13 @@ from factor_graphs.variance import BiasSteps, fix_noise_shown, imu_noise_shown
 
 Array = NDArray[np.float64]
 
+
+class FitTo(Protocol):
+    """Poses and fits the problem for a calibration; with `all_fixes` roughly, and with those that jump together."""
+
+    def __call__(self, calibration: Calibration, all_fixes: bool = False) -> tuple[Problem, Fit]: ...
+
+
 # Residuals fit their standard deviations when chi2 per degree of freedom is in this range.
 FITTING_CHI2 = (0.8, 1.3)
 # Once begun, inflation goes on until here. It ends where it no longer helps: then something else does not fit.
@@ -31,8 +38,8 @@ INFLATED_CHI2, MAX_INFLATION, INFLATION_ROUNDS, WORTHWHILE = 1.1, 1e4, 8, 0.98
 NOISE_ROUNDS = 10
 # Fixes are taken for worse than they say when they are so many times: below that, an inflated IMU does no harm.
 NOTABLE_FIX_NOISE = 1.2
-# A correction is applied beyond so many of its standard deviations; unasked, only beyond doubt.
-NEGLIGIBLE, BEYOND_DOUBT, CALIBRATION_ROUNDS = 0.1, 5.0, 6
+# A correction is applied beyond so many of its standard deviations.
+NEGLIGIBLE, CALIBRATION_ROUNDS = 0.1, 6
 # Unasked, a time offset is looked for only in a drive of this length: a short one hardly shows it.
 LONG_ENOUGH_S = 120.0
 
@@ -123,12 +130,10 @@ def _covariances(problem: Problem, fit: Fit) -> tuple[Array, BiasSteps]:
     return covariances, steps
 
 
-def calibrate(
-    fit_to: Callable[[Calibration], tuple[Problem, Fit]], settings: SmootherSettings, given: Array
-) -> tuple[Problem, Fit, Calibration]:
+def calibrate(fit_to: FitTo, settings: SmootherSettings, given: Array) -> tuple[Problem, Fit, Calibration]:
     """Fit, correct time offset and lever arm, and fit again, until the correction is lost in its own noise.
 
-    `fit_to` poses and fits the problem for a calibration; `given` (3,) m is the lever arm to start from.
+    `given` (3,) m is the lever arm to start from.
     """
     calibration, with_lever = Calibration(0.0, given), settings.estimate_lever_arm
     problem, fit = fit_to(calibration)
@@ -137,10 +142,12 @@ def calibrate(
     with_time = looks and (with_lever or settings.estimate_time_offset is True)
     if not looks and not with_lever:
         return problem, fit, calibration
+    if looks and problem.displaced:
+        problem, fit, calibration = _by_clock(fit_to, given) or (problem, fit, calibration)
     for _ in range(CALIBRATION_ROUNDS):
         errors, calibration = clock_errors(problem, fit, calibration, looks)
         offset, sigma = errors.clock_offset(calibration.begins)
-        with_time |= looks and abs(offset) > BEYOND_DOUBT * sigma
+        with_time |= looks and abs(offset) > SURELY * sigma
         better, moved = correct(errors, calibration, given, with_time, with_lever)
         if moved < NEGLIGIBLE:
             of_lever, of_clock = better.p_imu_antenna_stddevs, better.time_offset_stddev_s or sigma
@@ -150,6 +157,15 @@ def calibrate(
         calibration = better
         problem, fit = fit_to(calibration)
     return problem, fit, calibration
+
+
+def _by_clock(fit_to: FitTo, given: Array) -> tuple[Problem, Fit, Calibration] | None:
+    """Problem and solution with a step of the clock that explains why fixes jump together; None where none does."""
+    none = Calibration(0.0, given)
+    errors, stepped = clock_errors(*fit_to(none, True), none, True)
+    stepped, _ = correct(errors, stepped, given, False, False)
+    problem, fit = fit_to(stepped)
+    return (problem, fit, stepped) if stepped.clock_steps and not problem.displaced else None
 
 
 def reject(problem: Problem, fit: Fit, constraints: list[gtsam.NonlinearFactor]) -> Fit:

@@ -64,7 +64,8 @@ def find_jumps(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> tuple[
 def _spikes(stamps: Array, stddevs: Array, off: Array, chain: Rows) -> Mask:
     """Which fixes (m,) stand out of a running median: several outliers in one window, which least squares mix up.
 
-    A median keeps the edges of what lasts, and beside one a fix has neighbours at its level. The slope, the error of the IMU's velocity, is the median of the steps.
+    A median keeps the edges of what lasts, and beside one a fix has neighbours at its level. The slope, an error of
+    velocity, is the median of the steps.
     """
     found = np.zeros(len(stamps), np.bool_)
     for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(chain)) + 1):

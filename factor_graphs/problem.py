@@ -67,7 +67,7 @@ class Problem:
     `used` (m,) and `relative_used` (r,) say which of the fixes and relative poses given take part; `at` and
     `relative_at` (k, 2) are the keyframes of those that do. `late` (m,) s: a fix after its keyframe. Fixes have
     `of_fixes` times the standard deviations that they say. `heading_in_doubt`: another heading fits as well. By
-    `common_stddevs`, m, all fixes may be wrong together.
+    `common_stddevs`, m, all fixes may be wrong together. `displaced`: fixes that jump together are left out or moved.
     """
 
     settings: SmootherSettings
@@ -88,6 +88,7 @@ class Problem:
     of_fixes: float = 1.0
     heading_in_doubt: bool = False
     common_stddevs: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    displaced: bool = False
 
     @property
     def first_loss(self) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.antenna_heading import observe_headings
-from factor_graphs.calibration import Calibration, in_order, scale_error
+from factor_graphs.calibration import Calibration, in_order, scale_error, upright_axis
 from factor_graphs.clock_check import checked, stamps_are_ends
 from factor_graphs.condensing import CondensedDrive, condense
 from factor_graphs.consistent_fixes import with_consistent_fixes
@@ -38,7 +38,16 @@ from factor_graphs.measurements import (
     measured,
 )
 from factor_graphs.model import from_values
-from factor_graphs.problem import GATE, NOWHERE, REJECTION, RELATIVE_REJECTION, Fit, Problem, pose_problem
+from factor_graphs.problem import (
+    GATE,
+    NOWHERE,
+    REJECTION,
+    RELATIVE_REJECTION,
+    Fit,
+    Problem,
+    fit_as_expected,
+    pose_problem,
+)
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting, are_new
 from factor_graphs.settings import SmootherSettings as SmootherSettings
@@ -201,7 +210,9 @@ class _Log:
             inertial = inertial.at_middle()
             problem, fit, estimated = self._calibrated(inertial)
         of_noise, fitting = max(fit.inflation, problem.of_fixes), self.fixes[problem.used][fit.weights > HALF]
-        stepped = replace(fitting, stamps=in_order(replace(estimated, time_offset_s=0.0).on_imu_clock(fitting.stamps)))
+        stepped = replace(
+            fitting, stamps=in_order(replace(estimated, time_offset_s=0.0).on_imu_clock(fitting.stamps))
+        )
         calibration = checked(estimated, inertial.samples, stepped, of_noise)
         if calibration.refused:
             problem, fit = self._fit_to(inertial, calibration)
@@ -212,7 +223,9 @@ class _Log:
     def _calibrated(self, inertial: "_Inertial") -> tuple[Problem, Fit, Calibration]:
         return calibrate(partial(self._fit_to, inertial), self.settings, self.given)
 
-    def _fit_to(self, inertial: "_Inertial", calibration: Calibration) -> tuple[Problem, Fit]:
+    def _fit_to(
+        self, inertial: "_Inertial", calibration: Calibration, all_fixes: bool = False
+    ) -> tuple[Problem, Fit]:
         shifted = replace(self.fixes, stamps=in_order(calibration.on_imu_clock(self.fixes.stamps)))
         also_at = np.concatenate([NOWHERE, *(calibration.on_imu_clock(one.stamps) for one in self.also)])
 
@@ -220,6 +233,8 @@ class _Log:
             lever, known = calibration.p_imu_antenna, (self.attitude, self.relative, also_at)
             return pose_problem(inertial.samples, some, self.frame, self.settings, lever, *known)
 
+        if all_fixes:
+            return (posed := with_heading(pose(shifted))), fit_as_expected(posed)
         return fit_noise(with_heading(with_consistent_fixes(pose(shifted), shifted, pose)))
 
 
@@ -235,7 +250,7 @@ class _Inertial:
     are_ends: bool = False
     """The fixes show that the stamps were the ends of intervals."""
     scale: float = 0.0
-    """The gyroscope turned by this share too much about the vertical: taken out."""
+    """The gyroscope turned by this share too much about its upright axis: taken out."""
 
     @classmethod
     def of(cls, imu: ImuSamples, fixes: GnssFixes, settings: SmootherSettings) -> "_Inertial":
@@ -251,16 +266,16 @@ class _Inertial:
 
     def scaled(self, error: float) -> "_Inertial":
         """The same with another error of the gyroscope's scale taken out."""
-        imu, up = self.samples, self.samples.specific_force.mean(axis=0)
-        about_up = (imu.angular_rate @ up)[:, None] * up / (up @ up)
-        rates = imu.angular_rate - error / (1 + error) * about_up
+        imu, rates = self.samples, self.samples.angular_rate.copy()
+        rates[:, upright_axis(imu.specific_force)] /= 1 + error
         samples = ImuSamples(imu.stamps, imu.specific_force, rates)
         return replace(self, samples=samples, scale=(1 + error) * (1 + self.scale) - 1)
 
     def notes(self) -> Iterator[str]:
         """In words."""
         if self.scale:
-            yield f"the gyroscope turns by {100 * self.scale:+.2f} % too much about the vertical: taken out"
+            axis = "xyz"[upright_axis(self.samples.specific_force)]
+            yield f"the gyroscope turns by {100 * self.scale:+.2f} % too much about its {axis} axis: taken out"
         if self.are_ends:
             yield "stamps of the IMU are the ends of its intervals, as the fixes show (imu_sample_instant: end)"
         if self.filled:
@@ -308,7 +323,9 @@ def _point_residuals(
 ) -> tuple[PointResidual, ...]:
     """Of all surveyed points."""
     placed = [one.points for one in beside if one.points is not None]
-    return tuple(residual for one in placed for residual in residuals_of(*one, keyframes, calibration.p_imu_antenna))
+    return tuple(
+        residual for one in placed for residual in residuals_of(*one, keyframes, calibration.p_imu_antenna)
+    )
 
 
 def _observe(one: Also, problem: Problem, fit: Fit, calibration: Calibration) -> Observed:
@@ -432,7 +449,7 @@ def _doubts(problem: Problem, fit: Fit, keyframes: Trajectory, calibration: Cali
     if calibration.time_offset_s:
         yield f"every fix is of {calibration.time_offset_s:+.3f} s after its stamp: taken into account"
     for begin, step, _ in calibration.clock_steps:
-        yield f"the clock of the fixes steps at {begin:.1f} s: later ones are of {step:+.3f} s after, taken into account"
+        yield f"the clock of the fixes steps at {begin:.1f} s by {-step:+.3f} s: taken into account"
     if calibration.refused:
         yield (
             f"{calibration.refused}: not taken, a deviation of {calibration.time_offset_stddev_s:.2f} s in its place;"

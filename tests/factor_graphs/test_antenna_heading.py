@@ -40,7 +40,7 @@ def creeping(seconds: float, rng: np.random.Generator):
 def test_the_jacobian_is_that_of_the_azimuth_and_exact_headings_cost_nothing(simulate):
     drive = simulate(2, 60.0)
     problem, fit = fit_noise(pose_problem(drive.imu, drive.fixes, FRAME, FREE, LEVER, None))
-    observed = observe_headings(headings_of(drive, None), problem, fit, 0.0)
+    observed = observe_headings(headings_of(drive, None), problem, fit)
     assert observed.factors is not None
     factors = observed.factors(fit)
     costs = [factor.error(fit.values) for factor in factors]
@@ -49,7 +49,7 @@ def test_the_jacobian_is_that_of_the_azimuth_and_exact_headings_cost_nothing(sim
     turned = T.copy()
     turned[:, :3, :3] = T[:, :3, :3] @ Rotation.from_rotvec([2e-4, -1e-4, 3e-4]).as_matrix()
     values = to_values(turned, v, biases)
-    again = observe_headings(headings_of(drive, None), problem, replace(fit, values=values), 0.0)
+    again = observe_headings(headings_of(drive, None), problem, replace(fit, values=values))
     assert again.factors is not None
     np.testing.assert_allclose(
         [f.error(values) for f in factors], [f.error(values) for f in again.factors(replace(fit, values=values))],

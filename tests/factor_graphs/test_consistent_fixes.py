@@ -142,3 +142,19 @@ def test_over_a_gap_the_imu_tells_which_block_is_displaced(driven) -> None:
     fixes, block = displaced(good, 70.0, 115.0, 20.0)
     _, without = chosen(driven, fixes)
     np.testing.assert_array_equal(without.used, ~block)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_block_is_found_beside_outliers(simulate, seed: int) -> None:
+    one, rng = simulate(20 + seed, 160.0, ImuNoise()), np.random.default_rng(seed)
+    stamps = np.arange(0.37, 159.0, 1.0)
+    good = simulate_gnss(one.motion, stamps, RTK, LEVER, rng, outlier_share=0.1)
+    fixes, block = displaced(good, 50.0, 110.0, 5.0)
+    found = smooth(one.imu, fixes, FRAME, None, LEVER)
+    gap = smooth(one.imu, good[~block], FRAME, None, LEVER)
+    truth = one.motion.poses(stamps)[:, :3, 3]
+    off, of_gap = (
+        np.linalg.norm(s.keyframes.at(stamps)[:, :3, 3] - truth, axis=1).max() for s in (found, gap)
+    )
+    assert found.rejected[block].all()
+    assert off <= max(1.5 * of_gap, 0.3)

@@ -36,7 +36,7 @@ def test_in_exact_motion_the_velocities_of_the_antenna_cost_nothing(simulate):
     relative = drive.fixes.stamps  # keyframes at the fixes alone
     problem, fit = fit_noise(pose_problem(drive.imu, drive.fixes, FRAME, FREE, LEVER, None))
     assert len(problem.intervals.keyframes) < 2 * len(relative)
-    observed = observe_velocities(late, problem, fit, 0.0)
+    observed = observe_velocities(late, problem, fit)
     assert observed.factors is not None
     costs = np.array([factor.error(fit.values) for factor in observed.factors(fit)])
     assert len(costs) == len(late)
@@ -113,7 +113,7 @@ def test_errors_that_last_count_once(simulate):
         problem, fit = fit_noise(
             pose_problem(drive.imu, drive.fixes, FRAME, FREE, LEVER, None, also_at=stamps)
         )
-        verdict = observe_velocities(given, problem, fit, 0.0).verdict
+        verdict = observe_velocities(given, problem, fit).verdict
         counted.append(float(verdict.split("as if of ")[1].split(" times")[0]) / 6)
     expected = np.sqrt((1 + rho) / (1 - rho))
     assert np.mean(counted) == pytest.approx(expected, rel=0.25)

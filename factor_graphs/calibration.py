@@ -76,9 +76,8 @@ def upright_axis(specific_force: Array) -> int:
 def in_order(stamps: Array) -> Array:
     """The stamps (n,) s, those that a step of the clock brings before earlier ones just after these."""
     little = 1e-6 * np.arange(len(stamps))
-    return (
-        stamps if np.all(np.diff(stamps) > 0) else np.asarray(np.maximum.accumulate(stamps - little) + little)
-    )
+    ordered: Array = np.maximum.accumulate(stamps - little) + little
+    return stamps if np.all(np.diff(stamps) > 0) else ordered
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +131,9 @@ class LastingErrors:
 
         Before, they have `stddevs` (c,) about -`before`: what was corrected already.
         """
-        covariance = np.linalg.inv(columns.T @ self.information @ columns + np.diag(1 / stddevs**2))
-        return np.asarray(covariance @ (columns.T @ self.vector - before / stddevs**2)), covariance
+        covariance: Array = np.linalg.inv(columns.T @ self.information @ columns + np.diag(1 / stddevs**2))
+        found: Array = covariance @ (columns.T @ self.vector - before / stddevs**2)
+        return found, covariance
 
     def gain(self, columns: Array, stddevs: Array) -> float:
         """By how much the squared residuals fall where there are these errors: chi-square by chance."""

@@ -62,7 +62,7 @@ class Calibration:
 
     def on_imu_clock(self, stamps: Array) -> Array:
         """The moments (n,) s of what the receiver stamps."""
-        late = np.full(len(stamps), self.time_offset_s)
+        late: Array = np.full(len(stamps), self.time_offset_s)
         for begin, step, _ in self.clock_steps:
             late[stamps >= begin] += step
         return stamps + late
@@ -131,7 +131,8 @@ class LastingErrors:
 
         Before, they have `stddevs` (c,) about -`before`: what was corrected already.
         """
-        covariance: Array = np.linalg.inv(columns.T @ self.information @ columns + np.diag(1 / stddevs**2))
+        precision: Array = columns.T @ self.information @ columns + np.diag(1 / stddevs**2)
+        covariance = np.asarray(np.linalg.inv(precision), np.float64)
         found: Array = covariance @ (columns.T @ self.vector - before / stddevs**2)
         return found, covariance
 

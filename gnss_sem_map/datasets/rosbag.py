@@ -8,6 +8,7 @@ topic from 0. Stamp zero is that of the first fix.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -59,23 +60,17 @@ def is_drive(drive: Path) -> bool:
 
 
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
-    """Open a bag; raises DataError for a bag that is damaged, and for sensors that are missing or not unique.
+    """Open a bag; raises DataError for a bag that is damaged, and for sensors that are not unique.
 
     Without `with_imu`, only the first and last message of the IMU are read.
     """
     bag, file = Bag(drive), rig_file(drive)
     rig = roles.completed(bag, Rig() if file is None else read_rig(file))
-    if rig.imu is None or rig.gnss is None:
-        raise roles.nothing_taken(bag, rig)
-    imu = bag.messages(rig.imu.topic)
     lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
-    fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
-    epoch_ns = int(fix_ns[0])
-    gnss, velocities, frame, invalid = _usable(fixes, shown(drive))
-    skips += invalid
-    samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
-    headings = _headings(fixes, frame, rig.gnss, calibration.p_imu_antenna)
+    epoch_ns, receiver, skips = _receiver(bag, rig, file or drive, calibration.p_imu_antenna)
+    skips += roles.missing(bag, rig)
+    samples, attitude, imu_skips = _imu(bag, rig.imu, epoch_ns, with_imu)
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
@@ -92,13 +87,13 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         lidar=names[0],
         others=tuple(Lidar(*other) for other in others),
         images=images,
-        frame=frame,
+        frame=receiver.frame,
         imu=samples,
-        gnss=gnss,
-        velocities=velocities,
-        headings=headings,
-        imu_noise=rig.imu.noise,
-        imu_sample_instant=rig.imu.sample_instant,
+        gnss=receiver.gnss,
+        velocities=receiver.velocities,
+        headings=receiver.headings,
+        imu_noise=None if rig.imu is None else rig.imu.noise,
+        imu_sample_instant=None if rig.imu is None else rig.imu.sample_instant,
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
@@ -106,12 +101,41 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Receiver:
+    """What a receiver measured; nothing where there is none."""
+
+    frame: LocalFrame | None = None
+    gnss: GnssFixes | None = None
+    velocities: GnssVelocities | None = None
+    headings: AntennaHeadings | None = None
+
+
+def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[int, _Receiver, list[Skip]]:
+    """The epoch of the log, what its receiver measured, and the skipped fixes; `place`: rig.yaml, or the bag."""
+    if rig.gnss is None:
+        return _first_ns(bag, rig), _Receiver(), []
+    fixes, fix_ns, skips = _fixes(bag, rig.gnss, place.parent, rig.imu)
+    gnss, velocities, frame, invalid = _usable(fixes, shown(bag.path))
+    headings = _headings(fixes, frame, rig.gnss, p_imu_antenna)
+    return int(fix_ns[0]), _Receiver(frame, gnss, velocities, headings), skips + invalid
+
+
+def _first_ns(bag: Bag, rig: Rig) -> int:
+    """The first moment of the first sensor there is, Unix ns; raises DataError without any."""
+    sensor = rig.imu or next(iter(rig.lidars.values()), None)
+    if sensor is None:
+        raise DataError(f"{shown(bag.path)}: found no topic of an IMU, a receiver or a LiDAR")
+    said, believed, _ = stamps_of(bag, bag.messages(sensor.topic), sensor.stamps)
+    return int(said[believed][0]) if believed.any() else 0
+
+
 def _fixes(
-    bag: Bag, about: GnssTopic, folder: Path, imu: Messages, clock: Clock
+    bag: Bag, about: GnssTopic, folder: Path, imu: ImuTopic | None
 ) -> tuple[Array, NDArray[np.int64], list[Skip]]:
     """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`; their Unix times; and the skipped fixes."""
     if about.file is not None:
-        drive_ns = _span_ns(bag, imu, clock)
+        drive_ns = None if imu is None else _span_ns(bag, bag.messages(imu.topic), imu.stamps)
         found = read_gnss_file(about.file, folder, None, drive_ns)
         return found.rows, found.stamps_ns, found.skips
     assert about.topic is not None
@@ -190,8 +214,11 @@ def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | No
 
 
 def _imu(
-    bag: Bag, about: ImuTopic, messages: Messages, epoch_ns: int, with_all: bool
-) -> tuple[ImuSamples, AttitudePrior | None, list[Skip]]:
+    bag: Bag, about: ImuTopic | None, epoch_ns: int, with_all: bool
+) -> tuple[ImuSamples | None, AttitudePrior | None, list[Skip]]:
+    if about is None:
+        return None, None, []
+    messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
     rows, attitude = [], None
     for k in np.flatnonzero(believed).tolist():

@@ -136,7 +136,7 @@ def point_labels(folder: Path) -> Reader:
 
 def tum(folder: Path) -> Reader:
     """A trajectory in TUM format."""
-    from gnss_sem_map.evaluation.score_run import read_tum
+    from gnss_sem_map.datasets.given_trajectory import read_tum
 
     folder.mkdir(parents=True)
     file = folder / "t.tum"

@@ -25,7 +25,7 @@ FITTING = 3.0
 # A heading that is known worse than this, rad, tells no direction.
 UNKNOWN_HEADING = 0.05
 # A fit of roll and pitch, too, is taken where it leaves less than this share of the distances.
-TILTED = 0.5
+TILTED = 0.7
 REWEIGHTED = 10
 # A vehicle that turns less, rad/s, shows nothing; of what it turns, so much may differ.
 STRAIGHT, DIFFERENT = 0.02, 0.5

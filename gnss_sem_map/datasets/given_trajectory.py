@@ -98,13 +98,13 @@ def _read(file: Path, near_ns: int) -> _File:
 def read_tum(path: Path) -> Trajectory:
     """Read `stamp tx ty tz qx qy qz qw`, a pose per line; raises DataError for anything else."""
     rows = read_table(path, 8)
-    stamps, lengths = rows[:, 0], np.linalg.norm(rows[:, 4:], axis=1)
+    stamps, small = rows[:, 0], np.clip(rows[:, 4:], -FARTHEST_M, FARTHEST_M)
     faults = {
+        f"a number beyond {FARTHEST_M:g}": np.abs(rows).max(axis=1) > FARTHEST_M,
         "a stamp that is not later than the one before; sort the poses and drop repeats":
             np.diff(stamps, prepend=-np.inf) <= 0,
         "a quaternion that is no rotation, expected qx qy qz qw of length one":
-            np.abs(lengths - 1) > QUATERNION_TOLERANCE,
-        f"a number beyond {FARTHEST_M:g}": np.abs(rows[:, :4]).max(axis=1) > FARTHEST_M,
+            np.abs(np.linalg.norm(small, axis=1) - 1) > QUATERNION_TOLERANCE,
     }  # fmt: skip
     for what, wrong in faults.items():
         if wrong.any():

@@ -62,6 +62,6 @@ def open_drive(
         raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
     log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive, with_imu)
     if trajectory is not None:
-        return along(log, Path(trajectory))
+        return along(log, Path(trajectory), with_imu)
     log.check_located()
     return log

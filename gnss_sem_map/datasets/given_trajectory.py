@@ -50,18 +50,18 @@ class _File:
     frame: LocalFrame | None = None
 
 
-def along(log: SensorLog, file: Path) -> SensorLog:
+def along(log: SensorLog, file: Path, with_imu: bool = True) -> SensorLog:
     """The log with the poses of a file, and the scans that have one; raises DataError, MeasurementError.
 
-    It is an error when the file has no time in common with the log, or no poses.
+    It is an error when the file has no time in common with the log, or no poses. `with_imu`: as the log was read.
     """
-    first, last = _span(log)
+    ours = log.in_our_conventions(SensorConventions())
+    first, last = _span(ours)
     found = _read(file, log.epoch_ns + round((first + last) / 2 * 1e9))
-    trajectory, clock = _on_clock_of(log, found, file)
+    trajectory, clock = _on_clock_of(ours, found, file)
     if len(trajectory) < 2:
         raise DataError(f"{shown(file)}: found one pose, expected at least 2")
-    ours = log.in_our_conventions(SensorConventions())
-    if file.suffix not in (".parquet", *SBET):
+    if with_imu and file.suffix not in (".parquet", *SBET):
         _refuse_scalar_first(trajectory, ours, file)
     frame, trajectory, place = _placed(ours, trajectory, found.frame)
     scans, skips = _with_pose(log, trajectory, file)
@@ -142,11 +142,10 @@ def _on_clock_of(log: SensorLog, found: _File, file: Path) -> tuple[Trajectory, 
     how = max(common, key=lambda each: common[each])
     zero = clocks[how]
     if common[how] < 0:
-        zero = next(iter(clocks.values()))
         raise DataError(
-            f"{shown(file)}: its poses are from {poses.start - zero:.3f} to {poses.end - zero:.3f} s, those of"
-            f" {log.name} would be from {first:.3f} to {last:.3f} s (or {log.epoch_ns * 1e-9:.3f} s more, as Unix"
-            " time): no time in common; is it of another drive?"
+            f"{shown(file)}: its poses are from {poses.start - zero:.3f} to {poses.end - zero:.3f} s, and {log.name} is"
+            f" from {first:.3f} to {last:.3f} s after {log.epoch_ns * 1e-9:.3f}, Unix time: no time in common; is it of"
+            " another drive?"
         )
     return replace(poses, stamps=poses.stamps - zero) if zero else poses, how
 
@@ -219,10 +218,11 @@ def _placed(
 def _with_pose(log: SensorLog, trajectory: Trajectory, file: Path) -> tuple[SensorLog, list[Skip]]:
     """The log with the scans that have a pose, and how many have none."""
     stamps, outside, between = trajectory.stamps, 0, 0
+    late_s = 0.0 if log.conventions is None else log.conventions.lidar_time_offset_s or 0.0
 
     def kept(scans: tuple[Scan, ...]) -> tuple[Scan, ...]:
         nonlocal outside, between
-        t = np.array([scan.stamp for scan in scans])
+        t = np.array([scan.stamp for scan in scans]) + late_s
         is_out = (t < trajectory.start - STAMP_TOLERANCE_S) | (t > trajectory.end + STAMP_TOLERANCE_S)
         after = np.searchsorted(stamps, t).clip(1, len(stamps) - 1)
         is_between = ~is_out & (stamps[after] - stamps[after - 1] > LONGEST_STEP_S)

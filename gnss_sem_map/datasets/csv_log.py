@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +35,6 @@ from factor_graphs.csv_log import (
     LONGEST_FIX_STEP_S,
     LONGEST_IMU_STEP_S,
     LONGEST_WHEEL_STEP_S,
-    NOT_DEFINITE,
     WHEEL_COLUMNS,
     fix_rows,
     parse_columns,
@@ -45,21 +43,14 @@ from factor_graphs.csv_log import (
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import (
-    AntennaHeadings,
-    GnssFixes,
-    GnssVelocities,
-    ImuSamples,
-    WheelSpeeds,
-    clean_imu,
-    clean_wheels,
-)
-from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
+from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
+from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, read_bytes, shown
@@ -124,35 +115,14 @@ def _imu(path: Path, about: LogFile) -> tuple[ImuSamples | None, list[Skip]]:
     return imu, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 
 
-@dataclass(frozen=True, eq=False)
-class _Receiver:
-    """What a receiver measured; nothing where there is none."""
-
-    frame: LocalFrame | None = None
-    gnss: GnssFixes | None = None
-    velocities: GnssVelocities | None = None
-    headings: AntennaHeadings | None = None
-
-
-def _receiver(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[_Receiver, list[Skip]]:
+def _receiver(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Receiver, list[Skip]]:
     path = drive / "gnss.csv"
     if about.gnss_file is None and not is_file(path):
-        return _Receiver(), [_missing(path, GNSS_COLUMNS)]
+        return Receiver(), [_missing(path, GNSS_COLUMNS)]
     rows, skips = _fix_rows(drive, about, imu_stamps)
-    frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
-    gnss, gnss_repairs, no_covariance = fixes_of(rows, frame)
-    velocities, velocity_repairs = velocities_of(rows, frame)
     with _as_data_error():
-        headings, heading_repairs = headings_of(rows, frame, about.baseline)
-    lost = [
-        Skip("samples", shown(path), str(repairs))
-        for repairs in (gnss_repairs, velocity_repairs, heading_repairs)
-        if repairs is not None and repairs.dropped
-    ]
-    if no_covariance:
-        said = f"{no_covariance} fixes: {NOT_DEFINITE}"
-        lost.append(Skip("covariance", shown(path), said, no_covariance))
-    return _Receiver(frame, gnss, velocities, headings), [*lost, *skips]
+        found, lost = measured(rows, shown(path), about.baseline)
+    return found, [*lost, *skips]
 
 
 def _missing(path: Path, columns: tuple[str, ...]) -> Skip:

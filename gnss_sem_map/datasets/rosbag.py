@@ -8,7 +8,6 @@ topic from 0. Stamp zero is that of the first fix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -19,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.errors import MeasurementError
-from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, clean_imu
+from factor_graphs.measurements import ImuSamples, clean_imu
 from factor_graphs.position_covariances import split_covariances
-from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
+from factor_graphs.receiver_rows import with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
@@ -101,24 +100,24 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Receiver:
-    """What a receiver measured; nothing where there is none."""
-
-    frame: LocalFrame | None = None
-    gnss: GnssFixes | None = None
-    velocities: GnssVelocities | None = None
-    headings: AntennaHeadings | None = None
-
-
-def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[int, _Receiver, list[Skip]]:
+def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[int, Receiver, list[Skip]]:
     """The epoch of the log, what its receiver measured, and the skipped fixes; `place`: rig.yaml, or the bag."""
     if rig.gnss is None:
-        return _first_ns(bag, rig), _Receiver(), []
+        return _first_ns(bag, rig), Receiver(), []
     fixes, fix_ns, skips = _fixes(bag, rig.gnss, place.parent, rig.imu)
-    gnss, velocities, frame, invalid = _usable(fixes, shown(bag.path))
-    headings = _headings(fixes, frame, rig.gnss, p_imu_antenna)
-    return int(fix_ns[0]), _Receiver(frame, gnss, velocities, headings), skips + invalid
+    where, second = shown(bag.path), rig.gnss.p_imu_antenna2
+    valid, invalid = valid_fixes(fixes[:, 0], fixes[:, 1:4], fixes[:, 4:7])
+    if not valid.any():
+        raise DataError(
+            f"{where}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
+        )
+    skips += [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
+    try:
+        baseline = None if second is None else np.subtract(second, p_imu_antenna)
+        found, lost = measured(fixes[valid], where, baseline)
+    except MeasurementError as error:
+        raise DataError(f"rig.yaml: gnss: {error}") from None
+    return int(fix_ns[0]), found, skips + lost
 
 
 def _first_ns(bag: Bag, rig: Rig) -> int:
@@ -172,36 +171,6 @@ def _fixes(
         skips.append(Skip("covariance", messages.topic, f"{count} fixes: {NOT_DEFINITE}", count))
     table = np.column_stack([(ns - ns[0]) * 1e-9, np.array(rows), stddevs])
     return with_more(table, correlations=correlations), ns, skips
-
-
-def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, LocalFrame, list[Skip]]:
-    """The valid fixes of rows as `_fixes` makes them, in the local frame at the first one, and the skipped ones."""
-    valid, invalid = valid_fixes(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
-    if not valid.any():
-        raise DataError(
-            f"{where}: not one of {len(rows)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
-        )
-    rows = rows[valid]
-    frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
-    gnss, repairs, no_covariance = fixes_of(rows, frame)
-    velocities, _ = velocities_of(rows, frame)
-    skips = [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
-    if repairs.dropped:
-        skips.append(Skip("samples", where, str(repairs)))
-    if no_covariance:
-        skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
-    return gnss, velocities, frame, skips
-
-
-def _headings(
-    rows: Array, frame: LocalFrame, about: GnssTopic, p_imu_antenna: Array
-) -> AntennaHeadings | None:
-    """Headings in a file of positions."""
-    second = about.p_imu_antenna2
-    try:
-        return headings_of(rows, frame, None if second is None else np.subtract(second, p_imu_antenna))[0]
-    except MeasurementError as error:
-        raise DataError(f"rig.yaml: gnss: {error}") from None
 
 
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:

@@ -82,16 +82,15 @@ def _robust(p: Array, q: Array, claimed: Array, is_level: bool) -> Array:
 
 
 def _rigid(p: Array, q: Array, weights: Array, is_level: bool) -> Array:
-    """The best T with q = T p (Kabsch), or the best that turns about z alone."""
+    """The best T with q = T p, or the best that turns about z alone."""
     p0, q0 = (np.average(some, axis=0, weights=weights) for some in (p, q))
-    H = (weights[:, None] * (q - q0)).T @ (p - p0)
-    T = np.eye(4)
     if is_level:
-        angle = np.arctan2(H[1, 0] - H[0, 1], H[0, 0] + H[1, 1])
-        T[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+        H = (weights[:, None] * (q - q0)).T @ (p - p0)
+        turn = Rotation.from_rotvec([0.0, 0.0, np.arctan2(H[1, 0] - H[0, 1], H[0, 0] + H[1, 1])])
     else:
-        u, _, vt = np.linalg.svd(H)
-        T[:3, :3] = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        turn, _ = Rotation.align_vectors(q - q0, p - p0, weights)
+    T = np.eye(4)
+    T[:3, :3] = turn.as_matrix()
     T[:3, 3] = q0 - T[:3, :3] @ p0
     return T
 

@@ -30,6 +30,7 @@ from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 Array = NDArray[np.float64]
 
+SBET = (".sbet", ".out")
 FARTHEST_M = 1e12
 QUATERNION_TOLERANCE = 1e-2
 LONGEST_STEP_S = 1.0
@@ -67,9 +68,6 @@ def along(log: SensorLog, file: Path, with_imu: bool = True) -> SensorLog:
     scans, skips = _with_pose(log, trajectory, file)
     how = f"{len(trajectory)} poses of {shown(file.name)}; {clock}; {place}"
     return replace(scans, given=trajectory, frame=frame, given_how=how, skips=(*log.skips, *skips))
-
-
-SBET = (".sbet", ".out")
 
 
 def _read(file: Path, near_ns: int) -> _File:
@@ -162,14 +160,14 @@ def _refuse_scalar_first(trajectory: Trajectory, log: SensorLog, file: Path) -> 
     seen = [None if log.imu is None else turns_seen(one, log.imu) for one in (trajectory, other)]
     if seen[0] is not None and seen[1] is not None and seen[0].is_known:
         is_other = not seen[0].fits(seen[0].off_then) and seen[1].fits(seen[1].off_then)
-        why = "so the poses turn as the gyroscope does"
+        why = "the poses turn as the gyroscope does"
     else:
         is_other = _plausibility(trajectory) < POSSIBLE and _plausibility(other) > SURE
-        why = "so the vehicle drives forward and upright"
+        why = "the vehicle drives forward and upright"
     if is_other:
         raise DataError(
-            f"{shown(file)}: the file looks like qw first: {why}; expected stamp tx ty tz qx qy qz qw, so move the"
-            " fifth number of each line to its end"
+            f"{shown(file)}: the file looks like qw first: read so, {why}; expected stamp tx ty tz qx qy qz qw, so"
+            " move the fifth number of each line to its end"
         )
 
 
@@ -225,7 +223,7 @@ def _with_pose(log: SensorLog, trajectory: Trajectory, file: Path) -> tuple[Sens
         t = np.array([scan.stamp for scan in scans]) + late_s
         is_out = (t < trajectory.start - STAMP_TOLERANCE_S) | (t > trajectory.end + STAMP_TOLERANCE_S)
         after = np.searchsorted(stamps, t).clip(1, len(stamps) - 1)
-        is_between = ~is_out & (stamps[after] - stamps[after - 1] > LONGEST_STEP_S)
+        is_between = ~is_out & (stamps[after] - stamps[after - 1] > LONGEST_STEP_S + STAMP_TOLERANCE_S)
         outside, between = outside + int(is_out.sum()), between + int(is_between.sum())
         return tuple(scan for scan, lost in zip(scans, is_out | is_between, strict=True) if not lost)
 

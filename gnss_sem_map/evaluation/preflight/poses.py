@@ -25,6 +25,8 @@ ASIDE = np.radians(45.0)
 DRIVING_MPS = 2.0
 # A clock that is off by less, s, is not told of: turns do not show it.
 NOTABLE_LATE_S = 0.1
+# A way that bends more than this between two poses, m, blurs a map.
+BENT_M = 0.05
 
 
 def check(given: Trajectory, log: SensorLog) -> Iterator[Finding]:
@@ -38,6 +40,8 @@ def check(given: Trajectory, log: SensorLog) -> Iterator[Finding]:
         return
     steps, durations = np.diff(given.positions, axis=0), np.diff(given.stamps)
     yield _jumps(given, steps, durations)
+    if given.velocities is None:
+        yield _straight(steps, durations)
     yield _turns(given, durations)
     yield from _looks_ahead(given, steps, durations)
 
@@ -126,6 +130,21 @@ def _jumps(given: Trajectory, steps: Array, durations: Array) -> Finding:
             "correct the poses around it",
         )
     return green("Poses", evidence)
+
+
+def _straight(steps: Array, durations: Array) -> Finding:
+    """How far a curve of constant acceleration is from the straight line between two poses: an eighth of its bend."""
+    bends = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 8
+    bent, apart = float(np.quantile(bends, 0.9)), float(np.median(durations))
+    evidence = f"{apart:.3g} s apart, and between them up to {bent:.3f} m off the straight line (nine in ten)"
+    if bent > BENT_M:
+        return amber(
+            "Pose rate",
+            evidence,
+            "too few poses for such a motion, or noisy ones",
+            "give ten or more in a second",
+        )
+    return green("Pose rate", evidence)
 
 
 def _turns(given: Trajectory, durations: Array) -> Finding:

@@ -252,3 +252,11 @@ def test_the_lever_arm_counts(tmp_path: Path) -> None:
     exact = replace(log(), gnss=drive(SEED, stddev_m=1e-3).gnss)
     assert "0.00 m from the usual one" in along(exact, tum(tmp_path, TRUTH)).given_how
     assert np.linalg.norm(LEVER) > 1.0
+
+
+def test_poses_too_far_apart_for_their_motion_are_amber(tmp_path: Path) -> None:
+    assert not of(log(), tum(tmp_path, TRUTH[:: round(0.1 / 0.02)]))
+    found = along(log(), tum(tmp_path, TRUTH[:: round(1.0 / 0.02)]))
+    assert len(found.scans) + sum(skip.frames for skip in found.skips) == 599
+    assert len(found.scans) > 580  # a second is not too long
+    assert "Pose rate" in " ".join(wrong(findings(found)))

@@ -26,8 +26,8 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.dynamics.movers import Mover, movers_of
-from gnss_sem_map.evaluation.score_run import read_tum
 
 RESULTS = Path(__file__).parent / "results" / "movers.json"
 NEAR_M = 3.0

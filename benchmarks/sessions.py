@@ -35,8 +35,8 @@ from factor_graphs.sessions import AnchorPairs, bind
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.evaluation.map_sharpness import SharpnessSettings, of_clouds
-from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping.passes import LocatedDrive, bind_passes
 from gnss_sem_map.mapping.trajectory import in_frame, locate

@@ -44,6 +44,7 @@ from gnss_sem_map.mapping.trajectory import (
     estimate_trajectory,
     in_frame,
     locate,
+    matches_scans,
 )
 from gnss_sem_map.memory import release_memory
 from gnss_sem_map.run_stats import Progress, RunStats, silent
@@ -101,7 +102,7 @@ class Mapped:
     passes: tuple[TwoPasses, ...] = ()
     """What the drive passed again."""
     sharpness: Mapping[str, Sharpness] = field(default_factory=dict)
-    """Of the "map"; with LiDAR odometry, also of a map with the poses of "gnss and imu" alone."""
+    """Of the "map"; with LiDAR odometry, also with the poses of "gnss and imu" alone, or "given poses"."""
     from_lidar_odometry: bool = False
     """Whether the poses come from LiDAR odometry, so that static objects are not blurred in the map."""
     preflight: Preflight = field(default_factory=lambda: Preflight((), 0.0))
@@ -143,8 +144,7 @@ def run(
     stats = RunStats(skips=list(log.skips))
     opened_sensor_model(settings)  # one of other classes is refused now
     opened_model(settings)
-    has_odometry = match is not None and log.given is None and settings.trajectory.lidar_odometry
-    saved = work / SWEEPS if has_odometry else None
+    saved = work / SWEEPS if match is not None and matches_scans(log, settings) else None
     page, found, sharpness = _checked_and_located(
         log, segmenter, settings, stats, progress, force, match, registrar_of, saved, bound=correction is None
     )
@@ -228,7 +228,8 @@ def _located(
         sample = SweepSample(log, folder=saved)
         figures = of_sample(sample, trajectories, progress)
         sample.sweeps.forget()  # 100 MB
-    return replace(found, without_lidar=None), dict(zip(("map", "gnss and imu"), figures, strict=False))
+    names = "map", "gnss and imu" if log.given is None else "given poses"
+    return replace(found, without_lidar=None), dict(zip(names, figures, strict=False))
 
 
 def saving_sweeps(log: SensorLog, folder: Path) -> SensorLog:

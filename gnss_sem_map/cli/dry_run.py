@@ -62,7 +62,7 @@ def _of_drive(source: Source, log: SensorLog, origin: LocalFrame | None) -> Iter
     first, last = log.scans[0].stamp, log.scans[-1].stamp
     yield f"{source.name}: {log.scan_count} scans over {last - first:.1f} s, {len(log.images)} images"
     if log.given is not None:
-        yield f"  trajectory: {len(log.given)} poses given with the drive"
+        yield f"  trajectory: {log.given_how or f'{len(log.given)} poses given with the drive'}"
     elif log.imu is not None and log.gnss is not None:
         wheels = "" if log.wheels is None else f", {len(log.wheels.stamps)} wheel speeds"
         yield f"  trajectory: smoothed from {len(log.imu)} IMU samples and {len(log.gnss)} GNSS fixes{wheels}"

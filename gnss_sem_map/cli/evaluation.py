@@ -15,6 +15,7 @@ from gnss_sem_map.cli.options import (
     Format,
     Frames,
     Json,
+    Poses,
     Segmenter,
     Set,
     open_log,
@@ -118,6 +119,7 @@ def check(
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
+    trajectory: Poses = None,
     as_json: Json = False,
 ) -> None:
     """Pre-flight: check a log against physics, and its sensors against each other; exit code 1 if a check is red."""
@@ -129,7 +131,7 @@ def check(
 
     check_writable(out)
     settings = settings_of(config, set_)
-    log = open_log(drive, drive_format, frames)
+    log = open_log(drive, drive_format, frames, trajectory)
     network = None
     if segmenter not in (None, "none"):
         label_set = open_label_set(settings.classes)

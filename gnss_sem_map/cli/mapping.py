@@ -28,6 +28,7 @@ from gnss_sem_map.cli.options import (
     Geoid,
     Json,
     Out,
+    Poses,
     Segmenter,
     Set,
     default_workers,
@@ -73,6 +74,7 @@ def run(
     set_: Set = None,
     frames: Frames = None,
     drive_format: Format = None,
+    trajectory: Poses = None,
     origin: Annotated[
         str | None,
         typer.Option(
@@ -119,26 +121,26 @@ def run(
     is_of_many = len(found) > 1 or align_to is not None
     if is_of_many and segmenter is None:
         refuse_unlabelled(found[0])
-    sources = [source_of(drive, segmenter, frames, drive_format, device) for drive in found]
+    sources = [source_of(drive, segmenter, frames, drive_format, device, trajectory) for drive in found]
     with claimed_run(out, [*places_read(sources, settings, config), align_to], is_resumable=not dry_run):
         if dry_run:
             if is_of_many:
-                frame = frame_of_all(found, settings, drive_format, frame)
+                frame = frame_of_all(sources, settings, frame)
             print_plan(sources, settings, workers or default_workers(), frame, align_to)
             return
         if is_of_many:
-            how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+            how = HowMapped(segmenter, frames, drive_format, device, force, resume, trajectory)
             _run_many(found, out, settings, how, frame, workers, scheduler, write_labels, align_to, as_json)
             return
         [drive] = found
-        log = open_log(drive, drive_format, frames)
+        log = open_log(drive, drive_format, frames, trajectory)
         if segmenter is None and log.cameras:
             refuse_unlabelled(drive)
         with progress_bars() as progress:
             finished = finished_run.run(
                 drive, out, segmenter, settings,
-                log=log, frames=frames, drive_format=drive_format, device=device, origin=frame,
-                workers=workers or default_workers(), scheduler=scheduler, resume=resume,
+                log=log, frames=frames, drive_format=drive_format, device=device, trajectory=trajectory,
+                origin=frame, workers=workers or default_workers(), scheduler=scheduler, resume=resume,
                 write_labels=write_labels, force=force, progress=progress,
             )  # fmt: skip
     about = finished.about
@@ -184,6 +186,7 @@ def add(
     device: Device = "auto",
     frames: Frames = None,
     drive_format: Format = None,
+    trajectory: Poses = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     resume: Resume = False,
@@ -199,7 +202,7 @@ def add(
     Run.open(out)
     if segmenter is None:
         refuse_unlabelled(drive)
-    how = HowMapped(segmenter, frames, drive_format, device, force, resume)
+    how = HowMapped(segmenter, frames, drive_format, device, force, resume, trajectory)
     had_labels = has_point_labels(out)
     with progress_bars() as progress:
         made = add_drive(
@@ -269,6 +272,7 @@ def trajectory(
     config: Config = None,
     set_: Set = None,
     drive_format: Format = None,
+    given: Poses = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -279,8 +283,9 @@ def trajectory(
     from gnss_sem_map.runs.source import source_of
 
     settings = settings_of(config, set_)
-    with run_folder.claimed_run(out, run_folder.places_read([source_of(drive)], settings, config)):
-        log = open_log(drive, drive_format, None)
+    source = source_of(drive, drive_format=drive_format, trajectory=given)
+    with run_folder.claimed_run(out, run_folder.places_read([source], settings, config)):
+        log = open_log(drive, drive_format, None, given)
         stats = RunStats(skips=list(log.skips))
         page = pipeline.check_drive(log, None, settings, stats, force)
         with progress_bars() as progress, stats.stage("trajectory"):

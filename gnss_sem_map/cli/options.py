@@ -44,6 +44,14 @@ Frames = Annotated[
         " are used completely.",
     ),
 ]
+Poses = Annotated[
+    str | None,
+    typer.Option(
+        "--trajectory",
+        help="Poses in place of those smoothed from GNSS and IMU: TUM (T_map_imu), trajectory.parquet of a run, or"
+        " SBET (.sbet, .out). {drive} stands for the name of the drive.",
+    ),
+]
 Segmenter = Annotated[
     str | None,
     typer.Option(
@@ -96,16 +104,19 @@ def delivered_in(
     return settings.model_copy(update={"delivery": delivery})
 
 
-def open_log(drive: Path, drive_format: str | None, frames: str | None) -> SensorLog:
+def open_log(
+    drive: Path, drive_format: str | None, frames: str | None, trajectory: str | None = None
+) -> SensorLog:
     """The drive, with the scans that `--frames` names; raises DataError, and BadParameter for a wrong option."""
     from gnss_sem_map.datasets import open_drive, readers
     from gnss_sem_map.errors import ConfigError
+    from gnss_sem_map.runs.source import source_of
 
     if drive_format is not None and drive_format not in readers():
         raise typer.BadParameter(
             f"found {drive_format!r}, expected one of {sorted(readers())}", param_hint="--format"
         )
-    log = open_drive(drive, drive_format)
+    log = open_drive(drive, drive_format, trajectory=source_of(drive, trajectory=trajectory).trajectory)
     try:
         return log.between(frames)
     except ConfigError as error:

@@ -12,6 +12,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
+from gnss_sem_map.datasets.given_trajectory import along
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
 from gnss_sem_map.sensor_log import SensorLog
@@ -45,13 +46,22 @@ def detect_format(drive: Path) -> str:
     raise DataError(f"{shown(drive)}: no drive of a known format; found {found}, expected {signs}")
 
 
-def open_drive(drive: Path | str, drive_format: str | None = None, with_imu: bool = True) -> SensorLog:
+def open_drive(
+    drive: Path | str,
+    drive_format: str | None = None,
+    with_imu: bool = True,
+    trajectory: Path | str | None = None,
+) -> SensorLog:
     """Open a drive of any known format; scans and images are read later, when they are needed.
 
     `with_imu`: False for those who have a trajectory. A reader may then leave out what takes long to read.
+    `trajectory`: a file of poses in place of the drive's own, see `given_trajectory`.
     """
     drive = Path(drive)
     if drive_format is not None and drive_format not in readers():
         raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
     log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive, with_imu)
+    if trajectory is not None:
+        return along(log, Path(trajectory), with_imu)
+    log.check_located()
     return log

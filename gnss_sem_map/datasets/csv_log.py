@@ -16,7 +16,7 @@
 
 Of several LiDARs or cameras, each has a folder of its name in lidar/ or images/.
 
-Stamps are seconds on one clock.
+Stamps are seconds on one clock. With a trajectory in a file of its own, lidar/ is enough.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ from factor_graphs.csv_log import (
     LONGEST_FIX_STEP_S,
     LONGEST_IMU_STEP_S,
     LONGEST_WHEEL_STEP_S,
-    NOT_DEFINITE,
     WHEEL_COLUMNS,
     fix_rows,
     parse_columns,
@@ -44,17 +43,18 @@ from factor_graphs.csv_log import (
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import WheelSpeeds, clean_imu, clean_wheels
-from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
+from factor_graphs.measurements import ImuSamples, WheelSpeeds, clean_imu, clean_wheels
+from factor_graphs.receiver_rows import MORE_COLUMNS
 from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.datasets import frames
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.log_yaml import LidarFile, LogFile, calibration_of, read_log_yaml
 from gnss_sem_map.datasets.point_times import leave_out_of_sweep
+from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.stamps import LONGEST_FRAME_STEP_S, check_date, check_unit, in_order
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, read_bytes, shown
-from gnss_sem_map.sensor_log import POSE_OF_LIDAR, Image, Lidar, Points, Scan, SensorLog, Skip
+from gnss_sem_map.sensor_log import POSE_OF_LIDAR, SENSOR, Image, Lidar, Points, Scan, SensorLog, Skip
 from gnss_sem_map.sensor_log.cameras import Camera
 from gnss_sem_map.sensor_log.conventions import SensorConventions
 
@@ -64,38 +64,22 @@ MOST_DIGITS = 19
 MOST_NEGATIVE = 0.1
 """Largest share of intensities below zero; of coordinates that are taken for them it is larger."""
 STAMPS = "stamps.csv"
-FORMAT, SIGNS = "table", "imu.csv and gnss.csv (CSV log)"
+FORMAT, SIGNS = "table", "imu.csv and gnss.csv, or lidar/stamps.csv (CSV log)"
 
 
 def is_drive(drive: Path) -> bool:
     """Whether a folder looks like a CSV log."""
-    return is_file(drive / "imu.csv") or is_file(drive / "gnss.csv")
+    return any(is_file(drive / name) for name in ("imu.csv", "gnss.csv", f"lidar/{STAMPS}"))
 
 
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
-    """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
+    """Open a CSV log; raises DataError when a table is malformed or empty, and skips those that are missing."""
     about = read_log_yaml(drive / "log.yaml")
-    imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
-    imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
-    check_date(float(imu.stamps[-1]), about.epoch_ns, shown(drive / "imu.csv"))
-    gnss_rows, fix_skips = _fix_rows(drive, about, imu.stamps)
-    frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
-    gnss, gnss_repairs, no_covariance = fixes_of(gnss_rows, frame)
-    velocities, velocity_repairs = velocities_of(gnss_rows, frame)
-    with _as_data_error():
-        headings, heading_repairs = headings_of(gnss_rows, frame, about.baseline)
-    cleaned = {"imu.csv": (imu_repairs,), "gnss.csv": (gnss_repairs, velocity_repairs, heading_repairs)}
-    skips = [
-        Skip("samples", shown(drive / name), str(repairs))
-        for name, all_repairs in cleaned.items()
-        for repairs in all_repairs
-        if repairs is not None and repairs.dropped
-    ]
-    if no_covariance:
-        said = f"{no_covariance} fixes: {NOT_DEFINITE}"
-        skips.append(Skip("covariance", shown(drive / "gnss.csv"), said, no_covariance))
+    imu, imu_skips = _imu(drive / "imu.csv", about)
+    receiver, fix_skips = _receiver(drive, about, None if imu is None else imu.stamps)
     wheels, wheel_skips = _wheels(drive / "wheels.csv")
-    points = _points(drive / "control_points.csv", frame)
+    frame = receiver.frame
+    points = None if frame is None else _points(drive / "control_points.csv", frame)
     lidars, scan_skips = _lidars(drive, about)
     calibration = calibration_of(about, drive / "log.yaml")
     images, image_skips = _images(drive / "images", list(about.cameras), calibration.cameras)
@@ -109,20 +93,43 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         images=images,
         frame=frame,
         imu=imu,
-        gnss=gnss,
-        velocities=velocities,
-        headings=headings,
+        gnss=receiver.gnss,
+        velocities=receiver.velocities,
+        headings=receiver.headings,
         points=points,
         wheels=wheels,
         imu_noise=about.imu_noise,
         imu_sample_instant=about.imu_sample_instant,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
         conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
-        skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
+        skips=(*imu_skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
 
 
-def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, list[Skip]]:
+def _imu(path: Path, about: LogFile) -> tuple[ImuSamples | None, list[Skip]]:
+    if not is_file(path):
+        return None, [_missing(path, IMU_COLUMNS)]
+    rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    imu, repairs = clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+    check_date(float(imu.stamps[-1]), about.epoch_ns, shown(path))
+    return imu, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
+
+
+def _receiver(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Receiver, list[Skip]]:
+    path = drive / "gnss.csv"
+    if about.gnss_file is None and not is_file(path):
+        return Receiver(), [_missing(path, GNSS_COLUMNS)]
+    rows, skips = _fix_rows(drive, about, imu_stamps)
+    with _as_data_error():
+        found, lost = measured(rows, shown(path), about.baseline)
+    return found, [*lost, *skips]
+
+
+def _missing(path: Path, columns: tuple[str, ...]) -> Skip:
+    return Skip(SENSOR, shown(path), f"missing; expected a table with columns {','.join(columns)}")
+
+
+def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Array, list[Skip]]:
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     path, skips = drive / "gnss.csv", []
     if about.gnss_file is None:
@@ -131,8 +138,11 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, li
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
     else:
         path = drive / about.gnss_file.path
-        span_ns = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
-        found = read_gnss_file(about.gnss_file, drive, about.epoch_ns, (int(span_ns[0]), int(span_ns[1])))
+        span_ns = None
+        if imu_stamps is not None:
+            first, last = about.epoch_ns + np.round(imu_stamps[[0, -1]] * 1e9).astype(np.int64)
+            span_ns = int(first), int(last)
+        found = read_gnss_file(about.gnss_file, drive, about.epoch_ns, span_ns)
         given, skips = found.rows, found.skips
     with _as_data_error():
         rows, invalid = fix_rows(given, shown(path))

@@ -152,15 +152,16 @@ def _read_compensated(path: Path, state: frames.State | None) -> Points:
 
 
 def read_table(path: Path, columns: int) -> Array:
-    """Rows (n, columns) of numbers; raises DataError, with the line, for anything else."""
+    """Rows (n, columns) of numbers, without comments; raises DataError, with the line, for anything else."""
     if not is_file(path):
         raise DataError(f"{shown(path)}: missing; expected one line of {columns} numbers per frame")
     rows = []
     for number, line in enumerate(read_lines(path), 1):
-        if not line.strip():
+        words = line.partition("#")[0].split()
+        if not words:
             continue
         try:
-            row = [float(word) for word in line.split()]
+            row = [float(word) for word in words]
         except ValueError:
             row = []
         if len(row) != columns or not np.isfinite(row).all():

@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 from factor_graphs.alignment import AttitudePrior
 from factor_graphs.csv_log import NOT_DEFINITE
 from factor_graphs.errors import MeasurementError
-from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import AntennaHeadings, GnssFixes, GnssVelocities, ImuSamples, clean_imu
+from factor_graphs.measurements import ImuSamples, clean_imu
 from factor_graphs.position_covariances import split_covariances
-from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
+from factor_graphs.receiver_rows import with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
+from gnss_sem_map.datasets.receiver import Receiver, measured
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
@@ -59,23 +59,17 @@ def is_drive(drive: Path) -> bool:
 
 
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
-    """Open a bag; raises DataError for a bag that is damaged, and for sensors that are missing or not unique.
+    """Open a bag; raises DataError for a bag that is damaged, and for sensors that are not unique.
 
     Without `with_imu`, only the first and last message of the IMU are read.
     """
     bag, file = Bag(drive), rig_file(drive)
     rig = roles.completed(bag, Rig() if file is None else read_rig(file))
-    if rig.imu is None or rig.gnss is None:
-        raise roles.nothing_taken(bag, rig)
-    imu = bag.messages(rig.imu.topic)
     lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
-    fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
-    epoch_ns = int(fix_ns[0])
-    gnss, velocities, frame, invalid = _usable(fixes, shown(drive))
-    skips += invalid
-    samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
-    headings = _headings(fixes, frame, rig.gnss, calibration.p_imu_antenna)
+    epoch_ns, receiver, skips = _receiver(bag, rig, file or drive, calibration.p_imu_antenna)
+    skips += roles.missing(bag, rig)
+    samples, attitude, imu_skips = _imu(bag, rig.imu, epoch_ns, with_imu)
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
@@ -92,13 +86,13 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         lidar=names[0],
         others=tuple(Lidar(*other) for other in others),
         images=images,
-        frame=frame,
+        frame=receiver.frame,
         imu=samples,
-        gnss=gnss,
-        velocities=velocities,
-        headings=headings,
-        imu_noise=rig.imu.noise,
-        imu_sample_instant=rig.imu.sample_instant,
+        gnss=receiver.gnss,
+        velocities=receiver.velocities,
+        headings=receiver.headings,
+        imu_noise=None if rig.imu is None else rig.imu.noise,
+        imu_sample_instant=None if rig.imu is None else rig.imu.sample_instant,
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
@@ -106,12 +100,41 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     )
 
 
+def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[int, Receiver, list[Skip]]:
+    """The epoch of the log, what its receiver measured, and the skipped fixes; `place`: rig.yaml, or the bag."""
+    if rig.gnss is None:
+        return _first_ns(bag, rig), Receiver(), []
+    fixes, fix_ns, skips = _fixes(bag, rig.gnss, place.parent, rig.imu)
+    where, second = shown(bag.path), rig.gnss.p_imu_antenna2
+    valid, invalid = valid_fixes(fixes[:, 0], fixes[:, 1:4], fixes[:, 4:7])
+    if not valid.any():
+        raise DataError(
+            f"{where}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
+        )
+    skips += [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
+    try:
+        baseline = None if second is None else np.subtract(second, p_imu_antenna)
+        found, lost = measured(fixes[valid], where, baseline)
+    except MeasurementError as error:
+        raise DataError(f"rig.yaml: gnss: {error}") from None
+    return int(fix_ns[0]), found, skips + lost
+
+
+def _first_ns(bag: Bag, rig: Rig) -> int:
+    """The first moment of the first sensor there is, Unix ns; raises DataError without any."""
+    sensor = rig.imu or next(iter(rig.lidars.values()), None)
+    if sensor is None:
+        raise DataError(f"{shown(bag.path)}: found no topic of an IMU, a receiver or a LiDAR")
+    said, believed, _ = stamps_of(bag, bag.messages(sensor.topic), sensor.stamps)
+    return int(said[believed][0]) if believed.any() else 0
+
+
 def _fixes(
-    bag: Bag, about: GnssTopic, folder: Path, imu: Messages, clock: Clock
+    bag: Bag, about: GnssTopic, folder: Path, imu: ImuTopic | None
 ) -> tuple[Array, NDArray[np.int64], list[Skip]]:
     """Rows (n, 18) as `receiver_rows.ROW_COLUMNS`; their Unix times; and the skipped fixes."""
     if about.file is not None:
-        drive_ns = _span_ns(bag, imu, clock)
+        drive_ns = None if imu is None else _span_ns(bag, bag.messages(imu.topic), imu.stamps)
         found = read_gnss_file(about.file, folder, None, drive_ns)
         return found.rows, found.stamps_ns, found.skips
     assert about.topic is not None
@@ -150,36 +173,6 @@ def _fixes(
     return with_more(table, correlations=correlations), ns, skips
 
 
-def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, LocalFrame, list[Skip]]:
-    """The valid fixes of rows as `_fixes` makes them, in the local frame at the first one, and the skipped ones."""
-    valid, invalid = valid_fixes(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
-    if not valid.any():
-        raise DataError(
-            f"{where}: not one of {len(rows)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
-        )
-    rows = rows[valid]
-    frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
-    gnss, repairs, no_covariance = fixes_of(rows, frame)
-    velocities, _ = velocities_of(rows, frame)
-    skips = [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
-    if repairs.dropped:
-        skips.append(Skip("samples", where, str(repairs)))
-    if no_covariance:
-        skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
-    return gnss, velocities, frame, skips
-
-
-def _headings(
-    rows: Array, frame: LocalFrame, about: GnssTopic, p_imu_antenna: Array
-) -> AntennaHeadings | None:
-    """Headings in a file of positions."""
-    second = about.p_imu_antenna2
-    try:
-        return headings_of(rows, frame, None if second is None else np.subtract(second, p_imu_antenna))[0]
-    except MeasurementError as error:
-        raise DataError(f"rig.yaml: gnss: {error}") from None
-
-
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:
     """First and last moment of a topic, Unix ns."""
     if len(messages) == 0:
@@ -190,8 +183,11 @@ def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | No
 
 
 def _imu(
-    bag: Bag, about: ImuTopic, messages: Messages, epoch_ns: int, with_all: bool
-) -> tuple[ImuSamples, AttitudePrior | None, list[Skip]]:
+    bag: Bag, about: ImuTopic | None, epoch_ns: int, with_all: bool
+) -> tuple[ImuSamples | None, AttitudePrior | None, list[Skip]]:
+    if about is None:
+        return None, None, []
+    messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
     rows, attitude = [], None
     for k in np.flatnonzero(believed).tolist():

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import SHARES, coverage, errors, pose_nees, relative_error
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map import config
+from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.datasets.label_files import (
     label_files,
     read_confidence,
@@ -27,13 +27,12 @@ from gnss_sem_map.evaluation import metrics
 from gnss_sem_map.files.ownership import amend
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.files.structured import read_json
-from gnss_sem_map.files.untrusted import is_file, is_folder, read_lines, shown
+from gnss_sem_map.files.untrusted import is_file, is_folder, shown
 from gnss_sem_map.files.work_folder import DRIVES
 from gnss_sem_map.labels.label_set import LabelSet, open_label_set
 from gnss_sem_map.machine import threads
 from gnss_sem_map.scans.prefetch import prefetch
 
-LARGEST = 1e12
 """Largest stamp in s and length in m."""
 
 FARTHEST_M = 1e4
@@ -253,22 +252,3 @@ def _aligned_rms(points: NDArray[np.float64], reference: NDArray[np.float64]) ->
     proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rest = fixed - moved @ (u @ proper @ vt).T
     return float(np.sqrt((rest**2).sum(axis=1).mean()))
-
-
-def read_tum(path: Path) -> Trajectory:
-    """Read `stamp tx ty tz qx qy qz qw`; raises DataError for anything else."""
-    lines = [line.split("#")[0] for line in read_lines(path)]
-    try:
-        rows = np.array([[float(word) for word in line.split()] for line in lines if line.strip()])
-    except ValueError as error:
-        raise DataError(f"{shown(path)}: {str(error)[:100]}; expected eight numbers per line") from None
-    if rows.ndim != 2 or rows.shape[1] != 8 or not (np.abs(rows) <= LARGEST).all():
-        raise DataError(f"{shown(path)}: found {rows.shape} numbers, expected eight finite ones per line")
-    if not np.allclose((rows[:, 4:] ** 2).sum(axis=1), 1, atol=2e-2):
-        raise DataError(
-            f"{shown(path)}: found quaternions that are no rotation, expected qx qy qz qw of length one"
-        )
-    T_map_imu = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_map_imu[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    T_map_imu[:, :3, 3] = rows[:, 1:4]
-    return Trajectory(rows[:, 0], T_map_imu)

@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
+from gnss_sem_map.datasets.gnss_files.sbet import FRD_OF_FLU, NED_OF_ENU
 from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, WEEK_NS, gps_of_utc_ns
 from gnss_sem_map.files.atomic import replacing
 
 Array = NDArray[np.float64]
 
-NED_OF_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-FRD_OF_FLU = np.diag([1.0, -1.0, -1.0])
 STEP_S = 0.1
 """Between the rows of the table."""
 COLUMNS = (

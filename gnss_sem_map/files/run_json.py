@@ -25,7 +25,7 @@ def inputs_of(out: Path) -> dict[str, str]:
     inputs = read_run(out).get("inputs", {})
     if not isinstance(inputs, dict):
         raise DataError(f"{shown(out / 'run.json')}: damaged (inputs: found {type(inputs).__name__})")
-    names = ("drive", "segmenter", "frames", "drive_format")
+    names = ("drive", "segmenter", "frames", "drive_format", "trajectory")
     found = {name: inputs[name] for name in names if inputs.get(name) is not None}
     wrong = [name for name, value in found.items() if not isinstance(value, str) or not value]
     if wrong:

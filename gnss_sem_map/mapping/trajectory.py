@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.given_poses import held_by
 from factor_graphs.relative_poses import RelativePoses
 from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.trajectory import Trajectory
@@ -45,7 +46,7 @@ class DriveTrajectory:
     solution: Solution | None = None
     """Solution of the smoother; None if the drive has poses."""
     without_lidar: Trajectory | None = None
-    """The estimate from GNSS and IMU alone; None if LiDAR odometry was not used."""
+    """The estimate from GNSS and IMU alone, or the given poses; None if LiDAR odometry was not used."""
     from_lidar_odometry: bool = False
     """Whether nearly all scans were matched, so that static objects are not blurred in the map."""
     alone: Trajectory | None = None
@@ -77,24 +78,27 @@ def locate(
 ) -> DriveTrajectory:
     """The poses of the drive if it has some; else GNSS and IMU smoothed, then again with relative poses of its scans.
 
+    Given poses that are measurements (see `matches_scans`) are smoothed with the relative poses, too.
+
     `first` is the result of `smooth_log` for this log, if it is known already. `match` does the LiDAR odometry, by
     default `match_scans` in this process. If not `bound`, places that are passed again stay as they are; else they are
     registered by threads of this process, or as `registrar_of` says. `saved`: the folder of sweeps that `match` saves.
     """
-    if log.given is not None:
+    with_lidar = matches_scans(log, settings)
+    if log.given is not None and not with_lidar:
         return DriveTrajectory(log.given)
     log = log.in_our_conventions(settings.sensors)
-    with_lidar = settings.trajectory.lidar_odometry and bool(log.scans)
+    if log.given is not None:
+        matches, is_sharp = _matched(log, log.given, settings, stats, progress, match)
+        chosen = settings.trajectory
+        stddevs = np.radians(chosen.given_stddev_deg), chosen.given_stddev_m
+        held = held_by(log.given, matches.relative_poses, stddevs, chosen.drift_correlation_time_s)
+        return DriveTrajectory(held, without_lidar=log.given, from_lidar_odometry=is_sharp)
     found = first if first is not None else smooth_log(log, _plain(settings.trajectory, with_lidar))
     from_lidar_odometry, without_lidar, sweeps = False, None, None
     if with_lidar:
         sweeps = sweeps_along(log, found.trajectory, saved)
-        matches = (match or _in_this_process)(log, found.trajectory, settings, progress)
-        release_memory()  # of the local map
-        stats.counts.update(matches.counts)
-        # a scan that cannot be used at all is reported when the map is built
-        stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
-        from_lidar_odometry = matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
+        matches, from_lidar_odometry = _matched(log, found.trajectory, settings, stats, progress, match)
         if len(matches.relative_poses):
             without_lidar = found.trajectory
             found = smooth_log(log, settings.trajectory, matches.relative_poses)
@@ -103,6 +107,30 @@ def locate(
     stats.warnings.extend(found.notes)
     located = DriveTrajectory(found.trajectory, found, without_lidar, from_lidar_odometry, sweeps=sweeps)
     return _bound(located, log, settings, stats, registrar_of) if bound else located
+
+
+def matches_scans(log: SensorLog, settings: Settings) -> bool:
+    """Whether LiDAR odometry has a part in the trajectory: it has none in given poses, unless they are measurements."""
+    chosen = settings.trajectory
+    is_open = log.given is None or chosen.given_poses == "measured"
+    return is_open and chosen.lidar_odometry and bool(log.scans)
+
+
+def _matched(
+    log: SensorLog,
+    trajectory: Trajectory,
+    settings: Settings,
+    stats: RunStats,
+    progress: Progress,
+    match: Matcher | None,
+) -> tuple[ScanMatches, bool]:
+    """The matches of the scans, and whether nearly all of them have one."""
+    matches = (match or _in_this_process)(log, trajectory, settings, progress)
+    release_memory()  # of the local map
+    stats.counts.update(matches.counts)
+    # a scan that cannot be used at all is reported when the map is built
+    stats.skips.extend(skip for skip in matches.skips if skip.what == "scan matching")
+    return matches, matches.counts["scans matched"] >= MATCHED_SHARE * len(log.scans)
 
 
 def _plain(settings: TrajectorySettings, with_lidar: bool) -> TrajectorySettings:

@@ -82,6 +82,7 @@ def run(
     frames: str | None = None,
     drive_format: str | None = None,
     device: str = "auto",
+    trajectory: Path | str | None = None,
     origin: LocalFrame | None = None,
     workers: int = 1,
     scheduler: str | None = None,
@@ -93,12 +94,13 @@ def run(
     """Map one drive into a run folder, as `gnss-sem-map run` does.
 
     `segmenter` is `labels:FOLDER`, `refinenet:FILE`, ..., or `none` for geometry only, and `{drive}` in it the name of
-    the drive; `frames` is `A:B`; `log` is what these open, if it is open already. The scans are shared among `workers`
+    the drive; `frames` is `A:B`; `trajectory` is a file of poses in place of the drive's own; `log` is what these
+    open, if it is open already. The scans are shared among `workers`
     processes, or the workers of the Dask scheduler at the address `scheduler`. Raises PreflightError where the drive
     looks wrong (see `force`), DataError, ConfigError, and what the smoother raises.
     """
     drive, out, settings = Path(drive), Path(out), settings or Settings()
-    source = source_of(drive, segmenter, frames, drive_format, device)
+    source = source_of(drive, segmenter, frames, drive_format, device, trajectory)
     places = run_folder.places_read([source], settings)
     with run_folder.claimed_run(out, places, is_resumable=True) as claim:
         log = log or source.open_log()
@@ -330,7 +332,10 @@ class Run:
         inputs = inputs_of(self.folder)
         if place is None and "drive" not in inputs:
             raise DataError(f"{shown(self.folder)}: its run.json names no drive")
-        log = open_drive(place or inputs["drive"], inputs.get("drive_format")).between(inputs.get("frames"))
+        # as it was read, and maybe held by LiDAR odometry; its file may be gone
+        poses = self.folder / "trajectory.parquet" if "trajectory" in inputs else None
+        log = open_drive(place or inputs["drive"], inputs.get("drive_format"), trajectory=poses)
+        log = log.between(inputs.get("frames"))
         return log.in_our_conventions(self.settings.sensors)
 
     @property

@@ -55,7 +55,7 @@ LONGEST_GAP_S = 3.0
 
 @dataclass(frozen=True)
 class HowMapped:
-    """What is the same for all drives; `{drive}` in the segmenter stands for the name of the drive."""
+    """What is the same for all drives; `{drive}` in segmenter and trajectory stands for the name of the drive."""
 
     segmenter: str | None = "none"
     frames: str | None = None
@@ -63,10 +63,11 @@ class HowMapped:
     device: str = "auto"
     force: bool = False
     resume: bool = False
+    trajectory: Path | str | None = None
 
     def source(self, drive: Path) -> Source:
         """What the run of this drive reads."""
-        return source_of(drive, self.segmenter, self.frames, self.drive_format, self.device)
+        return source_of(drive, self.segmenter, self.frames, self.drive_format, self.device, self.trajectory)
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,9 @@ def run_drives(
     A drive that fails, or whose worker dies three times, is left out, and named in run.json. Raises DataError when all
     fail, when two drives have one name or are the same, or the first has no georeference.
     """
-    frame = frame_of_all(drives, settings, how.drive_format, origin)
     drives = [_absolute(drive) for drive in drives]
     sources = [how.source(drive) for drive in drives]
+    frame = frame_of_all(sources, settings, origin)
     places = run_folder.places_read(sources, settings)
     with ExitStack() as held:
         claim = held.enter_context(run_folder.claimed_run(out, [*places, align_to], is_resumable=True))
@@ -149,17 +150,14 @@ def _bound_and_mapped(
             return bound, failed
 
 
-def frame_of_all(
-    drives: Sequence[Path], settings: Settings, drive_format: str | None, origin: LocalFrame | None
-) -> LocalFrame:
+def frame_of_all(sources: Sequence[Source], settings: Settings, origin: LocalFrame | None) -> LocalFrame:
     """The frame of the map of several drives, `origin` if it is given.
 
     Raises DataError and ConfigError as `run_drives` does: for two drives of one name, and a map without a georeference
     or that cannot be delivered.
     """
-    drives = [_absolute(drive) for drive in drives]
-    _check_distinct([(drive.name, drive) for drive in drives])
-    frame = origin or _frame_of(drives, drive_format)
+    _check_distinct([(source.name, Path(source.drive)) for source in sources])
+    frame = origin or _frame_of(sources)
     Georeference.of(frame, settings.delivery)
     return frame
 
@@ -267,7 +265,7 @@ def _source_of(name: str, folder: Path) -> Source:
     inputs = inputs_of(folder)
     drive = str(inputs.get("drive", folder / name))
     segmenter, frames, drive_format = (inputs.get(key) for key in ("segmenter", "frames", "drive_format"))
-    return Source(drive, segmenter, frames, drive_format, called=name)
+    return Source(drive, segmenter, frames, drive_format, called=name, trajectory=inputs.get("trajectory"))
 
 
 def _is_of(folder: Path, source: Source) -> bool:
@@ -366,17 +364,17 @@ def _check_distinct(drives: Sequence[tuple[str, Path]]) -> None:
         places[place] = name
 
 
-def _frame_of(drives: Sequence[Path], drive_format: str | None) -> LocalFrame:
+def _frame_of(sources: Sequence[Source]) -> LocalFrame:
     """The frame of the first drive that can be read and has one."""
-    for drive in drives:
+    for one in sources:
         try:
-            frame = open_drive(drive, drive_format, with_imu=False).frame
+            frame = open_drive(one.drive, one.drive_format, with_imu=False, trajectory=one.trajectory).frame
         except (SemMapError, FactorGraphError, OSError):
             continue  # its own task says why
         if frame is not None:
             return frame
     raise DataError(
-        f"{drives[0]}: neither it nor another drive has a georeference; expected drives with GNSS"
+        f"{sources[0].drive}: neither it nor another drive has a georeference; expected drives with GNSS"
     )
 
 

@@ -90,7 +90,8 @@ def places_read(
     """All inputs of a run that are known before its drives are opened; without settings, those of the output count."""
     specs = [(source.segmenter or "").partition(":")[2].partition("?")[0] or None for source in sources]
     named = [] if settings is None else settings.files
-    return [*(source.drive for source in sources), *specs, *named, config]
+    drives = [place for source in sources for place in (source.drive, source.trajectory)]
+    return [*drives, *specs, *named, config]
 
 
 def write_run(

@@ -26,6 +26,8 @@ class Source:
     device: str = "auto"
     called: str = ""
     """The name of the drive, where its folder has another one now: it was given as a link."""
+    trajectory: str | None = None
+    """A file of poses in place of the drive's own."""
 
     @property
     def name(self) -> str:
@@ -45,11 +47,12 @@ class Source:
             "segmenter": self.segmenter,
             "frames": self.frames,
             "drive_format": self.drive_format,
+            **({} if self.trajectory is None else {"trajectory": self.trajectory}),
         }
 
     def open_log(self, with_imu: bool = True) -> SensorLog:
         """The log, with the scans of `frames`; raises DataError and ConfigError."""
-        return open_drive(self.drive, self.drive_format, with_imu).between(self.frames)
+        return open_drive(self.drive, self.drive_format, with_imu, self.trajectory).between(self.frames)
 
     def open_network(self, settings: Settings, log: SensorLog) -> Segmenter | None:
         """The segmenter for the images of this log; None for geometry only. Raises DataError and ConfigError."""
@@ -65,11 +68,14 @@ def source_of(
     frames: str | None = None,
     drive_format: str | None = None,
     device: str = "auto",
+    trajectory: Path | str | None = None,
 ) -> Source:
-    """The source of a run; `{drive}` in the SPEC stands for the name of the drive."""
+    """The source of a run; `{drive}` in the SPEC and in `trajectory` stands for the name of the drive."""
     folder = os.path.abspath(drive)
-    spec = None if segmenter is None else absolute(segmenter.replace("{drive}", Path(folder).name))
-    return Source(folder, spec, frames, drive_format, device)
+    name = Path(folder).name
+    spec = None if segmenter is None else absolute(segmenter.replace("{drive}", name))
+    poses = None if trajectory is None else os.path.abspath(str(trajectory).replace("{drive}", name))
+    return Source(folder, spec, frames, drive_format, device, trajectory=poses)
 
 
 def absolute(segmenter: str) -> str:

@@ -17,6 +17,7 @@ from functools import partial, reduce
 from itertools import chain, pairwise
 from operator import add
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import small_gicp
@@ -92,6 +93,12 @@ class TrajectorySettings(SmootherSettings):
     lidar_odometry: bool = Field(
         True, description="Add relative poses from LiDAR odometry to the factor graph."
     )
+    given_poses: Literal["fixed", "measured"] = Field(
+        "fixed",
+        description="Poses of --trajectory, or of the drive: as they are, or measurements beside LiDAR odometry.",
+    )
+    given_stddev_m: float = Field(0.1, gt=0, description="Of measured poses without a covariance.")
+    given_stddev_deg: float = Field(0.1, gt=0, description="Likewise, of their rotations.")
     scan_matching: ScanMatchingSettings = Field(ScanMatchingSettings(), description="Sweep to local map.")
     revisits: RevisitSettings = Field(RevisitSettings(), description="Places that are passed again.")
 

@@ -178,6 +178,8 @@ class Skip:
     """Number of frames, rows or files."""
 
 
+SENSOR = "sensor"
+"""`what` of the skip that says that a drive lacks its IMU or its receiver."""
 POSE_OF_LIDAR = "pose of the LiDAR"
 """`what` of the skip that says that a drive does not give it."""
 
@@ -215,7 +217,9 @@ class SensorLog:
     attitude_of_unit: bool = False
     """Whether that is of the unit's own axes, as its samples are, and not of ours."""
     given: Trajectory | None = None
-    """Poses given with the drive; if present, there is no smoothing."""
+    """Poses given with the drive, or in place of its own; if present, there is no smoothing."""
+    given_how: str = ""
+    """From where, on which clock and in which frame they were given in place of the drive's own; empty: they are."""
     reference: Trajectory | None = None
     """Poses by the drive's own navigation system, for comparison; never used as input."""
     skips: tuple[Skip, ...] = ()
@@ -246,8 +250,14 @@ class SensorLog:
                 raise DataError(
                     f"{self.name}: stamps of the {what} do not increase; sort and remove repeats first"
                 )
+
+    def check_located(self) -> None:
+        """Raise DataError when neither poses nor IMU with GNSS say where the vehicle was."""
         if self.given is None and (self.imu is None or self.gnss is None):
-            raise DataError(f"{self.name}: found neither poses nor IMU with GNSS; expected one of them")
+            lost = next((f"{skip.where}: {skip.reason}" for skip in self.skips if skip.what == SENSOR), None)
+            raise DataError(
+                lost or f"{self.name}: found neither poses nor IMU with GNSS; expected one of them"
+            )
 
     @property
     def folders(self) -> set[Path]:
@@ -267,7 +277,7 @@ class SensorLog:
         low, high = int(first or 0), int(last) if last else float("inf")
         if low >= high:
             raise ConfigError(f"frames: found {frames!r}, expected A:B with A below B")
-        return self._with_scans(lambda scans: tuple(scan for scan in scans if low <= scan.number < high))
+        return self.with_scans(lambda scans: tuple(scan for scan in scans if low <= scan.number < high))
 
     def in_our_conventions(self, chosen: SensorConventions) -> SensorLog:
         """The same log in our axes, units and clock; chosen conventions have priority over those of the drive."""
@@ -279,7 +289,7 @@ class SensorLog:
         if attitude is not None and self.attitude_of_unit:
             attitude = theirs.attitude_in_ours(attitude)
         late = (
-            self._with_scans(lambda scans: tuple(_later(scan, offset) for scan in scans)) if offset else self
+            self.with_scans(lambda scans: tuple(_later(scan, offset) for scan in scans)) if offset else self
         )
         return replace(
             late,
@@ -293,7 +303,8 @@ class SensorLog:
             conventions=None,
         )
 
-    def _with_scans(self, change: Callable[[tuple[Scan, ...]], tuple[Scan, ...]]) -> SensorLog:
+    def with_scans(self, change: Callable[[tuple[Scan, ...]], tuple[Scan, ...]]) -> SensorLog:
+        """The same log with what `change` makes of the scans of each LiDAR."""
         others = tuple(replace(lidar, scans=change(lidar.scans)) for lidar in self.others)
         return replace(self, scans=change(self.scans), others=others)
 

@@ -14,8 +14,11 @@ import street
 from faults import mutations
 from faults.fuzzing import Reader
 
+from factor_graphs.trajectory import Trajectory
+from factor_graphs.tum import write_tum
 from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.export.navigation import write_sbet
 from gnss_sem_map.labels import label_set, sensor_model
 from gnss_sem_map.voxels import tiles
 from gnss_sem_map.voxels.map_json import read_frame
@@ -136,12 +139,27 @@ def point_labels(folder: Path) -> Reader:
 
 def tum(folder: Path) -> Reader:
     """A trajectory in TUM format."""
-    from gnss_sem_map.evaluation.score_run import read_tum
+    from gnss_sem_map.datasets.given_trajectory import read_tum
 
     folder.mkdir(parents=True)
     file = folder / "t.tum"
     file.write_text("".join(f"{k * 0.1:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
     return Reader(file, lambda: read_tum(file), mutations.text)
+
+
+def given(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
+    """Poses in a file of their own, with the log that they belong to."""
+    this = small_street(folder / "street")
+    drive, file = street.write_table_log(folder, this), folder / name
+    stamps = np.arange(0.0, 0.4, 0.02)
+    poses = Trajectory(stamps, this.motion.poses(stamps), covariances=np.tile(np.eye(6), (len(stamps), 1, 1)))
+    epoch_ns = int(street.EPOCH.astype(np.int64))
+    write = {".tum": write_tum, ".parquet": Trajectory.save}.get(file.suffix)
+    if write is None:
+        write_sbet(poses, street.FRAME, epoch_ns, file)
+    else:
+        write(poses, file)
+    return Reader(file, lambda: open_drive(drive, trajectory=file), mutate)
 
 
 def settings(folder: Path) -> Reader:
@@ -339,6 +357,9 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "probabilities": probabilities,
     "point labels": point_labels,
     "TUM": tum,
+    "poses in TUM": functools.partial(given, "poses.tum", mutations.text),
+    "poses in Parquet": functools.partial(given, "poses.parquet", mutations.parquet),
+    "poses in SBET": functools.partial(given, "poses.sbet", mutations.floats),
     "settings": settings,
     "--set": one_setting,
     "segmenter": segmenter,

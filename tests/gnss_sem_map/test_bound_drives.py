@@ -20,8 +20,8 @@ from factor_graphs.geodesy import LocalFrame
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.config import Settings
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.files.run_json import read_run
 from gnss_sem_map.mapping import passes
 from gnss_sem_map.mapping.trajectory import locate

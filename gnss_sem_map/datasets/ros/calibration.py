@@ -22,11 +22,8 @@ Array = NDArray[np.float64]
 
 def calibration_of(bag: Bag, rig: Rig) -> tuple[Calibration, list[Skip]]:
     """Poses of the sensors and the camera's intrinsics; raises DataError for one that is nowhere."""
-    assert rig.imu is not None
-    assert rig.gnss is not None
-    transforms = read_static_transforms(bag)
-    imu = rig.imu.frame or _frame_in(bag, rig.imu.topic)
-    antenna, skips = _antenna(bag, rig.gnss, imu, transforms)
+    transforms, imu = read_static_transforms(bag), _body(bag, rig)
+    antenna, skips = (np.zeros(3), []) if rig.gnss is None else _antenna(bag, rig.gnss, imu, transforms)
     if not rig.lidars:
         return Calibration(np.eye(4), p_imu_antenna=antenna), skips
     lidar = next(iter(rig.lidars.values()))
@@ -58,13 +55,17 @@ def lidar_pose(bag: Bag, lidar: LidarTopic, imu: str, transforms: StaticTransfor
 
 def other_poses(bag: Bag, rig: Rig) -> list[Array]:
     """T_imu_lidar (4, 4) of every LiDAR but the first, which is in the calibration."""
-    assert rig.imu is not None
     lidars = list(rig.lidars.values())[1:]
     if not lidars:
         return []
-    transforms = read_static_transforms(bag)
-    imu = rig.imu.frame or _frame_in(bag, rig.imu.topic)
+    transforms, imu = read_static_transforms(bag), _body(bag, rig)
     return [lidar_pose(bag, lidar, imu, transforms) for lidar in lidars]
+
+
+def _body(bag: Bag, rig: Rig) -> str:
+    """The frame whose poses make the trajectory: that of the IMU, or without one of the first LiDAR."""
+    body = rig.imu or next(iter(rig.lidars.values()), None)
+    return "" if body is None else body.frame or _frame_in(bag, body.topic)
 
 
 def _frame_in(bag: Bag, topic: str) -> str:

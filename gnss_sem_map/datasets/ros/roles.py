@@ -9,6 +9,7 @@ from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
+from gnss_sem_map.sensor_log import SENSOR, Skip
 
 IMU, GNSS, INFO = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo"
 UNKNOWN_COVARIANCE, DIAGONAL_COVARIANCE = 0, 2
@@ -70,14 +71,16 @@ def info_beside(bag: Bag, topic: str) -> str | None:
     return infos[0] if len(infos) == 1 else None
 
 
-def nothing_taken(bag: Bag, rig: Rig) -> DataError:
-    """The error that there is no IMU or no receiver."""
+def missing(bag: Bag, rig: Rig) -> list[Skip]:
+    """That there is no IMU or no receiver."""
+    if rig.imu is not None and rig.gnss is not None:
+        return []
     what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
-    return DataError(
-        f"{shown(bag.path)}: found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file),"
-        " in rig.yaml"
+    reason = (
+        f"found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file), in rig.yaml"
     )
+    return [Skip(SENSOR, shown(bag.path), reason)]
 
 
 def _only(bag: Bag, sensor: str, key: str) -> str | None:

@@ -284,7 +284,7 @@ def _rotation_finding(
     if (np.abs(turn) <= np.maximum(SAME_RAD, SIGMAS * spread)).all():
         return green(NAME, found)
     given_inverse = float(Rotation.from_matrix(rotation @ R).magnitude())
-    is_given = sample.log.given is not None
+    is_given = sample.log.given is not None and not sample.log.given_how
     matrix = "Tr in calib.txt" if is_given else "T_imu_lidar"
     main = int(np.argmax(np.abs(turn)))
     level = red if angle > WRONG_RAD or np.abs(turn).max() > 2 * SAME_RAD[main] else amber

@@ -1,4 +1,4 @@
-"""Check of given poses against the dynamics of a vehicle."""
+"""Check of given poses against the dynamics of a vehicle, the gyroscope and the fixes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.given_poses import do_fit, misses, turns_seen
 from factor_graphs.trajectory import Trajectory
-from gnss_sem_map.evaluation.preflight.findings import Finding, amber, green, red
+from gnss_sem_map.evaluation.preflight.clocks import LEAP_S
+from gnss_sem_map.evaluation.preflight.findings import ONE_CLOCK, Finding, amber, green, red
+from gnss_sem_map.sensor_log import SensorLog
 
 Array = NDArray[np.float64]
 
@@ -20,17 +23,75 @@ HARDEST, POSE_NOISE_M = 15.0, 0.3
 # A vehicle drives where it looks, or backwards: so far, rad, it may look aside all the time.
 ASIDE = np.radians(45.0)
 DRIVING_MPS = 2.0
+# A clock that is off by less, s, is not told of: turns do not show it.
+NOTABLE_LATE_S = 0.1
+# A way that bends more than this between two poses, m, blurs a map.
+BENT_M = 0.05
 
 
-def check(given: Trajectory) -> Iterator[Finding]:
-    """Checks of jumps, speeds and turns, and whether the vehicle drives in the direction of its x axis."""
+def check(given: Trajectory, log: SensorLog) -> Iterator[Finding]:
+    """Checks of jumps, speeds and turns, of the direction of the x axis, and against gyroscope and fixes."""
+    if log.given_how:
+        yield green("Given poses", log.given_how)
+    yield from _with_gyroscope(given, log)
+    yield from _with_fixes(given, log)
     if len(given) < 3:
         yield green("Poses", f"{len(given)} poses: too few to judge")
         return
     steps, durations = np.diff(given.positions, axis=0), np.diff(given.stamps)
     yield _jumps(given, steps, durations)
+    if given.velocities is None:
+        yield _straight(steps, durations)
     yield _turns(given, durations)
     yield from _looks_ahead(given, steps, durations)
+
+
+def _with_gyroscope(given: Trajectory, log: SensorLog) -> Iterator[Finding]:
+    """The vehicle turns as its gyroscope says, and at the same time."""
+    seen = None if log.imu is None else turns_seen(given, log.imu, (-LEAP_S, LEAP_S))
+    if seen is None:
+        return
+    off, turning, then = np.degrees([seen.off, seen.turning, seen.off_then])
+    evidence = f"turns differ from the gyroscope's by {off:.2f} of {turning:.2f} °/s"
+    if not seen.is_known:
+        yield green("Poses with IMU", f"{evidence}: too little turning to judge")
+    elif seen.fits(seen.off_then) and abs(seen.late_s) >= NOTABLE_LATE_S and not seen.fits(2 * seen.off):
+        late = f"{abs(seen.late_s):.2f} s {'late' if seen.late_s > 0 else 'early'}"
+        system = ": GPS time and UTC" if abs(seen.late_s) == LEAP_S else ""
+        yield (amber if seen.fits(seen.off) else red)(
+            "Poses with IMU",
+            f"{evidence}, and by {then:.2f} with stamps {late}",
+            f"the stamps of the poses are {late}{system}",
+            ONE_CLOCK,
+        )
+    elif not seen.fits(seen.off):
+        yield red(
+            "Poses with IMU",
+            evidence,
+            "the poses are of another drive, or of a body with other axes than the IMU",
+            "give T_map_imu of this drive: x forward, y left, z up of its IMU",
+        )
+    else:
+        yield green("Poses with IMU", evidence)
+
+
+def _with_fixes(given: Trajectory, log: SensorLog) -> Iterator[Finding]:
+    """The antenna is where the fixes are."""
+    if log.gnss is None or log.frame is None:
+        return
+    off, claimed = misses(given, log.gnss, log.calibration.p_imu_antenna)
+    if not len(off):
+        return
+    evidence = f"the usual fix is {np.median(off):.2f} m off, and claims {np.median(claimed):.2f} m"
+    if do_fit(off, claimed):
+        yield green("Poses with GNSS", evidence)
+    else:
+        yield (amber if do_fit(off, 2 * claimed) else red)(
+            "Poses with GNSS",
+            evidence,
+            "the poses are of another drive, in another frame or scale, or the fixes are worse than they claim",
+            "give poses in metres of this drive, in its frame or any that is turned about up, and check p_imu_antenna",
+        )
 
 
 def _jumps(given: Trajectory, steps: Array, durations: Array) -> Finding:
@@ -54,19 +115,36 @@ def _jumps(given: Trajectory, steps: Array, durations: Array) -> Finding:
     if speeds[worst] > FASTEST:
         return red(
             "Poses",
-            f"{evidence}: a step of {sizes[worst]:.1f} m at {given.stamps[worst + 1]:.2f} s (pose {worst + 1})",
+            f"{evidence}: {_counted(speeds > FASTEST)}, the largest of {sizes[worst]:.1f} m at"
+            f" {given.stamps[worst + 1]:.2f} s (pose {worst + 1})",
             "the poses jump: a damaged row, or two drives in one file",
-            "correct or drop the poses after the jump (poses.txt)",
+            "correct or drop the poses after the jump",
         )
     if np.any(change > allowed):
         k = int(np.argmax(change - allowed)) + 1
         return amber(
             "Poses",
-            f"{evidence}; at {given.stamps[k]:.2f} s (pose {k}) the velocity changes by {change[k - 1]:.1f} m/s",
+            f"{evidence}; {_counted(change > allowed)}, the hardest at {given.stamps[k]:.2f} s (pose {k}), where the"
+            f" velocity changes by {change[k - 1]:.1f} m/s",
             "the poses jump there",
-            "correct the poses around it (poses.txt)",
+            "correct the poses around it",
         )
     return green("Poses", evidence)
+
+
+def _straight(steps: Array, durations: Array) -> Finding:
+    """How far a curve of constant acceleration is from the straight line between two poses: an eighth of its bend."""
+    bends = np.linalg.norm(np.diff(steps, axis=0), axis=1) / 8
+    bent, apart = float(np.quantile(bends, 0.9)), float(np.median(durations))
+    evidence = f"{apart:.3g} s apart, and between them up to {bent:.3f} m off the straight line (nine in ten)"
+    if bent > BENT_M:
+        return amber(
+            "Pose rate",
+            evidence,
+            "too few poses for such a motion, or noisy ones",
+            "give ten or more in a second",
+        )
+    return green("Pose rate", evidence)
 
 
 def _turns(given: Trajectory, durations: Array) -> Finding:
@@ -79,9 +157,14 @@ def _turns(given: Trajectory, durations: Array) -> Finding:
             "Pose turns",
             f"{evidence} at {given.stamps[worst + 1]:.2f} s (pose {worst + 1})",
             "the rotations jump: a damaged row, or rows that are not rotations",
-            "correct these poses (poses.txt)",
+            "correct these poses",
         )
     return green("Pose turns", evidence)
+
+
+def _counted(jumps: NDArray[np.bool_]) -> str:
+    count = int(jumps.sum())
+    return f"{count} jump{'' if count == 1 else 's'}"
 
 
 def _looks_ahead(given: Trajectory, steps: Array, durations: Array) -> Iterator[Finding]:
@@ -100,7 +183,7 @@ def _looks_ahead(given: Trajectory, steps: Array, durations: Array) -> Iterator[
             "Pose heading",
             evidence,
             "the rotations are of other axes: not x forward, y left, z up of the LiDAR",
-            "check the poses' frame and Tr in calib.txt",
+            "check the poses' frame (KITTI odometry: Tr in calib.txt)",
         )
     else:
         yield green("Pose heading", evidence)

@@ -46,7 +46,7 @@ def check(sample: Sample) -> Iterator[Finding]:
     """Where the fixes are, how they move, what they claim, and their clock; or the poses that are given."""
     log, found = sample.log, sample.fixes
     if log.given is not None:
-        yield from poses.check(log.given)
+        yield from poses.check(log.given, log)
         return
     if found is None or log.gnss is None or log.frame is None:
         return

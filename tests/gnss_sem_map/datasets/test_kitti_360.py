@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gnss_sem_map.datasets import detect_format, kitti_360, open_drive
+from gnss_sem_map.datasets.given_trajectory import read_tum
 from gnss_sem_map.errors import DataError
-from gnss_sem_map.evaluation.score_run import read_tum
 from gnss_sem_map.simulation import Simulation, prepare
 from gnss_sem_map.simulation.kitti_360_drive import write_kitti_360
 from gnss_sem_map.simulation.rigs import MountedCamera, MountedLidar, Rig

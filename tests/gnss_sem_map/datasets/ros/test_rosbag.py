@@ -205,3 +205,21 @@ def test_the_attitude_of_a_unit_with_axes_of_its_own_becomes_that_of_ours(
     np.testing.assert_allclose(ours.imu.specific_force @ R.T, in_map, atol=1e-9)
     turn = R.T @ unit.as_matrix()
     np.testing.assert_allclose(variances, np.diag(turn @ np.diag([0.01, 0.04, 0.09]) @ turn.T), atol=1e-9)
+
+
+def test_scans_alone_with_a_trajectory_in_unix_time(tmp_path: Path) -> None:
+    """Without an IMU the poses are those of the LiDAR."""
+    bag = ros.write(tmp_path / "drive", ros.drive(), keep=lambda message: message[0] == "/points")
+    with pytest.raises(DataError, match="found no topic of an IMU"):
+        open_drive(bag)
+    poses = [f"{ros.START_NS * 1e-9 + 0.1 * k:.6f} {k} 0 0 0 0 0 1" for k in range(15)]
+    (tmp_path / "poses.tum").write_text("\n".join(poses))
+    log = open_drive(bag, trajectory=tmp_path / "poses.tum")
+    assert log.epoch_ns == ros.START_NS
+    assert "Unix time" in log.given_how
+    assert log.frame is None
+    np.testing.assert_array_equal(log.calibration.T_imu_lidar, np.eye(4))
+    assert [scan.number for scan in log.scans] == list(range(8))
+    assert sum(skip.frames for skip in log.skips if skip.what == "scan") == 2
+    assert log.given is not None
+    np.testing.assert_allclose(log.given.at([0.55])[0, :3, 3], [5.5, 0, 0], atol=1e-5)

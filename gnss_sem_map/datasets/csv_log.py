@@ -44,7 +44,7 @@ from factor_graphs.csv_log import (
 )
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
-from factor_graphs.measurements import WheelSpeeds, clean_imu, clean_wheels
+from factor_graphs.measurements import ImuSamples, Repairs, WheelSpeeds, clean_imu, clean_wheels
 from factor_graphs.receiver_rows import MORE_COLUMNS, fixes_of, headings_of, velocities_of
 from factor_graphs.surveyed_points import SurveyedPoints
 from gnss_sem_map.datasets import frames
@@ -75,8 +75,7 @@ def is_drive(drive: Path) -> bool:
 def read(drive: Path, with_imu: bool = True) -> SensorLog:
     """Open a CSV log; raises DataError when a table is missing, malformed or empty."""
     about = read_log_yaml(drive / "log.yaml")
-    imu_rows = _numbers(drive / "imu.csv", IMU_COLUMNS, LONGEST_IMU_STEP_S)
-    imu, imu_repairs = clean_imu(imu_rows[:, 0], imu_rows[:, 1:4], imu_rows[:, 4:7])
+    imu, imu_repairs = _imu(drive / "imu.csv")
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(drive / "imu.csv"))
     gnss_rows, fix_skips = _fix_rows(drive, about, imu.stamps)
     frame = LocalFrame(*(float(v) for v in gnss_rows[0, 1:4]))
@@ -117,9 +116,20 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu_noise=about.imu_noise,
         imu_sample_instant=about.imu_sample_instant,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
-        conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
+        conventions=about.conventions,
         skips=(*skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
+
+
+def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
+    """The samples of imu.csv and their conventions; nothing else need be there. Raises DataError."""
+    return _imu(drive / "imu.csv")[0], read_log_yaml(drive / "log.yaml").conventions
+
+
+def _imu(path: Path) -> tuple[ImuSamples, Repairs]:
+    rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S)
+    with _as_data_error():
+        return clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
 
 
 def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array) -> tuple[Array, list[Skip]]:

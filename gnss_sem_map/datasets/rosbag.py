@@ -63,8 +63,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 
     Without `with_imu`, only the first and last message of the IMU are read.
     """
-    bag, file = Bag(drive), rig_file(drive)
-    rig = roles.completed(bag, Rig() if file is None else read_rig(file))
+    bag, file, rig = _opened(drive)
     if rig.imu is None or rig.gnss is None:
         raise roles.nothing_taken(bag, rig)
     imu = bag.messages(rig.imu.topic)
@@ -101,9 +100,25 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu_sample_instant=rig.imu.sample_instant,
         initial_attitude=attitude,
         attitude_of_unit=True,
-        conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
+        conventions=rig.conventions,
         skips=(*lost, *skips, *imu_skips, *calibration_skips, *image_skips),
     )
+
+
+def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
+    """The samples of a bag's IMU and their conventions; it needs no other sensor. Raises DataError."""
+    bag, _, rig = _opened(drive)
+    if rig.imu is None:
+        raise roles.nothing_taken(bag, rig)
+    messages = bag.messages(rig.imu.topic)
+    first = _span_ns(bag, messages, rig.imu.stamps)
+    return _imu(bag, rig.imu, messages, 0 if first is None else first[0], True)[0], rig.conventions
+
+
+def _opened(drive: Path) -> tuple[Bag, Path | None, Rig]:
+    """The bag, its rig.yaml, if there is one, and the rig that it tells, completed."""
+    bag, file = Bag(drive), rig_file(drive)
+    return bag, file, roles.completed(bag, Rig() if file is None else read_rig(file))
 
 
 def _fixes(

@@ -24,7 +24,7 @@ from factor_graphs.position_covariances import split_covariances
 from factor_graphs.receiver_rows import fixes_of, headings_of, velocities_of, with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
-from gnss_sem_map.datasets.ros import clouds, pictures, roles
+from gnss_sem_map.datasets.ros import clouds, pictures, receiver_topics, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
@@ -70,11 +70,13 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
     lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
     fixes, fix_ns, skips = _fixes(bag, rig.gnss, (file or drive).parent, imu, rig.imu.stamps)
     epoch_ns = int(fix_ns[0])
-    gnss, velocities, frame, invalid = _usable(fixes, shown(drive))
+    gnss, rows, frame, invalid = _usable(fixes, shown(drive))
     skips += invalid
     samples, attitude, imu_skips = _imu(bag, rig.imu, imu, epoch_ns, with_imu)
     calibration, calibration_skips = calibration_of(bag, rig)
-    headings = _headings(fixes, frame, rig.gnss, calibration.p_imu_antenna)
+    velocities, headings, beside = _beside_fixes(
+        bag, rig.gnss, rows, frame, epoch_ns, calibration.p_imu_antenna
+    )
     scans: list[tuple[Scan, ...]] = []
     for one in rig.lidars.values():
         found, scan_skips = _scans(bag, one, epoch_ns)
@@ -101,7 +103,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         initial_attitude=attitude,
         attitude_of_unit=True,
         conventions=rig.conventions,
-        skips=(*lost, *skips, *imu_skips, *calibration_skips, *image_skips),
+        skips=(*lost, *skips, *beside, *imu_skips, *calibration_skips, *image_skips),
     )
 
 
@@ -165,8 +167,8 @@ def _fixes(
     return with_more(table, correlations=correlations), ns, skips
 
 
-def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, LocalFrame, list[Skip]]:
-    """The valid fixes of rows as `_fixes` makes them, in the local frame at the first one, and the skipped ones."""
+def _usable(rows: Array, where: str) -> tuple[GnssFixes, Array, LocalFrame, list[Skip]]:
+    """The valid fixes of rows as `_fixes` makes them, their rows, the local frame at the first one, and the skips."""
     valid, invalid = valid_fixes(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
     if not valid.any():
         raise DataError(
@@ -175,24 +177,35 @@ def _usable(rows: Array, where: str) -> tuple[GnssFixes, GnssVelocities | None, 
     rows = rows[valid]
     frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
     gnss, repairs, no_covariance = fixes_of(rows, frame)
-    velocities, _ = velocities_of(rows, frame)
     skips = [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
     if repairs.dropped:
         skips.append(Skip("samples", where, str(repairs)))
     if no_covariance:
         skips.append(Skip("covariance", where, f"{no_covariance} fixes: {NOT_DEFINITE}", no_covariance))
-    return gnss, velocities, frame, skips
+    return gnss, rows, frame, skips
 
 
-def _headings(
-    rows: Array, frame: LocalFrame, about: GnssTopic, p_imu_antenna: Array
-) -> AntennaHeadings | None:
-    """Headings in a file of positions."""
+def _beside_fixes(
+    bag: Bag, about: GnssTopic, rows: Array, frame: LocalFrame, epoch_ns: int, p_imu_antenna: Array
+) -> tuple[GnssVelocities | None, AntennaHeadings | None, list[Skip]]:
+    """Velocities and headings: those of topics of their own, else of the rows (n, 18) of the fixes; and the skips."""
+    skips: list[Skip] = []
+    of_velocity = of_heading = rows
+    if about.velocity is not None:
+        of_velocity, skips = receiver_topics.velocity_rows(bag, about.velocity, rows, epoch_ns)
+    if about.heading is not None:
+        of_heading, more = receiver_topics.heading_rows(bag, about.heading, rows, epoch_ns)
+        skips += more
     second = about.p_imu_antenna2
+    velocities, of_velocities = velocities_of(of_velocity, frame)
     try:
-        return headings_of(rows, frame, None if second is None else np.subtract(second, p_imu_antenna))[0]
+        headings, of_headings = headings_of(
+            of_heading, frame, None if second is None else np.subtract(second, p_imu_antenna)
+        )
     except MeasurementError as error:
         raise DataError(f"rig.yaml: gnss: {error}") from None
+    dropped = [one for one in (of_velocities, of_headings) if one is not None and one.dropped]
+    return velocities, headings, skips + [Skip("samples", shown(bag.path), str(one)) for one in dropped]
 
 
 def _span_ns(bag: Bag, messages: Messages, clock: Clock) -> tuple[int, int] | None:

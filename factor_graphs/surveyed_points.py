@@ -148,7 +148,7 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit, offset_s:
     if len(there) < len(points):
         verdict += f"; {len(points) - len(there)} of a time or place without the drive"
     if not len(there) and not np.isfinite(points.stamps).any():
-        nearest = cKDTree(_antennas(problem, fit)[:, :2]).query(points.positions[:, :2])[0].min()
+        nearest = np.min(cKDTree(_antennas(problem, fit)[:, :2]).query(points.positions[:, :2])[0])
         verdict += f", the nearest lies {nearest:.0f} m from the way: of another datum, CRS or drive?"
     if not fits[there].all():
         verdict += f"; {_mistake(points, off, there[~fits[there]], len(there))}"

@@ -66,8 +66,10 @@ class AxisNoise:
 def noise_of(imu: ImuSamples) -> list[AxisNoise]:
     """The noise of all six axes of samples at rest (`at_rest.span_at_rest`); gyroscope first, x to z.
 
-    Raises MeasurementError where no axis of a sensor shows any noise.
+    Raises MeasurementError for too few samples, and where no axis of a sensor shows any noise.
     """
+    if len(imu) < (least := round(2 * FEWEST_SAMPLES / LONGEST_SHARE)):
+        raise MeasurementError(f"{len(imu)} samples at rest, expected {least} or more")
     step = float(np.ptp(imu.stamps)) / (len(imu) - 1)
     found = []
     for sensor, letter, values in (
@@ -98,14 +100,11 @@ def _of_axis(name: str, sensor: str, values: Array, step: float) -> AxisNoise:
     from allantools import edf_simple, oadev
 
     n = len(values)
-    first, last = FEWEST_SAMPLES, n * LONGEST_SHARE
-    sizes = np.unique(
-        np.geomspace(first, last, max(2, round(PER_DECADE * np.log10(last / first)) + 1)).astype(int)
-    )
-    taus, deviations, *_ = oadev(values - values.mean(), 1 / step, "freq", sizes * step)
-    spread = np.sqrt(
-        2 / np.array([edf_simple(n + 1, size, 0) for size in sizes])
-    )  # of the variance, relative
+    first, last = FEWEST_SAMPLES * step, LONGEST_SHARE * n * step
+    asked = np.geomspace(first, last, round(PER_DECADE * np.log10(last / first)) + 1)
+    taus, deviations, *_ = oadev(values - values.mean(), 1 / step, "freq", asked)
+    # of the variance, as a share of it
+    spread = np.sqrt(2 / np.array([edf_simple(n + 1, round(tau / step), 0) for tau in taus]))
     squares = _fitted(terms(taus), deviations**2, spread)
     fit = np.sqrt(terms(taus) @ squares)
     numbers, why = _reached(squares, taus, deviations, spread, n * step)

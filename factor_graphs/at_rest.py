@@ -1,4 +1,4 @@
-"""When an IMU is at rest: by its own scatter from second to second, and by its means."""
+"""When an IMU is at rest: by its own scatter from window to window, and by its means."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,8 @@ from factor_graphs.measurements import ImuSamples, gaps
 Array = NDArray[np.float64]
 
 # What scatters no more than so many times as in the quietest seconds may stand; these are the quietest of fifty.
-QUIET, QUIETEST = 2.0, 0.02
+# Windows of a slow IMU are longer: the scatter of fewer samples is twice as large by chance.
+QUIET, QUIETEST, FEWEST_IN_WINDOW = 2.0, 0.02, 50
 # A record at rest is this long, s, or longer. Over so many parts of it, mean specific force, m/s², and angular rate,
 # rad/s, stay within these: a bias that warms up does, a vehicle, whose road has slopes, does not.
 LEAST_SPAN_S, PARTS = 60.0, 10
@@ -25,8 +26,8 @@ STEADY_STEPS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Seconds:
-    """Number, means (s, 3) and scatter (s,) of each second of samples; values scatter by their resolution at least."""
+class Windows:
+    """Number, means (w, 3) and scatter (w,) of samples by windows; values scatter by their resolution at least."""
 
     count: NDArray[np.intp]
     force: Array
@@ -35,28 +36,33 @@ class Seconds:
     rate_scatter: Array
 
     @classmethod
-    def of(cls, imu: ImuSamples) -> "Seconds":
-        """Seconds from the first stamp on; one without samples has means and scatter of zero."""
-        second = (imu.stamps - imu.stamps[0]).astype(int)
-        count = np.bincount(second)
+    def of(cls, imu: ImuSamples, length_s: float = 1.0) -> "Windows":
+        """Windows from the first stamp on; one without samples has means and scatter of zero."""
+        window = window_of(imu, length_s)
+        count = np.bincount(window)
 
         def means_of(columns: Array) -> Array:
-            sums = np.column_stack([np.bincount(second, column) for column in columns.T])
+            sums = np.column_stack([np.bincount(window, column) for column in columns.T])
             return np.asarray(sums / np.maximum(count, 1)[:, None])
 
         force, rate = means_of(imu.specific_force), means_of(imu.angular_rate)
         scatters = (
-            np.sqrt(means_of((samples - means[second]) ** 2).sum(axis=1) + _resolution(samples) ** 2)
+            np.sqrt(means_of((samples - means[window]) ** 2).sum(axis=1) + _resolution(samples) ** 2)
             for samples, means in ((imu.specific_force, force), (imu.angular_rate, rate))
         )
         return cls(count, force, rate, *scatters)
 
     def quiet(self, share: float) -> NDArray[np.bool_]:
-        """The seconds (s,) with samples in which both sensors scatter little against that share of all."""
+        """The windows (w,) with samples in which both sensors scatter little against that share of all."""
         quiet = self.count > self.count.max() / 2
         for scatter in (self.force_scatter, self.rate_scatter):
             quiet &= scatter <= QUIET * np.quantile(scatter[quiet], share)
         return np.asarray(quiet)
+
+
+def window_of(imu: ImuSamples, length_s: float) -> NDArray[np.intp]:
+    """The window (n,) of each sample."""
+    return np.asarray((imu.stamps - imu.stamps[0]) / length_s, np.intp)
 
 
 def _resolution(values: Array) -> float:
@@ -94,13 +100,13 @@ def span_at_rest(imu: ImuSamples) -> ImuSamples:
 
 
 def _longest_run(imu: ImuSamples) -> ImuSamples:
-    """The samples of the longest run of quiet seconds that no gap interrupts."""
-    quiet = Seconds.of(imu).quiet(QUIETEST)
-    second = (imu.stamps - imu.stamps[0]).astype(int)
+    """The samples of the longest run of quiet windows that no gap interrupts."""
+    length_s = max(1.0, FEWEST_IN_WINDOW * float(np.median(np.diff(imu.stamps))))
+    quiet = Windows.of(imu, length_s).quiet(QUIETEST)
     breaks = np.searchsorted(imu.stamps, gaps(imu.stamps)[:, 1])
     after_gap = np.zeros(len(imu), np.intp)
     after_gap[breaks] = 1
-    good = quiet[second]
+    good = quiet[window_of(imu, length_s)]
     run = np.cumsum(after_gap + np.append(False, good[1:] != good[:-1]))
     sizes = np.bincount(run, good)
     return imu[run == sizes.argmax()]
@@ -108,12 +114,11 @@ def _longest_run(imu: ImuSamples) -> ImuSamples:
 
 def _moved(samples: ImuSamples) -> str:
     """How it moves, in words; empty at rest."""
-    parts = [len(samples) * k // PARTS for k in range(PARTS)]
     for what, unit, values, steady in (
         ("mean specific force", "m/s²", samples.specific_force, STEADY_FORCE),
         ("mean angular rate", "rad/s", samples.angular_rate, STEADY_RATE),
     ):
-        means = np.add.reduceat(values, parts) / (len(samples) / PARTS)
+        means = np.array([part.mean(axis=0) for part in np.array_split(values, PARTS)])
         noise = values.std(axis=0).max() / np.sqrt(len(samples) / PARTS)
         if (change := float(np.ptp(means, axis=0).max())) > steady + BEYOND * noise:
             return f"its {what} changes by {change:.2g} {unit} within {np.ptp(samples.stamps):.0f} s"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from factor_graphs.at_rest import Seconds
+from factor_graphs.at_rest import Windows
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
 Array = NDArray[np.float64]
@@ -114,7 +114,7 @@ def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
 
 def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
     """The median rate (3,) of the seconds in which the vehicle stands; None for less than a few of them."""
-    seconds = Seconds.of(imu)
+    seconds = Windows.of(imu)
     quiet, rates = seconds.quiet(0.1), seconds.rate
     stamps = np.arange(len(quiet)) + imu.stamps[0] + 0.5
     middles, ways, stddevs = _ways(fixes)

@@ -93,6 +93,15 @@ def test_what_moves_is_cut_out(hour: ImuSamples) -> None:
     assert of(noise_of(rest), "gyroscope")[:, 0] == pytest.approx(DENSITY["gyroscope"], rel=0.05)
 
 
+def test_a_slow_imu_stands_as_well(hour: ImuSamples) -> None:
+    """Ten samples a second, as of a KITTI drive: by chance some seconds scatter twice as much as others."""
+    slow = span_at_rest(hour[::5])
+    assert np.ptp(slow.stamps) == pytest.approx(3600, abs=5)
+    assert len(span_at_rest(hour[: 5 * 601 : 5])) >= 600  # whose parts are of other sizes
+    found = of(noise_of(slow), "gyroscope")[:, 0]
+    assert found == pytest.approx(DENSITY["gyroscope"] * np.sqrt(5), rel=0.03)
+
+
 def changed(hour: ImuSamples, seconds: float, **change: Array) -> ImuSamples:
     part = hour[: round(seconds * RATE)]
     values = {"stamps": part.stamps, "specific_force": part.specific_force, "angular_rate": part.angular_rate}
@@ -150,5 +159,7 @@ def test_an_axis_without_resolution_is_left_out_and_named(hour: ImuSamples) -> N
     assert "0.004 apart, and scatters by less" in y.why[0]
     assert np.isnan([x.numbers, y.numbers]).all()
     assert z.numbers[0] == pytest.approx(DENSITY["gyroscope"], rel=0.05)
+    with pytest.raises(MeasurementError, match="199 samples at rest, expected 200 or more"):
+        noise_of(hour[:199])
     with pytest.raises(MeasurementError, match=r"gyroscope: wx is 0 all the time; wy is 0 .*; wz is 0"):
         noise_of(changed(hour, 200, angular_rate=np.zeros_like(rates)))

@@ -54,17 +54,15 @@ def separation_of(
     factors = [linear.at(n) for n in range(linear.size())]
     spans = np.array([_span(factor, k) for factor in factors])
     stddevs = np.repeat([*LOOSE, noise.accelerometer_bias_stddev, noise.gyroscope_bias_stddev], 3)
-    held = [_known(key, np.zeros(len(values.atVector(key))), HELD) for key in shared_keys(values, k)]
-    at_end = [
-        _known(key, -biases[-1] if rows.start == 9 else np.zeros(rows.stop - rows.start), stddevs[rows])
-        for key, rows in zip(state_keys(k - 1), (slice(0, 6), slice(6, 9), slice(9, 15)), strict=True)
-    ]
+    mean, A = np.concatenate([np.zeros(9), -biases[-1]]), np.diag(1 / stddevs)
+    x, v, b = state_keys(k - 1)
+    at_end = gtsam.JacobianFactor(x, A[:, :6], v, A[:, 6:9], b, A[:, 9:], A @ mean, _unit(SIZE))
+    sizes = {key: len(values.atVector(key)) for key in shared_keys(values, k)}
+    held = [gtsam.JacobianFactor(key, np.eye(n) / HELD, np.zeros(n), _unit(n)) for key, n in sizes.items()]
     means, covariances = _swept(factors, spans, k, held)
     # the same, counted from the last keyframe on
-    later_means, later_covariances = _swept(
-        factors, k - 1 - spans[:, ::-1], k, [*held, *at_end], is_backward=True
-    )
-    means, covariances = means - later_means[::-1], covariances + later_covariances[::-1]
+    after = _swept(factors, k - 1 - spans[:, ::-1], k, [*held, at_end], is_backward=True)
+    means, covariances = means - after[0][::-1], covariances + after[1][::-1]
     R = T[:, :3, :3]
     rows = np.zeros((k, 4, SIZE))
     rows[:, :3, 3:6], rows[:, 3, :3] = R, R[:, 2]
@@ -78,9 +76,8 @@ def _span(factor: gtsam.GaussianFactor, k: int) -> tuple[int, int]:
     return min(numbers), max(numbers)
 
 
-def _known(key: int, mean: Array, stddevs: Array | float) -> gtsam.JacobianFactor:
-    scales = np.broadcast_to(1 / np.asarray(stddevs), mean.shape)
-    return gtsam.JacobianFactor(key, np.diag(scales), mean * scales, gtsam.noiseModel.Unit.Create(len(mean)))
+def _unit(size: int) -> gtsam.noiseModel.Unit:
+    return gtsam.noiseModel.Unit.Create(size)
 
 
 def _swept(
@@ -100,12 +97,8 @@ def _swept(
     np.maximum.at(needed, first, last)
     order = np.lexsort((first == last, last))
     bounds = np.searchsorted(last[order], np.arange(k + 1))
-    means, covariances, active, graph = (
-        np.empty((k, SIZE)),
-        np.empty((k, SIZE, SIZE)),
-        list[int](),
-        gtsam.GaussianFactorGraph(),
-    )
+    means, covariances = np.empty((k, SIZE)), np.empty((k, SIZE, SIZE))
+    active, graph = list[int](), gtsam.GaussianFactorGraph()
     shared = {key for one in known for key in list(one.keys()) if split_key(key)[0] not in OF_KEYFRAME}
     for one in known:
         graph.push_back(one)

@@ -46,6 +46,7 @@ def imu_noise(
     from factor_graphs.at_rest import span_at_rest
     from gnss_sem_map.datasets import read_imu
     from gnss_sem_map.files.atomic import adding_folder, replacing
+    from gnss_sem_map.files.untrusted import shown
 
     samples, conventions = read_imu(log, drive_format)
     imu = settings_of(config, set_).sensors.over(conventions).imu_in_ours(samples)
@@ -53,7 +54,7 @@ def imu_noise(
     start, end = rest.stamps[[0, -1]] - imu.stamps[0]
     rate = (len(rest) - 1) / (end - start)
     of = f"of {imu.stamps[-1] - imu.stamps[0]:.1f} s, {rate:.1f} Hz"
-    used = f"{log.name}: at rest from {start:.1f} to {end:.1f} s {of}"
+    used = f"{shown(log.name)}: at rest from {start:.1f} to {end:.1f} s {of}"
     axes = noise_of(rest)
     snippet = _yaml(axes, used)
     if out is not None:
@@ -89,7 +90,9 @@ def _table(axes: list[AxisNoise]) -> list[str]:
     lines = [f"{axis.name} {axis.why[0]}" for axis in axes if not len(axis.taus)]
     for sensor, k, name, _, said in _worst(axes):
         values = [axis.numbers[k] * UNITS[sensor][2][k] for axis in axes if axis.sensor == sensor]
-        each = "  ".join(f"{axis} {value:.3g}" for axis, value in zip("xyz", values, strict=True))
+        each = "  ".join(
+            f"{axis} {value:.3g}".replace("nan", "-") for axis, value in zip("xyz", values, strict=True)
+        )
         lines.append(f"{name:<24} {each}  worst {said}")
     return lines
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,13 @@ def test_the_yaml_is_taken_by_the_log_as_its_noise(table: Path, tmp_path: Path) 
     again = gnss_sem_map("imu-noise", table, "-o", tmp_path / "noise")
     assert again.returncode == 1
     assert "exists; move it away" in again.stderr
+
+
+def test_a_name_with_a_line_break_does_not_end_the_comment(table: Path, tmp_path: Path) -> None:
+    log = shutil.copytree(table, tmp_path / "still\nepoch_ns: 1")
+    done = gnss_sem_map("imu-noise", log)
+    assert done.returncode == 0
+    assert not any(line.startswith("epoch_ns") for line in done.stdout.splitlines())
 
 
 def test_a_bag_with_nothing_else_tells_the_same_as_the_table(table: Path, tmp_path: Path) -> None:

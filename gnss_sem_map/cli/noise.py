@@ -54,7 +54,7 @@ def imu_noise(
     start, end = rest.stamps[[0, -1]] - imu.stamps[0]
     rate = (len(rest) - 1) / (end - start)
     of = f"of {imu.stamps[-1] - imu.stamps[0]:.1f} s, {rate:.1f} Hz"
-    used = f"{shown(log.name)}: at rest from {start:.1f} to {end:.1f} s {of}"
+    used = f"{' '.join(shown(log.name).split())}: at rest from {start:.1f} to {end:.1f} s {of}"
     axes = noise_of(rest)
     snippet = _yaml(axes, used)
     if out is not None:

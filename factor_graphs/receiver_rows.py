@@ -32,7 +32,7 @@ _HEADINGS, _HEADING_STDDEVS = 16, 17
 # Where a receiver does not tell how good its heading is: how well it knows the place of one antenna against the other.
 # u-blox promises 0.4° for antennas 1 m apart (data sheet of the ZED-F9P).
 OF_BASELINE_M = 0.007
-# Where it does not tell how good its velocity is, m/s: receivers of all makes promise 0.03 to 0.1. What the drive shows
+# Where no row tells how good its velocity is, m/s: receivers of all makes promise 0.03 to 0.1. What the drive shows
 # is larger where it is.
 USUAL_VELOCITY_STDDEV = 0.1
 FORWARD = (1.0, 0.0, 0.0)
@@ -75,7 +75,7 @@ def velocities_of(rows: Array, frame: LocalFrame) -> tuple[GnssVelocities | None
     turned = np.einsum("nij,nj->ni", frame.axes_at(frame.to_map(*rows[:, 1:4].T)), np.nan_to_num(v))
     turned[is_flat, 2] = np.nan
     stated = rows[:, _VELOCITY_STDDEVS]
-    stddevs = np.where(np.isnan(stated), USUAL_VELOCITY_STDDEV, stated)
+    stddevs = np.where(np.isnan(stated).all(axis=0), USUAL_VELOCITY_STDDEV, stated)
     velocities, repairs = clean_velocities(rows[:, 0], turned, stddevs)
     return (velocities if len(velocities) else None), repairs
 

@@ -12,6 +12,7 @@ import ros
 from ros import IMU, START_NS
 from typer.testing import CliRunner
 
+from factor_graphs.receiver_rows import velocities_of, with_more
 from gnss_sem_map.cli import app
 from gnss_sem_map.datasets import open_drive
 from gnss_sem_map.datasets.ros.bag import Bag
@@ -162,6 +163,19 @@ def test_a_velocity_that_says_nothing_of_up_or_of_its_noise_is_level(tmp_path: P
     found = opened(tmp_path, rig, velocity={"topic": "/vel"}).velocities
     assert found is not None
     assert found.stddevs.tolist() == [[0.1, 0.1, 1000.0]] * len(VELOCITIES)
+
+
+def test_a_velocity_without_noise_among_others_is_left_out(table: SensorLog) -> None:
+    """Of a receiver that tells it of the other rows."""
+    rows = with_more(
+        np.column_stack([np.arange(3.0), np.tile([49.0, 8.4, 115.0, 1, 1, 1], (3, 1))]),
+        velocities=VELOCITIES[:3], velocity_stddevs=np.array([[0.1] * 3, [np.nan] * 3, [0.1] * 3]),
+    )  # fmt: skip
+    assert table.frame is not None
+    found, repairs = velocities_of(rows, table.frame)
+    assert found is not None
+    assert repairs is not None
+    assert (found.stamps.tolist(), repairs.dropped) == ([0.0, 2.0], 1)
 
 
 def test_what_is_no_velocity_or_heading_is_counted(tmp_path: Path) -> None:

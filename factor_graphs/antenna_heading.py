@@ -29,7 +29,8 @@ SURE_HEADING = 0.1
 BEYOND_DOUBT, LEAST_OFFSET = 5.0, 0.01
 # The heading of a solution is wrong by about the same for so long, s.
 SLOW_S = 20.0
-# A heading that scatters by more, rad, and by three times less when it is mirrored, turns the wrong way.
+# A heading that scatters by more, rad, is of something else: one that scatters by three times less when it is mirrored,
+# or in another unit, is that.
 SCATTERED, MIRRORED = 0.3, 3.0
 
 
@@ -48,8 +49,7 @@ def observe_headings(headings: AntennaHeadings, problem: Problem, fit: Fit) -> O
         return Observed(
             f"{said}, not judged by the motion", partial(_factors, kept, problem, place), True, -turn
         )
-    mirrored = wrapped(2 * kept.azimuths[sure] - off[sure])  # -azimuth less that of the solution, sign aside
-    if doubt := _mistake(off[sure], mirrored, own[sure]):
+    if doubt := _mistake(kept[sure], off[sure], own[sure]):
         return Observed(f"antenna heading off: {doubt}", doubtful=True)
     stamps = problem.intervals.keyframes[place.at]
     scale = noise_scale(stamps[sure], _quick(stamps[sure], off[sure])[:, None], kept.stddevs[sure, None])
@@ -79,10 +79,15 @@ def _scatter(angles: Array) -> float:
     return float(np.median(np.abs(wrapped(angles - _centre(angles)))))
 
 
-def _mistake(off: Array, mirrored: Array, own: Array) -> str:
+def _mistake(headings: AntennaHeadings, off: Array, own: Array) -> str:
     """What is wrong with headings that are `off` (n,) rad, of a solution with stddevs `own`; empty where they fit."""
-    if (scatter := _scatter(off)) > SCATTERED and _scatter(mirrored) < scatter / MIRRORED:
-        return "it turns against the vehicle; expected degrees clockwise from north: is it counter-clockwise?"
+    said, known = headings.azimuths, headings.azimuths - off
+    if (scatter := _scatter(off)) > max(SCATTERED, float(np.median(headings.stddevs))):
+        if _scatter(-said - known) < scatter / MIRRORED:
+            return "it turns against the vehicle; expected degrees clockwise from north: is it counter-clockwise?"
+        if _scatter(np.degrees(said) - known) < scatter / MIRRORED:
+            return "it turns less than the vehicle: is it in radians, not degrees?"
+        return f"it does not follow the motion, and scatters by {np.degrees(scatter):.0f}° about the heading of that"
     centre = _centre(off)
     if abs(centre) > max(BEYOND_DOUBT * np.hypot(np.median(own), scatter / len(off) ** 0.5), LEAST_OFFSET):
         asked = "; are the two antennas exchanged?" if abs(centre) > np.pi - 0.2 else ""

@@ -43,7 +43,9 @@ def observe_velocities(velocities: GnssVelocities, problem: Problem, fit: Fit) -
     off = kept.velocities - _antenna_velocities(problem, fit, place)
     seen = beside_fixes(problem, fit)[place.at]
     said = f"GNSS velocity: {len(kept)} of {len(velocities)} used"
-    if doubt := _mistake(kept.velocities[seen], (kept.velocities - off)[seen]):
+    R = from_values(fit.values, len(problem.intervals.keyframes))[0][place.at, :3, :3]
+    turned = np.einsum("kij,kj->ki", R, kept.velocities)
+    if doubt := _mistake(kept.velocities[seen], (kept.velocities - off)[seen], turned[seen]):
         return Observed(f"GNSS velocity off: {doubt}", doubtful=True)
     scales = _noise_shown(problem, fit, place, off, kept.stddevs, seen)
     if scales.max() > 1:
@@ -62,13 +64,17 @@ def _antenna_velocities(problem: Problem, fit: Fit, place: Placed) -> Array:
     return found
 
 
-def _mistake(said: Array, known: Array) -> str:
-    """What velocities (n, 3) are that do not agree with the positions'; empty where they do, or too few are seen."""
+def _mistake(said: Array, known: Array, turned: Array) -> str:
+    """What velocities (n, 3) are that do not agree with the positions'; empty where they do, or too few are seen.
+
+    `turned` (n, 3) are they, were they along the axes of the imu.
+    """
     moving = np.linalg.norm(known[:, :2], axis=1) > MOVING_SPEED
-    said, known = said[moving, :2], known[moving, :2]
+    said, known, turned = said[moving, :2], known[moving, :2], turned[moving, :2]
     if len(known) < FEWEST_SEEN or (share := _misfit(said, known)) <= MOST_MISFIT:
         return ""
     fitting = {what: _misfit(said @ turn.T, known) for what, turn in MISTAKES.items()}
+    fitting["along the axes of the vehicle, not east, north"] = _misfit(turned, known)
     best = min(fitting, key=lambda what: fitting[what])
     asked = f"; are they {best}?" if fitting[best] <= MOST_MISFIT else ""
     ratio = float(np.median(np.linalg.norm(said, axis=1) / np.linalg.norm(known, axis=1)))

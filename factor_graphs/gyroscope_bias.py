@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
+from factor_graphs.at_rest import Windows
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
 Array = NDArray[np.float64]
@@ -24,10 +25,10 @@ CHORD_S, LEAST_COURSE_STDDEV, WINDOW_S = 2.0, 0.05, 100.0
 # A bias is better than another when its log-likelihood is so much larger, 5 standard deviations; and the gyroscope
 # turns with the vehicle when at least this share of what the courses can tell agrees.
 SURELY, AGREEING = 12.5, 0.5
-# A second of standstill: the IMU scatters no more than so many times as in its quietest tenth, and the fixes stay
-# within so many standard deviations. So many of them are believed, if half of them are within so many rad/s: what
+# A second of standstill: the IMU is about as quiet as in its quietest tenth, and the fixes stay within so many standard
+# deviations. So many of them are believed, if half of them are within so many rad/s: what
 # stands turns at one rate.
-QUIET, STAYING, LEAST_STANDING, STEADY = 2.0, 3.0, 5, 3e-3
+STAYING, LEAST_STANDING, STEADY = 3.0, 5, 3e-3
 # A mean specific force beyond these, m/s², is no gravity, and does not tell what is up.
 LEAST_FORCE, MOST_FORCE = 5.0, 20.0
 TINY = 1e-12
@@ -115,19 +116,9 @@ def _ways(fixes: GnssFixes) -> tuple[Array, NDArray[np.complex128], Array]:
 
 def _at_rest(imu: ImuSamples, fixes: GnssFixes) -> Array | None:
     """The median rate (3,) of the seconds in which the vehicle stands; None for less than a few of them."""
-    second = (imu.stamps - imu.stamps[0]).astype(int)
-    count = np.maximum(np.bincount(second), 1)
-    quiet = count > count.max() / 2
-
-    def means_of(columns: Array) -> Array:
-        sums = np.column_stack([np.bincount(second, column) for column in columns.T])
-        return np.asarray(sums / count[:, None])
-
-    rates = means_of(imu.angular_rate)
-    for samples, means in ((imu.specific_force, means_of(imu.specific_force)), (imu.angular_rate, rates)):
-        scatter = np.sqrt(means_of((samples - means[second]) ** 2).sum(axis=1))
-        quiet &= scatter <= QUIET * np.quantile(scatter[quiet], 0.1)
-    stamps = np.arange(len(count)) + imu.stamps[0] + 0.5
+    seconds = Windows.of(imu)
+    quiet, rates = seconds.quiet(0.1), seconds.rate
+    stamps = np.arange(len(quiet)) + imu.stamps[0] + 0.5
     middles, ways, stddevs = _ways(fixes)
     if not len(ways):
         return None

@@ -32,6 +32,9 @@ _HEADINGS, _HEADING_STDDEVS = 16, 17
 # Where a receiver does not tell how good its heading is: how well it knows the place of one antenna against the other.
 # u-blox promises 0.4° for antennas 1 m apart (data sheet of the ZED-F9P).
 OF_BASELINE_M = 0.007
+# Where no row tells how good its velocity is, m/s: receivers of all makes promise 0.03 to 0.1. What the drive shows
+# is larger where it is.
+USUAL_VELOCITY_STDDEV = 0.1
 FORWARD = (1.0, 0.0, 0.0)
 
 
@@ -71,7 +74,9 @@ def velocities_of(rows: Array, frame: LocalFrame) -> tuple[GnssVelocities | None
     is_flat = np.isnan(v[:, 2])
     turned = np.einsum("nij,nj->ni", frame.axes_at(frame.to_map(*rows[:, 1:4].T)), np.nan_to_num(v))
     turned[is_flat, 2] = np.nan
-    velocities, repairs = clean_velocities(rows[:, 0], turned, rows[:, _VELOCITY_STDDEVS])
+    stated = rows[:, _VELOCITY_STDDEVS]
+    stddevs = np.where(np.isnan(stated).all(axis=0), USUAL_VELOCITY_STDDEV, stated)
+    velocities, repairs = clean_velocities(rows[:, 0], turned, stddevs)
     return (velocities if len(velocities) else None), repairs
 
 

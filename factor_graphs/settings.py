@@ -63,4 +63,9 @@ class SmootherSettings(BaseModel):
     start_heading_stddev_rad: float = Field(
         1.8, gt=0, description="Unknown heading of the first guess; by default any heading is as likely."
     )
+    forward_backward: bool = Field(
+        False,
+        description="Also solve by what was before and by what comes after each keyframe, and plot how far these lie"
+        " apart: up to a third more time.",
+    )
     max_iterations: int = Field(50, gt=0, description="The optimiser fails when it needs more.")

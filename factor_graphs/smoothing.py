@@ -50,6 +50,7 @@ from factor_graphs.problem import (
 )
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.screening import are_drifting, are_new
+from factor_graphs.separation import Separation, separation_of
 from factor_graphs.settings import SmootherSettings as SmootherSettings
 from factor_graphs.side_measurements import Observed
 from factor_graphs.surveyed_points import (
@@ -100,7 +101,7 @@ class Solution:
     place; `wheels` scale, offset, latency and slip of the wheels, None where none were given or asked for;
     `condensed` the drive in short, None where it was not asked for; `beside` what became of measurements beside IMU
     and fixes, in words; `points` the surveyed points against the trajectory; `notes` says in words what was
-    repaired or is in doubt.
+    repaired or is in doubt; `separation` of forward and backward solution, None where it was not asked for.
     """
 
     trajectory: Trajectory
@@ -124,6 +125,7 @@ class Solution:
     beside: tuple[str, ...] = ()
     points: tuple[PointResidual, ...] = ()
     notes: tuple[str, ...] = ()
+    separation: Separation | None = None
 
     @property
     def outside_imu(self) -> NDArray[np.bool_]:
@@ -180,6 +182,9 @@ def smooth(
         beside=tuple(one.verdict for one in beside),
         notes=(*inertial.notes(), *found.notes, *(one.verdict for one in beside if one.doubtful)),
     )
+    if settings.forward_backward:
+        graph, values = held.fit.graph, held.fit.values
+        found = replace(found, separation=separation_of(graph, values, found.keyframes.stamps, problem.noise))
     if not condensed:
         return found
     R = found.keyframes.T_map_imu[:, :3, :3]

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from factor_graphs.constraints import STANDING_SPEED
 from factor_graphs.covariances import keyframe_covariances
@@ -146,6 +147,9 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
     verdict += f"{np.sum(~points.control)} check points"
     if len(there) < len(points):
         verdict += f"; {len(points) - len(there)} of a time or place without the drive"
+    if not len(there) and not np.isfinite(points.stamps).any():
+        nearest = np.min(cKDTree(_antennas(problem, fit)[:, :2]).query(points.positions[:, :2])[0])
+        verdict += f", the nearest lies {nearest:.0f} m from the way: of another datum, CRS or drive?"
     if not fits[there].all():
         verdict += f"; {_mistake(points, off, there[~fits[there]], len(there))}"
     factors = partial(_factors, known, problem, np.flatnonzero(held), at, late)
@@ -176,8 +180,8 @@ def _keyframes(
 ) -> tuple[NDArray[np.intp], Array]:
     """The keyframe (n,) of every point, -1 for none, and how late (n,) s it was there."""
     keyframes = problem.intervals.keyframes
-    T, velocities, _ = from_values(fit.values, len(keyframes))
-    antennas = T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna
+    velocities = from_values(fit.values, len(keyframes))[1]
+    antennas = _antennas(problem, fit)
     stands = np.flatnonzero(np.linalg.norm(velocities, axis=1) < STANDING_SPEED)
     at, late = np.full(len(points), -1), np.zeros(len(points))
     for n, stamp in enumerate(stamps.tolist()):
@@ -192,11 +196,16 @@ def _keyframes(
     return at, late
 
 
+def _antennas(problem: Problem, fit: Fit) -> Array:
+    """Where the antenna was at the keyframes, (k, 3) m."""
+    T = from_values(fit.values, len(problem.intervals.keyframes))[0]
+    return np.asarray(T[:, :3, 3] + T[:, :3, :3] @ problem.p_imu_antenna)
+
+
 def _off(points: SurveyedPoints, problem: Problem, fit: Fit, at: NDArray[np.intp], late: Array) -> Array:
     """Estimated less surveyed, (n, 3) m; at keyframe -1 of no meaning."""
-    T, velocities, _ = from_values(fit.values, len(problem.intervals.keyframes))
-    antennas = T[at, :3, 3] + T[at, :3, :3] @ problem.p_imu_antenna + velocities[at] * late[:, None]
-    return np.asarray(antennas - points.positions)
+    velocities = from_values(fit.values, len(problem.intervals.keyframes))[1]
+    return np.asarray(_antennas(problem, fit)[at] + velocities[at] * late[:, None] - points.positions)
 
 
 def _mistake(points: SurveyedPoints, off: Array, unfit: NDArray[np.intp], n: int) -> str:

@@ -17,13 +17,17 @@ Array = NDArray[np.float64]
 
 AXES = ("east", "north", "up")
 COLOURS = ("tab:red", "tab:green", "tab:blue")
-HEADROOM = 1.15
+HEADROOM, PANEL_INCHES = 1.15, 2.5
+SHOWN_STDDEVS = 4.0
+"""So many usual standard deviations of the separation are shown."""
 LINE_SHARE = 0.016
 """Height of a line of the title, of that of the figure."""
 
 
 def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str) -> None:
     """Write track, residuals, standard deviations and biases as one PNG, with fixes that were not used and all notes.
+
+    And the separation of forward and backward solution where it is known.
 
     `fixes` are those given to the smoother. The file is written where `path` says, whatever its name ends with. Raises
     MeasurementError for other fixes, and OSError when the file cannot be written.
@@ -35,14 +39,15 @@ def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure, title = Figure(figsize=(15, 10), dpi=110), _title(solution, fixes)
+    panels = [_residuals, _stddevs, _heading, *([] if solution.separation is None else [_separation])]
+    figure, title = Figure(figsize=(15, PANEL_INCHES * (len(panels) + 1)), dpi=110), _title(solution, fixes)
     FigureCanvasAgg(figure)
     # fixed margins: a layout engine would draw everything twice
     edges = {"left": 0.05, "right": 0.94, "bottom": 0.06, "top": 0.96 - LINE_SHARE * (1 + title.count("\n"))}
-    grid = figure.add_gridspec(4, 2, width_ratios=[1.1, 1.0], wspace=0.14, hspace=0.1, **edges)
+    grid = figure.add_gridspec(len(panels) + 1, 2, width_ratios=[1.1, 1.0], wspace=0.14, hspace=0.1, **edges)
     _track(figure.add_subplot(grid[:, 0]), solution, fixes)
-    below = figure.add_subplot(grid[3, 1])
-    for row, draw in enumerate((_residuals, _stddevs, _heading)):
+    below = figure.add_subplot(grid[-1, 1])
+    for row, draw in enumerate(panels):
         axes = figure.add_subplot(grid[row, 1], sharex=below)
         axes.tick_params(labelbottom=False)
         draw(axes, solution, fixes)
@@ -107,6 +112,20 @@ def _heading(axes: "Axes", solution: Solution, _fixes: GnssFixes) -> None:
     stddev = np.degrees(heading_stddevs(solution.trajectory))
     axes.plot(solution.trajectory.stamps, stddev, color="tab:purple", linewidth=1)
     axes.set(ylabel="heading stddev, °", ylim=(0.0, HEADROOM * stddev.max()))
+    axes.grid(alpha=0.3)
+
+
+def _separation(axes: "Axes", solution: Solution, _fixes: GnssFixes) -> None:
+    """With standard deviations as dots; both ends are cut: there, one of the two solutions knows nothing yet."""
+    found = solution.separation
+    assert found is not None
+    for name, colour, off, stddev in zip(AXES, COLOURS, found.off.T, found.stddevs.T, strict=False):
+        axes.plot(found.stamps, off, color=colour, linewidth=1, label=name)
+        for sign in (-1, 1):
+            axes.plot(found.stamps, sign * stddev, ":", color=colour, linewidth=0.8)
+    limit = SHOWN_STDDEVS * float(np.median(found.stddevs[:, :3], axis=0).max())
+    axes.set(ylim=(-limit, limit), ylabel="forward - backward, m")
+    axes.legend(loc="lower right", fontsize=7, ncols=3)
     axes.grid(alpha=0.3)
 
 

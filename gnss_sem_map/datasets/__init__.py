@@ -1,7 +1,8 @@
 """Readers of drives: each reads one folder layout into a `SensorLog`.
 
 A reader is a module of this folder with `FORMAT` (its name), `SIGNS` (the content of such a drive, in words),
-`is_drive(path)` and `read(path, with_imu)`. Where a drive may be one file, `FILES` are the endings of its name.
+`is_drive(path)` and `read(path, with_imu)`. Where a drive may be one file, `FILES` are the endings of its name; where
+the IMU can be read without a receiver, `read_imu(path)` does.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
+from factor_graphs.measurements import ImuSamples
 from gnss_sem_map.datasets.given_trajectory import along
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import inside, is_file, is_folder, shown
 from gnss_sem_map.sensor_log import SensorLog
+from gnss_sem_map.sensor_log.conventions import SensorConventions
 
 
 @cache
@@ -57,11 +60,29 @@ def open_drive(
     `with_imu`: False for those who have a trajectory. A reader may then leave out what takes long to read.
     `trajectory`: a file of poses in place of the drive's own, see `given_trajectory`.
     """
-    drive = Path(drive)
-    if drive_format is not None and drive_format not in readers():
-        raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
-    log: SensorLog = readers()[drive_format or detect_format(drive)].read(drive, with_imu)
+    log: SensorLog = _reader(Path(drive), drive_format).read(Path(drive), with_imu)
     if trajectory is not None:
         return along(log, Path(trajectory), with_imu)
     log.check_located()
     return log
+
+
+def read_imu(drive: Path, drive_format: str | None = None) -> tuple[ImuSamples, SensorConventions]:
+    """The samples of an IMU and their conventions: of a log that may have no other sensor, where its format allows.
+
+    Raises DataError as `open_drive` does, and for a drive without an IMU.
+    """
+    reader = _reader(drive, drive_format)
+    if hasattr(reader, "read_imu"):
+        found: tuple[ImuSamples, SensorConventions] = reader.read_imu(drive)
+        return found
+    log: SensorLog = reader.read(drive, True)
+    if log.imu is None:
+        raise DataError(f"{shown(drive)}: has no IMU, only poses; expected a log with the samples of an IMU")
+    return log.imu, log.conventions or SensorConventions()
+
+
+def _reader(drive: Path, drive_format: str | None) -> Any:
+    if drive_format is not None and drive_format not in readers():
+        raise DataError(f"{shown(drive)}: found format {drive_format!r}, expected one of {sorted(readers())}")
+    return readers()[drive_format or detect_format(drive)]

@@ -101,16 +101,26 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu_noise=about.imu_noise,
         imu_sample_instant=about.imu_sample_instant,
         initial_attitude=None if about.initial_attitude is None else about.initial_attitude.prior,
-        conventions=SensorConventions(**about.model_dump(include=set(SensorConventions.model_fields))),
+        conventions=about.conventions,
         skips=(*imu_skips, *fix_skips, *wheel_skips, *scan_skips, *image_skips),
     )
+
+
+def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
+    """The samples of imu.csv and their conventions; nothing else need be there. Raises DataError."""
+    about = read_log_yaml(drive / "log.yaml")
+    imu, skips = _imu(drive / "imu.csv", about)
+    if imu is None:
+        raise DataError(f"{skips[0].where}: {skips[0].reason}")
+    return imu, about.conventions
 
 
 def _imu(path: Path, about: LogFile) -> tuple[ImuSamples | None, list[Skip]]:
     if not is_file(path):
         return None, [_missing(path, IMU_COLUMNS)]
     rows = _numbers(path, IMU_COLUMNS, LONGEST_IMU_STEP_S)
-    imu, repairs = clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
+    with _as_data_error():
+        imu, repairs = clean_imu(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
     check_date(float(imu.stamps[-1]), about.epoch_ns, shown(path))
     return imu, [Skip("samples", shown(path), str(repairs))] if repairs.dropped else []
 

@@ -25,16 +25,21 @@ class Receiver:
 
 
 def measured(
-    rows: NDArray[np.float64], where: str, baseline: ArrayLike | None
+    rows: NDArray[np.float64],
+    where: str,
+    baseline: ArrayLike | None,
+    velocity: NDArray[np.float64] | None = None,
+    heading: NDArray[np.float64] | None = None,
 ) -> tuple[Receiver, list[Skip]]:
     """What valid rows (n, 18) say, as `receiver_rows.ROW_COLUMNS`, and what was skipped; `baseline` as `headings_of`.
 
+    `velocity` and `heading`: likewise, where these come by topics of their own.
     Raises MeasurementError.
     """
     frame = LocalFrame(*(float(v) for v in rows[0, 1:4]))
     gnss, gnss_repairs, no_covariance = fixes_of(rows, frame)
-    velocities, velocity_repairs = velocities_of(rows, frame)
-    headings, heading_repairs = headings_of(rows, frame, baseline)
+    velocities, velocity_repairs = velocities_of(rows if velocity is None else velocity, frame)
+    headings, heading_repairs = headings_of(rows if heading is None else heading, frame, baseline)
     skips = [
         Skip("samples", where, str(repairs))
         for repairs in (gnss_repairs, velocity_repairs, heading_repairs)

@@ -24,7 +24,7 @@ from factor_graphs.receiver_rows import with_more
 from factor_graphs.valid_fixes import valid_fixes
 from gnss_sem_map.datasets.gnss_files import read_gnss_file
 from gnss_sem_map.datasets.receiver import Receiver, measured
-from gnss_sem_map.datasets.ros import clouds, pictures, roles
+from gnss_sem_map.datasets.ros import clouds, pictures, receiver_topics, roles
 from gnss_sem_map.datasets.ros.bag import METADATA, SUFFIXES, Bag, Messages, bag_files
 from gnss_sem_map.datasets.ros.calibration import calibration_of, other_poses
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
@@ -63,8 +63,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
 
     Without `with_imu`, only the first and last message of the IMU are read.
     """
-    bag, file = Bag(drive), rig_file(drive)
-    rig = roles.completed(bag, Rig() if file is None else read_rig(file))
+    bag, file, rig = _opened(drive)
     lost = [Skip("part of the bag", name, f"{METADATA} lists it, and it is not there") for name in bag.lost]
     calibration, calibration_skips = calibration_of(bag, rig)
     epoch_ns, receiver, skips = _receiver(bag, rig, file or drive, calibration.p_imu_antenna)
@@ -95,7 +94,7 @@ def read(drive: Path, with_imu: bool = True) -> SensorLog:
         imu_sample_instant=None if rig.imu is None else rig.imu.sample_instant,
         initial_attitude=attitude,
         attitude_of_unit=True,
-        conventions=SensorConventions(**rig.model_dump(include=set(SensorConventions.model_fields))),
+        conventions=rig.conventions,
         skips=(*lost, *skips, *imu_skips, *calibration_skips, *image_skips),
     )
 
@@ -112,9 +111,16 @@ def _receiver(bag: Bag, rig: Rig, place: Path, p_imu_antenna: Array) -> tuple[in
             f"{where}: not one of {len(fixes)} fixes of the receiver is usable ({next(iter(invalid), 'none')})"
         )
     skips += [Skip("fix", where, f"{n} fixes: {why}", n) for why, n in invalid.items()]
+    rows = of_velocity = of_heading = fixes[valid]
+    if rig.gnss.velocity is not None:
+        of_velocity, lost = receiver_topics.velocity_rows(bag, rig.gnss.velocity, rows, int(fix_ns[0]))
+        skips += lost
+    if rig.gnss.heading is not None:
+        of_heading, lost = receiver_topics.heading_rows(bag, rig.gnss.heading, rows, int(fix_ns[0]))
+        skips += lost
     try:
         baseline = None if second is None else np.subtract(second, p_imu_antenna)
-        found, lost = measured(fixes[valid], where, baseline)
+        found, lost = measured(rows, where, baseline, of_velocity, of_heading)
     except MeasurementError as error:
         raise DataError(f"rig.yaml: gnss: {error}") from None
     return int(fix_ns[0]), found, skips + lost
@@ -127,6 +133,22 @@ def _first_ns(bag: Bag, rig: Rig) -> int:
         raise DataError(f"{shown(bag.path)}: found no topic of an IMU, a receiver or a LiDAR")
     said, believed, _ = stamps_of(bag, bag.messages(sensor.topic), sensor.stamps)
     return int(said[believed][0]) if believed.any() else 0
+
+
+def read_imu(drive: Path) -> tuple[ImuSamples, SensorConventions]:
+    """The samples of a bag's IMU and their conventions; it needs no other sensor. Raises DataError."""
+    bag, _, rig = _opened(drive)
+    imu, *_ = _imu(bag, rig.imu, _first_ns(bag, rig), True)
+    if imu is None:
+        missing = roles.missing(bag, rig)[0]
+        raise DataError(f"{missing.where}: {missing.reason}")
+    return imu, rig.conventions
+
+
+def _opened(drive: Path) -> tuple[Bag, Path | None, Rig]:
+    """The bag, its rig.yaml, if there is one, and the rig that it tells, completed."""
+    bag, file = Bag(drive), rig_file(drive)
+    return bag, file, roles.completed(bag, Rig() if file is None else read_rig(file))
 
 
 def _fixes(

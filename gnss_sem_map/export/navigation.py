@@ -25,6 +25,7 @@ STEP_S = 0.1
 COLUMNS = (
     "stamp_s", "lat_deg", "lon_deg", "alt_m", "roll_deg", "pitch_deg", "heading_deg",
     "std_e_m", "std_n_m", "std_u_m", "std_roll_deg", "std_pitch_deg", "std_heading_deg", "fixes", "fixes_rejected",
+    "nearest_fix_s",
 )  # fmt: skip
 
 
@@ -60,27 +61,44 @@ def write_attitude(
     """Write a CSV file of COLUMNS, a row in 0.1 s: place and attitude, their standard deviations, and the fixes.
 
     `fixes` is how many of `fix_stamps` (m,) s lie since the row before, `fixes_rejected` how many of these are
-    `rejected` (m,). Without covariances, deviations are empty. Raises DataError when the file cannot be written.
+    `rejected` (m,); `nearest_fix_s` is from the nearest one that was not. Without covariances, deviations are empty.
+    Raises DataError when the file cannot be written.
     """
     t = trajectory.stamps
     track = trajectory[
         np.unique(np.searchsorted(t, np.arange(t[0], t[-1] + STEP_S / 2, STEP_S)).clip(max=len(t) - 1))
     ]
     angles = np.degrees(_angles(_axes(track, frame)[1]))
-    stamps = np.empty(0) if fix_stamps is None else fix_stamps
-    bad = np.zeros(len(stamps), np.bool_) if rejected is None else rejected
-    row = np.searchsorted(track.stamps, stamps)
-    inside = (row < len(track)) & (stamps >= track.start)
-    counts = [np.bincount(row[rows], minlength=len(track)) for rows in (inside, inside & bad)]
+    of_fixes = fixes_along(track.stamps, fix_stamps, rejected)
     numbers = np.column_stack(
         [track.stamps, *frame.to_geodetic(track.positions), angles, _stddevs(track, angles)]
     )
     with replacing(path) as file:
         file.write((",".join(COLUMNS) + "\n").encode())
-        for values, *of_fixes in zip(numbers.tolist(), *(one.tolist() for one in counts), strict=True):
+        for values in np.column_stack([numbers, *of_fixes.values()]).tolist():
             cells = ("" if np.isnan(value) else f"{value:.10g}" for value in values[4:])
             place = f"{values[0]:.6f},{values[1]:.10f},{values[2]:.10f},{values[3]:.4f}"
-            file.write(f"{place},{','.join(cells)},{of_fixes[0]},{of_fixes[1]}\n".encode())
+            file.write(f"{place},{','.join(cells)}\n".encode())
+
+
+def fixes_along(
+    stamps: Array, fix_stamps: Array | None, rejected: NDArray[np.bool_] | None
+) -> dict[str, Array]:
+    """Columns of a track with `stamps` (k,) s, by fixes (m,): how many lie since the row before, and how many of these
+    were rejected; how many seconds it is to the nearest that was not, NaN where there is none.
+    """
+    fixes = np.empty(0) if fix_stamps is None else fix_stamps
+    bad = np.zeros(len(fixes), np.bool_) if rejected is None else rejected
+    row = np.searchsorted(stamps, fixes)
+    inside = (row < len(stamps)) & (fixes >= stamps[0])
+    counts = [np.bincount(row[rows], minlength=len(stamps)) for rows in (inside, inside & bad)]
+    used = np.concatenate([[-np.inf], np.sort(fixes[~bad]), [np.inf]])
+    after = np.searchsorted(used, stamps)
+    nearest = np.minimum(used[after] - stamps, stamps - used[after - 1])
+    return {
+        "fixes": counts[0], "fixes_rejected": counts[1],
+        "nearest_fix_s": np.where(np.isfinite(nearest), nearest, np.nan),
+    }  # fmt: skip
 
 
 def _axes(trajectory: Trajectory, frame: LocalFrame) -> tuple[Array, Array]:

@@ -7,14 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from factor_graphs import tum
 from factor_graphs.geodesy import LocalFrame
+from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.trajectory import Trajectory
 from gnss_sem_map.export.dates import are_dates
 from gnss_sem_map.export.geoparquet import GEOMETRY, write_shapes
 from gnss_sem_map.export.longitudes import box_around, line_through
+from gnss_sem_map.export.navigation import fixes_along
 from gnss_sem_map.files.atomic import replacing
+
+Array = NDArray[np.float64]
 
 
 def write_tum(trajectory: Trajectory, path: Path | str) -> None:
@@ -57,12 +62,20 @@ def write_geojson(trajectory: Trajectory, frame: LocalFrame, path: Path | str) -
         file.write(json.dumps({"type": "FeatureCollection", "features": [feature]}).encode())
 
 
-def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, path: Path | str) -> None:
+def write_geoparquet(
+    trajectory: Trajectory,
+    frame: LocalFrame,
+    epoch_ns: int,
+    path: Path | str,
+    fix_stamps: Array | None = None,
+    rejected: NDArray[np.bool_] | None = None,
+) -> None:
     """Write a point per pose as GeoParquet 1.1: WGS 84 (EPSG:4979), heights above the ellipsoid.
 
     Columns: `time` (UTC; null where the log has no date), `stamp_s`, `heading_deg` from north over east, `speed_mps`
-    where velocities are known, `stddev_east_m`, `stddev_north_m`, `stddev_up_m` where covariances are, and `geometry`
-    (WKB). Raises DataError when the file cannot be written.
+    where velocities are known, `stddev_east_m`, `stddev_north_m`, `stddev_up_m`, `stddev_heading_deg` where covariances
+    are, the columns of `navigation.fixes_along` where fixes are, and `geometry` (WKB). Raises DataError when the
+    file cannot be written.
     """
     import pyarrow as pa
 
@@ -80,5 +93,9 @@ def write_geoparquet(trajectory: Trajectory, frame: LocalFrame, epoch_ns: int, p
     if trajectory.covariances is not None:
         names = (f"stddev_{axis}_m" for axis in ("east", "north", "up"))
         columns |= dict(zip(names, trajectory.position_stddevs.T, strict=True))
+        of_heading = stddevs_of_heading(trajectory.T_map_imu[:, :3, :3], trajectory.covariances)
+        columns["stddev_heading_deg"] = np.degrees(of_heading)
+    if fix_stamps is not None:
+        columns |= fixes_along(trajectory.stamps, fix_stamps, rejected)
     columns[GEOMETRY] = pa.array(shapely.to_wkb(shapely.points(places), byte_order=1).tolist(), pa.binary())
     write_shapes(pa.table(columns), ["Point Z"], box_around(places), True, path)

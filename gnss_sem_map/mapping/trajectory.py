@@ -137,7 +137,9 @@ def _plain(settings: TrajectorySettings, with_lidar: bool) -> TrajectorySettings
     """How a drive is smoothed first: before LiDAR odometry, only the motion within a sweep counts."""
     if not with_lidar:
         return settings
-    return settings.model_copy(update={"vehicle_constraint": "off", "estimate_time_offset": False})
+    return settings.model_copy(
+        update={"vehicle_constraint": "off", "estimate_time_offset": False, "forward_backward": False}
+    )
 
 
 def _bound(

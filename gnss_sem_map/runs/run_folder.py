@@ -279,18 +279,18 @@ def write_trajectory_files(folder: Path, located: Located, delivery: DeliverySet
     write_kitti(trajectory, folder / "trajectory_kitti.txt")
     if frame is not None:
         write_geojson(trajectory, frame, folder / "trajectory.geojson")
-        write_geoparquet(trajectory, frame, located.log.epoch_ns, folder / "trajectory_wgs84.parquet")
         _write_navigation(folder, located, frame)
 
 
 def _write_navigation(folder: Path, located: Located, frame: LocalFrame) -> None:
-    """Write the SBET, where the log has dates, and the table of attitudes and fixes."""
+    """Write what tells of the fixes along the track, and the SBET, where the log has dates."""
     trajectory, log, solution = located.trajectory, located.log, located.solution
     times = log.epoch_ns + np.round(1e9 * trajectory.stamps[[0, -1]]).astype(np.int64)
     if are_dates(times).all():
         write_sbet(trajectory, frame, log.epoch_ns, folder / "trajectory.sbet")
     fixes = None if log.gnss is None or solution is None else log.gnss.stamps
     rejected = None if fixes is None or solution is None else solution.rejected
+    write_geoparquet(trajectory, frame, log.epoch_ns, folder / "trajectory_wgs84.parquet", fixes, rejected)
     write_attitude(trajectory, frame, folder / "trajectory_attitude.csv", fixes, rejected)
 
 

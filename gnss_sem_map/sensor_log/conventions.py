@@ -78,6 +78,11 @@ class SensorConventions(BaseModel):
         None, ge=-3600, le=3600, description="Moment of a point minus its stamp."
     )
 
+    @property
+    def conventions(self) -> SensorConventions:
+        """These alone, of a file that says more."""
+        return SensorConventions(**self.model_dump(include=set(SensorConventions.model_fields)))
+
     def over(self, drive: SensorConventions) -> SensorConventions:
         """These conventions, completed with those of the drive."""
         return drive.model_copy(update=self.model_dump(exclude_none=True))

@@ -89,7 +89,11 @@ def test_headings_never_cost_accuracy(simulate):
         (lambda a: -a, "turns against the vehicle"),
         (lambda a: np.pi / 2 - a, "turns against the vehicle"),
         (lambda a: a + np.pi, "exchanged"),
-        (lambda a: a + np.radians(12.0), "° off the heading of the motion"),
+        (lambda a: a + np.radians(12.0), "it is +11"),
+        (lambda a: a - np.radians(90.0), "it is -91"),
+        (lambda a: a + np.radians(8.0), "° off the heading of the motion"),
+        (lambda a: np.radians(a % (2 * np.pi)), "is it in radians, not degrees?"),
+        (lambda a: np.random.default_rng(3).uniform(-np.pi, np.pi, len(a)), "it does not follow the motion"),
     ],
 )
 def test_a_wrong_sign_or_a_constant_offset_is_found_against_the_motion(simulate, made, said):

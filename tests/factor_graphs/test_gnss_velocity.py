@@ -78,6 +78,17 @@ def test_another_unit_or_order_is_found_against_the_positions(simulate, made, sa
     np.testing.assert_allclose(found.keyframes.positions, plain.keyframes.positions, atol=1e-6)
 
 
+def test_a_velocity_along_the_axes_of_the_vehicle_is_named_and_not_used(simulate):
+    """Drivers of ROS publish both as a TwistStamped."""
+    drive = simulate(1, 60.0, ImuNoise())
+    right = velocities_of(drive, 1)
+    R = drive.motion.poses(right.stamps)[:, :3, :3]
+    wrong = replace(right, velocities=np.einsum("kji,kj->ki", R, right.velocities))
+    plain, found = (smooth(drive.imu, drive.fixes, FRAME, FREE, LEVER, also=also) for also in ((), (wrong,)))
+    assert any("are they along the axes of the vehicle, not east, north?" in note for note in found.notes)
+    np.testing.assert_allclose(found.keyframes.positions, plain.keyframes.positions, atol=1e-6)
+
+
 def test_noise_that_is_not_stated_is_found(simulate):
     """Velocities with six times the noise that they state: the claim of the solution stays honest."""
     ratios = []

@@ -84,6 +84,21 @@ def test_points_of_another_crs_are_named_and_not_held(simulate, made, said):
     assert sum(p.used for p in found.points) == (2 if "P3" in said else 0)
 
 
+@pytest.mark.parametrize("metres", [300.0, 5000.0])
+def test_points_without_a_moment_that_are_nowhere_near_are_of_another_crs(simulate, metres):
+    drive = simulate(1, 100.0, ImuNoise())
+    way = antennas(drive, np.arange(0.0, 100.0, 0.1))
+    far = np.add(antennas(drive, STAMPS), [metres, metres, 0])
+    nearest = np.linalg.norm((far[:, None] - way)[..., :2], axis=2).min()
+    found = smooth(
+        drive.imu, drive.fixes, FRAME, FREE, LEVER, also=(surveyed(drive, far, np.full(4, np.nan)),)
+    )
+    [note] = [note for note in found.notes if note.startswith("surveyed points: 0 of 3")]
+    said = float(note.split("the nearest lies ")[1].split(" m from the way")[0])
+    assert said == pytest.approx(nearest, abs=5)
+    assert note.endswith("of another datum, CRS or drive?")
+
+
 def test_points_are_read_in_degrees_or_in_a_projected_crs(tmp_path: Path):
     lat, lon = np.array([49.001, 49.0]), np.array([8.401, 8.41])
     east, north = Transformer.from_crs(4326, 25832, always_xy=True).transform(lon, lat)

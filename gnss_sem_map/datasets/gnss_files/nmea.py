@@ -25,9 +25,7 @@ STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
 USED = ("GGA", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
 TIMELESS = ("VTG", "HDT", "THS")
-MPS_PER_KNOT, VELOCITY_STDDEV_MPS = 1852 / 3600, 0.1
-"""NMEA does not tell how good a velocity is; receivers of all makes promise 0.03 to 0.1 m/s. What the drive shows is
-larger where it is."""
+MPS_PER_KNOT = 1852 / 3600
 AT_REST_MPS = 0.1
 """Slower than this, receivers leave the course out."""
 
@@ -79,9 +77,6 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     up = np.full(len(flat), np.nan)
     found.more["headings_deg"] = np.array([headings.get(int(s % DAY_NS), np.nan) for s in found.stamps_ns])
     found.more["velocities"] = np.column_stack([flat, up])
-    found.more["velocity_stddevs"] = np.where(
-        np.isfinite(found.more["velocities"]), VELOCITY_STDDEV_MPS, np.nan
-    )
     return found
 
 

@@ -56,6 +56,8 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
         later = steps[steps > 0]  # of messages that are there twice, one has no step
         usual = float(np.median(later)) if len(later) else 0.0
         gaps = steps[steps > GAP_STEPS * usual] if len(steps) > 2 else steps[:0]
+        if taken == "IMU" and len(messages) and _tells_orientation_alone(bag, messages):
+            taken = "heading"
         is_sensor = taken in roles.KINDS and len(messages) > 0
         frame, notes = _looked_into(bag, messages, taken, transforms) if is_sensor else ("", [])
         found.append(
@@ -87,6 +89,11 @@ def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
                 f"# {key}: {{topic: ...}}  # found none"
                 + ("" if key == "imu" else "; or a file: see the guide")
             )
+    parts += [
+        f"  # {what}: {{topic: {topic.name}}}  # if it is of this receiver; its axes: see the guide"
+        for what in ("velocity", "heading")
+        for topic in of[what]
+    ]
     for key, sensor in (("lidars", "LiDAR"), ("cameras", "camera")):
         parts.append(f"{key}:" if of[sensor] else f"{key}: {{}}")
         for name, topic in _named(of[sensor]).items():
@@ -104,6 +111,8 @@ def _looked_into(
     """Frame of a topic's first message, and what is odd about the topic."""
     try:
         first = decode(bag, messages, 0)
+        if not hasattr(first, "header"):
+            return "", []
         frame, notes = str(first.header.frame_id).strip("/"), _stamp_notes(bag, messages)
     except DataError as error:
         return "", [str(error)]
@@ -118,6 +127,15 @@ def _looked_into(
     if taken in ("LiDAR", "camera") and frame not in transforms.frames:
         notes.append(f"its frame {frame!r} is not in {TF_STATIC}: set frame or the pose")
     return frame, notes
+
+
+def _tells_orientation_alone(bag: Bag, messages: Messages) -> bool:
+    """Whether the first message of an Imu topic says that it has neither rate nor force."""
+    try:
+        first = decode(bag, messages, 0)
+    except DataError:
+        return False
+    return bool(first.angular_velocity_covariance[0] == first.linear_acceleration_covariance[0] == -1)
 
 
 def _stamp_notes(bag: Bag, messages: Messages) -> list[str]:

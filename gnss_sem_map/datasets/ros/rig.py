@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,25 @@ class ImuTopic(_Topic):
     )
 
 
+class VelocityTopic(_Section):
+    """Velocity of the antenna: a topic of TwistStamped or TwistWithCovarianceStamped."""
+
+    topic: str = Field(description="Name of the topic.")
+    axes: Literal["enu", "ned"] = Field("enu", description="East, north, up, or north, east, down.")
+    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
+
+
+class HeadingTopic(_Section):
+    """Heading between two antennas: a topic of Imu (its orientation), QuaternionStamped or Float64 (degrees)."""
+
+    topic: str = Field(description="Name of the topic.")
+    axes: Literal["enu", "ned"] | None = Field(
+        None,
+        description="enu: counter-clockwise from east, ned: clockwise from north; default: enu of Imu, else ned.",
+    )
+    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
+
+
 class GnssTopic(_Section):
     """The receiver: a topic of NavSatFix, or a file."""
 
@@ -67,8 +86,10 @@ class GnssTopic(_Section):
     )
     p_imu_antenna2: tuple[float, float, float] | None = Field(
         None,
-        description="Second antenna, m, where a file tells headings; default: the heading is that of the IMU.",
+        description="Second antenna, m, where headings are told; default: the heading is that of the IMU.",
     )
+    velocity: VelocityTopic | None = Field(None, description="Its velocity, in place of that of a file.")
+    heading: HeadingTopic | None = Field(None, description="Its heading, in place of that of a file.")
 
 
 class LidarTopic(_Topic):

@@ -19,7 +19,13 @@ KINDS = {
     "receiver": (GNSS,),
     "LiDAR": (clouds.KIND,),
     "camera": (pictures.RAW, pictures.COMPRESSED),
+    "velocity": ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped"),
+    "heading": (
+        "geometry_msgs/msg/QuaternionStamped",
+        "std_msgs/msg/Float64",
+    ),  # and an Imu of orientations alone
 }
+"""Those of velocities and headings, which may also be a command or an angle of anything, are never taken unasked."""
 
 
 def completed(bag: Bag, rig: Rig) -> Rig:
@@ -30,7 +36,8 @@ def completed(bag: Bag, rig: Rig) -> Rig:
     """
     update: dict[str, object] = {}
     if rig.imu is None:
-        topic = _only(bag, "IMU", "imu: {topic: ...}")
+        of_heading = rig.gnss.heading.topic if rig.gnss and rig.gnss.heading else None
+        topic = _only(bag, "IMU", "imu: {topic: ...}", but=of_heading)
         update["imu"] = None if topic is None else ImuTopic(topic=topic)
     if rig.gnss is None or (rig.gnss.topic is None and rig.gnss.file is None):
         topic = _only(bag, "receiver", "gnss: {topic: ...}")
@@ -83,8 +90,8 @@ def missing(bag: Bag, rig: Rig) -> list[Skip]:
     return [Skip(SENSOR, shown(bag.path), reason)]
 
 
-def _only(bag: Bag, sensor: str, key: str) -> str | None:
-    found = of_kind(bag, sensor)
+def _only(bag: Bag, sensor: str, key: str, but: str | None = None) -> str | None:
+    found = [topic for topic in of_kind(bag, sensor) if topic != but]
     if len(found) > 1:
         raise DataError(
             f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
@@ -97,13 +104,15 @@ def _check(bag: Bag, rig: Rig) -> None:
     named: list[tuple[str, str, str | None]] = [
         *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
         *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),
+        *([("gnss.velocity", "velocity", rig.gnss.velocity.topic)] if rig.gnss and rig.gnss.velocity else []),
+        *([("gnss.heading", "heading", rig.gnss.heading.topic)] if rig.gnss and rig.gnss.heading else []),
         *((f"lidars.{name}", "LiDAR", one.topic) for name, one in rig.lidars.items()),
         *((f"cameras.{name}", "camera", one.topic) for name, one in rig.cameras.items()),
     ]
     places: dict[str, str] = {}
     for place, sensor, topic in named:
         if topic is not None:
-            _check_kind(bag, place, topic, KINDS[sensor])
+            _check_kind(bag, place, topic, (*KINDS[sensor], IMU) if sensor == "heading" else KINDS[sensor])
             if places.setdefault(topic, place) != place:
                 raise DataError(
                     f"rig.yaml: {place}: {topic} is {places[topic]} already, and would count twice; correct or remove"

@@ -143,6 +143,9 @@ def test_deviations_of_angles_are_those_of_samples_and_fixes_are_counted(tmp_pat
     np.testing.assert_allclose([float(row["stamp_s"]) for row in rows], np.arange(11) * 0.1, atol=1e-6)
     assert [int(row["fixes"]) for row in rows] == [1, 0, 3, 0, 0, 0, 0, 0, 0, 0, 1]
     assert [int(row["fixes_rejected"]) for row in rows] == [0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 1]
+    used = fixes[~rejected]
+    nearest = np.abs(np.arange(11)[:, None] * 0.1 - used).min(axis=1)
+    np.testing.assert_allclose([float(row["nearest_fix_s"]) for row in rows], nearest, atol=1e-6)
     drawn = np.random.default_rng(6).multivariate_normal(np.zeros(6), C, 20_000)[:, :3]
     many = np.tile(np.eye(4), (len(drawn), 1, 1))
     many[:, :3, :3] = T[:3, :3] @ Rotation.from_rotvec(drawn).as_matrix()

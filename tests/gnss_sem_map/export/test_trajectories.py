@@ -140,6 +140,26 @@ def test_geopandas_reads_the_geoparquet_back(
     np.testing.assert_allclose(np.sin(np.radians(table["heading_deg"])), np.sin(east), atol=1e-9)
 
 
+def test_the_geoparquet_tells_heading_and_fixes_along_the_track(
+    uncertain: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
+) -> None:
+    """The deviation of the heading is that of turns that are drawn; every fix within is counted once."""
+    rng, span = np.random.default_rng(8), uncertain.end - uncertain.start
+    fixes = np.sort(rng.uniform(uncertain.start - 1, uncertain.end, 30))
+    rejected = rng.random(30) < 0.3
+    write_geoparquet(uncertain, karlsruhe, 0, tmp_path / "track.parquet", fixes, rejected)
+    table = geopandas.read_parquet(tmp_path / "track.parquet")
+    inside = fixes >= uncertain.start
+    assert (table["fixes"].sum(), table["fixes_rejected"].sum()) == (inside.sum(), (inside & rejected).sum())
+    nearest = np.abs(uncertain.stamps[:, None] - fixes[~rejected]).min(axis=1)
+    np.testing.assert_allclose(table["nearest_fix_s"], nearest)
+    assert nearest.max() > span / 100
+    assert uncertain.covariances is not None
+    turns = rng.multivariate_normal(np.zeros(3), uncertain.covariances[5, :3, :3], 100_000)
+    about_up = turns @ uncertain.T_map_imu[5, 2, :3]
+    assert table["stddev_heading_deg"][5] == pytest.approx(np.degrees(about_up.std()), rel=0.02)
+
+
 def test_a_log_without_a_date_has_no_times(
     uncertain: Trajectory, karlsruhe: LocalFrame, tmp_path: Path
 ) -> None:

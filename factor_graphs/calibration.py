@@ -28,8 +28,8 @@ CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
 # Unasked, an error is corrected only beyond doubt: where chance shows as much in one of two million drives.
 SURELY = 5.0
 DOUBT = 1 - probability_below(SURELY**2, 1)
-# A scale is in question where fixes and IMU alone show more than those of five good gyroscopes of six.
-QUESTIONABLE = 2.0
+# A scale is in question where fixes and IMU alone show more than those of half of all good gyroscopes.
+QUESTIONABLE = 0.5
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
 STRETCHES, SHORTEST_S, PLACED_S = 8, 20.0, 1.0
 # Columns of an IMU factor: pose, velocity, pose, velocity, biases, biases.

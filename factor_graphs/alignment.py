@@ -13,6 +13,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
 from factor_graphs.intervals import ImuIntervals, nearest
 from factor_graphs.measurements import GnssFixes
@@ -27,9 +28,8 @@ CRUISE_NOISE_DENSITY = 1.5
 MIN_COURSE_SPEED, MAX_COURSE_AGE = 1.5, 1.5
 # The gyroscope's heading is tied to the course over this long, s.
 HEADING_WINDOW_S = 20.0
-# The acceleration tells where the imu looks when it agrees with the fixes by so many standard deviations of chance; so
-# far from the axis of the vehicle, rad, it looks aside.
-SURELY, LOOKING_ASIDE = 5.0, np.pi / 4
+# So far from the axis of the vehicle, rad, the imu looks aside.
+LOOKING_ASIDE = np.pi / 4
 # Over this long, s, a vehicle goes more forward than backward.
 FORWARD_WINDOW_S = 100.0
 
@@ -160,7 +160,7 @@ def _off_axis(intervals: ImuIntervals, level: Array, axis: Array, velocities: Ar
     force = np.add.reduceat(intervals.specific_force * intervals.durations[:, None], intervals.bounds[:-1])
     gained = (force @ level.T)[:, :2] @ [1, 1j] * np.exp(0.5j * (axis[1:] + axis[:-1]))
     products = np.diff(velocities[:, :2] @ [1, 1j]) * gained.conj()
-    if abs(products.sum()) < SURELY * np.linalg.norm(products):
+    if abs(products.sum()) < BEYOND_DOUBT * np.linalg.norm(products):
         return None
     off = float(np.angle(products.sum()))
     straight = np.pi * round(off / np.pi)

@@ -13,6 +13,7 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import AntennaHeadings
@@ -24,9 +25,9 @@ Array = NDArray[np.float64]
 
 # A solution whose heading is known better than this, rad, judges that of the antennas.
 SURE_HEADING = 0.1
-# An offset is one beyond so many standard deviations of the heading of the solution, and this, rad: the place of an
+# An offset is one beyond doubt of the heading of the solution, and beyond this, rad: the place of an
 # antenna 1 m away is known to 1 cm.
-BEYOND_DOUBT, LEAST_OFFSET = 5.0, 0.01
+LEAST_OFFSET = 0.01
 # The heading of a solution is wrong by about the same for so long, s.
 SLOW_S = 20.0
 # A heading that scatters by more, rad, is of something else: one that scatters by three times less when it is mirrored,

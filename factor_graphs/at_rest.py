@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.errors import MeasurementError
 from factor_graphs.measurements import ImuSamples, gaps
 
@@ -17,8 +18,6 @@ QUIET, QUIETEST, FEWEST_IN_WINDOW = 2.0, 0.02, 50
 # rad/s, stay within these: a bias that warms up does, a vehicle, whose road has slopes, does not.
 LEAST_SPAN_S, PARTS = 60.0, 10
 STEADY_FORCE, STEADY_RATE = 0.1, 0.01
-# A mean of so many standard deviations of its noise differs.
-BEYOND = 5.0
 # Gravity on Earth is within this share of 9.81 m/s², any accelerometer's bias included.
 GRAVITY, OFF_GRAVITY = 9.81, 0.1
 # The middle nine tenths of the steps of the stamps differ by less than this share of a step.
@@ -120,6 +119,6 @@ def _moved(samples: ImuSamples) -> str:
     ):
         means = np.array([part.mean(axis=0) for part in np.array_split(values, PARTS)])
         noise = values.std(axis=0).max() / np.sqrt(len(samples) / PARTS)
-        if (change := float(np.ptp(means, axis=0).max())) > steady + BEYOND * noise:
+        if (change := float(np.ptp(means, axis=0).max())) > steady + BEYOND_DOUBT * noise:
             return f"its {what} changes by {change:.2g} {unit} within {np.ptp(samples.stamps):.0f} s"
     return ""

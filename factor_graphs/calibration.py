@@ -16,7 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import C
 from numpy.typing import NDArray
 
-from factor_graphs.chi_square import probability_below, quantile
+from factor_graphs.chi_square import BEYOND_DOUBT, probability_below, quantile
 from factor_graphs.elimination import by_sections, eliminate, shared_keys, split
 from factor_graphs.model import motion_from
 from factor_graphs.problem import Fit, Problem
@@ -25,9 +25,7 @@ Array = NDArray[np.float64]
 
 # What may be wrong before anything is estimated: clock s, antenna m, scale of the gyroscope.
 CLOCK_STDDEV, ANTENNA_STDDEV, SCALE_STDDEV = 0.5, 2.0, 0.03
-# Unasked, an error is corrected only beyond doubt: where chance shows as much in one of two million drives.
-SURELY = 5.0
-DOUBT = 1 - probability_below(SURELY**2, 1)
+DOUBT = 1 - probability_below(BEYOND_DOUBT**2, 1)
 # A scale is in question where fixes and IMU alone show more than those of half of all good gyroscopes.
 QUESTIONABLE = 0.5
 # The clock is looked at in so many stretches, none shorter than so many s; where a step is found, to so many s.
@@ -179,7 +177,9 @@ def correct(
     if of_steps:
         of_each = zip(now.clock_steps, found[of_time:].tolist(), sigma[of_time:].tolist(), strict=False)
         steps = tuple((begin, step + more, stddev) for (begin, step, _), more, stddev in of_each)
-        better = replace(better, clock_steps=tuple(one for one in steps if abs(one[1]) > SURELY * one[2]))
+        better = replace(
+            better, clock_steps=tuple(one for one in steps if abs(one[1]) > BEYOND_DOUBT * one[2])
+        )
         if len(better.clock_steps) < of_steps:  # beside a larger one it looked like one
             return better, np.inf
     if with_lever:

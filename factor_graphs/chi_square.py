@@ -2,6 +2,9 @@
 
 from scipy.special import chdtr, gammaincinv
 
+BEYOND_DOUBT = 5.0
+"""In standard deviations: chance shows as much in one of two million drives."""
+
 
 def quantile(probability: float, dof: float) -> float:
     """The value that a sum of `dof` squared standard normal variables stays below with this probability."""

@@ -7,7 +7,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factor_graphs.calibration import QUESTIONABLE, SURELY, Calibration, clock_errors, correct
+from factor_graphs.calibration import QUESTIONABLE, Calibration, clock_errors, correct
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.problem import (
     RELATIVE_TOLERANCE,
@@ -147,7 +148,7 @@ def calibrate(fit_to: FitTo, settings: SmootherSettings, given: Array) -> tuple[
     for _ in range(CALIBRATION_ROUNDS):
         errors, calibration = clock_errors(problem, fit, calibration, looks)
         offset, sigma = errors.clock_offset(calibration.begins)
-        with_time |= looks and abs(offset) > SURELY * sigma
+        with_time |= looks and abs(offset) > BEYOND_DOUBT * sigma
         better, moved = correct(errors, calibration, given, with_time, with_lever)
         if moved < NEGLIGIBLE:
             of_lever, of_clock = better.p_imu_antenna_stddevs, better.time_offset_stddev_s or sigma

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from factor_graphs.at_rest import Windows
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.measurements import GnssFixes, ImuSamples
 
 Array = NDArray[np.float64]
@@ -24,7 +25,7 @@ COARSE, STEP = 2e-3, 5e-4
 CHORD_S, LEAST_COURSE_STDDEV, WINDOW_S = 2.0, 0.05, 100.0
 # A bias is better than another when its log-likelihood is so much larger, 5 standard deviations; and the gyroscope
 # turns with the vehicle when at least this share of what the courses can tell agrees.
-SURELY, AGREEING = 12.5, 0.5
+SURELY, AGREEING = BEYOND_DOUBT**2 / 2, 0.5
 # A second of standstill: the IMU is about as quiet as in its quietest tenth, and the fixes stay within so many standard
 # deviations. So many of them are believed, if half of them are within so many rad/s: what
 # stands turns at one rate.

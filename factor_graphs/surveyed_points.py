@@ -13,6 +13,7 @@ from gtsam.symbol_shorthand import X
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from factor_graphs.chi_square import BEYOND_DOUBT
 from factor_graphs.constraints import STANDING_SPEED
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.errors import MeasurementError
@@ -24,8 +25,8 @@ from factor_graphs.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-# A point fits within so many of its and the solution's standard deviations, per axis, and this, m.
-FITTING, LEAST_FITTING_M = 5.0, 0.1
+# A point fits where neither its nor the solution's standard deviations leave a doubt, per axis, and this, m.
+LEAST_FITTING_M = 0.1
 # A stop belongs to a point that is no farther from it than this, m.
 FARTHEST_STOP_M = 5.0
 # A drive has no points farther away than this, m.
@@ -136,7 +137,7 @@ def observe_points(points: SurveyedPoints, problem: Problem, fit: Fit) -> Observ
         covariances, _ = keyframe_covariances(fit.graph, fit.values, len(problem.intervals.keyframes))
         R = from_values(fit.values, len(covariances))[0][at[there], :3, :3]
         of_place = np.einsum("kij,kjl,kil->ki", R, covariances[at[there], 3:6, 3:6], R)
-        limits = FITTING * np.sqrt(of_place + points.stddevs[there] ** 2) + LEAST_FITTING_M
+        limits = BEYOND_DOUBT * np.sqrt(of_place + points.stddevs[there] ** 2) + LEAST_FITTING_M
         fits[there] = (np.abs(off[there]) < limits).all(axis=1)
     held = points.control & fits
     stamps = problem.intervals.keyframes[at] + late

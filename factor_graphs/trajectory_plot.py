@@ -43,7 +43,7 @@ def write_trajectory_plot(solution: Solution, fixes: GnssFixes, path: Path | str
     figure, title = Figure(figsize=(15, PANEL_INCHES * (len(panels) + 1)), dpi=110), _title(solution, fixes)
     FigureCanvasAgg(figure)
     # fixed margins: a layout engine would draw everything twice
-    edges = {"left": 0.05, "right": 0.94, "bottom": 0.06, "top": 0.96 - LINE_SHARE * (1 + title.count("\n"))}
+    edges = {"left": 0.05, "right": 0.93, "bottom": 0.06, "top": 0.96 - LINE_SHARE * (1 + title.count("\n"))}
     grid = figure.add_gridspec(len(panels) + 1, 2, width_ratios=[1.1, 1.0], wspace=0.14, hspace=0.1, **edges)
     _track(figure.add_subplot(grid[:, 0]), solution, fixes)
     below = figure.add_subplot(grid[-1, 1])
@@ -132,6 +132,7 @@ def _separation(axes: "Axes", solution: Solution, _fixes: GnssFixes) -> None:
 def _biases(axes: "Axes", solution: Solution) -> None:
     stamps = solution.keyframes.stamps
     rates = axes.twinx()
+    rates.ticklabel_format(axis="y", scilimits=(-2, 3))
     for i, (name, colour) in enumerate(zip("xyz", COLOURS, strict=True)):
         axes.plot(stamps, solution.biases[:, i], color=colour, linewidth=1, label=name)
         rates.plot(stamps, np.degrees(solution.biases[:, 3 + i]), ":", color=colour, linewidth=1.2)

@@ -21,6 +21,8 @@ from gnss_sem_map.sensor_log import Image
 
 IMAGENET_MEAN = "0.485,0.456,0.406"
 IMAGENET_STD = "0.229,0.224,0.225"
+# Numbers between 0 and 1, up to rounding, are probabilities.
+ROUNDING = 1e-3
 
 ONNX_ERRORS = (
     state.Fail, state.InvalidArgument, state.InvalidGraph, state.InvalidProtobuf, state.NoModel, state.NoSuchFile,
@@ -29,7 +31,9 @@ ONNX_ERRORS = (
 
 
 class OnnxSegmenter:
-    """One input (1, 3, h, w) float32, one output (1, c, h', w') of class logits; other layouts raise DataError.
+    """One input (1, 3, h, w) float32, one output (1, c, h', w') of class logits, or of probabilities.
+
+    Other layouts raise DataError.
 
     The pixels, 0..`pixel_max`, are normalised with `mean` and `std`: three numbers, in the network's channel `order`.
     A network of a fixed input size gets the image resized to it. Class names as in `named_classes`.
@@ -80,7 +84,17 @@ class OnnxSegmenter:
             raise DataError(
                 f"{self._path} on image {image.number}: logits are not finite; is the normalisation right?"
             )
-        return resized_softmax(np.asarray(logits, np.float32)[self._kept], (height, width))
+        return resized_softmax(_as_logits(np.asarray(logits, np.float32))[self._kept], (height, width))
+
+
+def _as_logits(output: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Logits (c, h, w) whose softmax is the output where that is probabilities: a softmax or a sigmoid is in the file.
+
+    Logits of a whole image are hardly ever all between 0 and 1.
+    """
+    if output.min() < -ROUNDING or output.max() > 1 + ROUNDING:
+        return output
+    return np.log(np.maximum(output, np.finfo(np.float32).tiny))
 
 
 def _open_session(path: Path, device: str) -> Any:

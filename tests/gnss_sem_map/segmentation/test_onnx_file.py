@@ -42,6 +42,9 @@ def save(
     if kind == "argmax":
         nodes.append(helper.make_node("ArgMax", ["y"], ["ids"], axis=1))
         output = helper.make_tensor_value_info("ids", TensorProto.INT64, [1, 1, *size])
+    if kind in ("Softmax", "Sigmoid"):
+        nodes.append(helper.make_node(kind, ["y"], ["p"], **({"axis": 1} if kind == "Softmax" else {})))
+        output = helper.make_tensor_value_info("p", TensorProto.FLOAT, [1, count, *size])
     if kind == "two inputs":
         inputs.append(helper.make_tensor_value_info("z", TensorProto.FLOAT, [1]))
     if kind == "four channels":
@@ -150,3 +153,22 @@ def test_logits_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "net.onnx", np.where(WEIGHTS > 1, np.nan, WEIGHTS))
     with pytest.raises(DataError, match="not finite"):
         open_segmenter(f"onnx:{path}", URBAN, "cpu")(camera())
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"), [("Softmax", ""), ("Softmax", "&shrink=1"), ("Sigmoid", "&shrink=1")]
+)
+def test_probabilities_that_a_network_gives_are_kept(tmp_path: Path, kind: str, more: str) -> None:
+    """No second softmax; of a sigmoid for each class, the share of all."""
+    plain, with_it = (save(tmp_path / f"{n}.onnx", WEIGHTS, kind=of) for n, of in enumerate(("conv", kind)))
+    names = ",".join((*URBAN.names[:5], "sky"))
+    ours, theirs = (
+        open_segmenter(f"onnx:{path}?classes={names}{more}", URBAN, "cpu") for path in (plain, with_it)
+    )
+    if kind == "Softmax":
+        np.testing.assert_allclose(theirs(camera()), ours(camera()), atol=1e-5)
+    else:
+        seen = (PIXELS / 255 - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
+        alone = 1 / (1 + np.exp(-(seen @ WEIGHTS.T)))
+        expected = alone / alone.sum(axis=2, keepdims=True)
+        np.testing.assert_allclose(theirs(camera()), expected, atol=1e-4)

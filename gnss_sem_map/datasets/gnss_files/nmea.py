@@ -8,14 +8,19 @@ GGA's height is above the geoid; with the geoid's own height, which it also tell
 from __future__ import annotations
 
 import datetime
+import re
+from collections.abc import Iterator
+from functools import reduce
 from importlib.util import find_spec
+from operator import xor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.gnss_files.positions import Positions
-from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, nearest
+from gnss_sem_map.datasets.gnss_files.time_systems import DAY_NS, WEEK_NS, nearest
 from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.files.untrusted import read_lines, shown
 from gnss_sem_map.sensor_log import Skip
@@ -24,8 +29,11 @@ STDDEVS_M = {1: (2.0, 4.0), 2: (0.6, 1.2), 3: (2.0, 4.0), 4: (0.02, 0.03), 5: (0
 """Horizontal and vertical, m, at a HDOP of 1: autonomous, differential, PPS, fixed and float RTK. Other qualities are
 no measurements: 0 none, 6 dead reckoning, 7 entered by hand, 8 simulated."""
 USED = ("GGA", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
+SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{2}}))?")
+"""What stands between $ and *, and the checksum behind it, if there is one."""
 TIMELESS = ("VTG", "HDT", "THS")
 MPS_PER_KNOT = 1852 / 3600
+ERA_NS = 1024 * WEEK_NS
 AT_REST_MPS = 0.1
 """Slower than this, receivers leave the course out."""
 
@@ -42,11 +50,9 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     clock: int | None = None  # of the last sentence with a time
     fixes: list[tuple[int, bool, list[float]]] = []
     lost: dict[str, int] = {}
-    for line in read_lines(path):
-        sentence, why = _sentence(line)
-        if sentence is None:
-            if why:
-                lost[why] = lost.get(why, 0) + 1
+    for sentence in _sentences(path):
+        if isinstance(sentence, str):
+            lost[sentence] = lost.get(sentence, 0) + 1
             continue
         if sentence.msgID not in TIMELESS:
             clock = _clock_ns(sentence.time)
@@ -98,13 +104,42 @@ def _joined(
             raise DataError(f"{shown(path)}: has no date, expected RMC or ZDA sentences beside GGA")
         midnights = np.concatenate([[0], np.cumsum(np.diff(stamps) < -DAY_NS // 2)])
         stamps = nearest(stamps + midnights * DAY_NS, DAY_NS, near_ns)
+    stamps = _of_this_era(stamps, near_ns if dated.any() else None, path, skips)
     table = np.array([values for _, _, values in fixes])
+    best = _best(stamps, table, path, skips)
+    stamps, table = stamps[best], table[best]
     given = [deviations.get(int(stamp % DAY_NS)) for stamp in stamps]
     stddevs = np.array([
         one if one is not None and all(isinstance(v, float) and v > 0 for v in one) else by_quality
         for one, by_quality in zip(given, table[:, 3:].tolist(), strict=True)
     ])  # fmt: skip
     return Positions(stamps, table[:, :3], stddevs, "utc", skips)
+
+
+def _of_this_era(
+    stamps_ns: NDArray[np.int64], near_ns: int | None, path: Path, skips: list[Skip]
+) -> NDArray[np.int64]:
+    """Stamps that are 1,024 weeks off the drive, once or more, moved there: a receiver began to count weeks anew."""
+    if near_ns is None:
+        return stamps_ns
+    off_ns = near_ns - int(np.median(stamps_ns))
+    eras = round(off_ns / ERA_NS)
+    if eras == 0 or abs(off_ns - eras * ERA_NS) > DAY_NS:
+        return stamps_ns
+    told = f"dates are {1024 * eras} weeks early, for the receiver counts weeks anew: corrected"
+    skips.append(Skip("date", shown(path), told, len(stamps_ns)))
+    return stamps_ns + eras * ERA_NS
+
+
+def _best(
+    stamps: NDArray[np.int64], table: NDArray[np.float64], path: Path, skips: list[Skip]
+) -> NDArray[np.intp]:
+    """The rows, in order, of the best fix of each moment."""
+    order = np.lexsort((np.arange(len(stamps)), table[:, 3], stamps))
+    first = np.append(True, np.diff(stamps[order]) > 0)
+    if lost := int((~first).sum()):
+        skips.append(Skip("fix", shown(path), "of the moment of a better or earlier one", lost))
+    return np.asarray(np.sort(order[first]))
 
 
 def _velocity(sentence: Any) -> tuple[float, float] | None:
@@ -134,26 +169,38 @@ def _heading(sentence: Any) -> float | None:
     return float(said) if isinstance(said, float | int) else None
 
 
-def _sentence(line: str) -> tuple[Any | None, str]:
-    """A sentence that is used, or why a line that looks like one is not."""
+def _sentences(path: Path) -> Iterator[Any]:
+    """The sentences that are used, and for what looks like one why it is not.
+
+    Bytes of other messages may stand before and behind them. Where no sentence of a file has a checksum, none needs it.
+    """
+    found = [one for line in read_lines(path) for one in SENTENCE.findall(line)]
+    are_checked = any(checksum for _, checksum in found)
+    for body, checksum in found:
+        if checksum or not are_checked:
+            yield _sentence(body, checksum or f"{reduce(xor, body.encode(), 0):02X}")
+        else:
+            yield "damaged"
+
+
+def _sentence(body: str, checksum: str) -> Any:
     from pynmeagps import NMEAReader, exceptions
 
-    start = line.find("$")
-    if start < 0 or line[start + 3 : start + 6] not in USED:
-        return None, ""
     try:
-        return NMEAReader.parse(line[start:].strip() + "\r\n"), ""
+        return NMEAReader.parse(f"${body}*{checksum}\r\n")
     except (
         exceptions.NMEAParseError,
         exceptions.NMEAMessageError,
         exceptions.NMEATypeError,
         ValueError,
     ) as error:
-        return None, "wrong checksum" if "checksum" in str(error) else "damaged"
+        return "wrong checksum" if "checksum" in str(error) else "damaged"
 
 
 def _moment_ns(sentence: Any) -> int | None:
     """Date and time of a sentence, ns since 1970; None where the receiver does not know them yet."""
+    if sentence.msgID == "RMC" and sentence.status != "A":
+        return None
     date, clock = sentence.date if sentence.msgID == "RMC" else _date(sentence), _clock_ns(sentence.time)
     if not isinstance(date, datetime.date) or clock is None:
         return None

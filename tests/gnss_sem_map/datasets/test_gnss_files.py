@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import datetime
 import json
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -286,6 +288,45 @@ def test_nmea_that_is_no_fix_is_counted(tmp_path: Path) -> None:
     assert any("height above the ellipsoid is unknown" in why for why in told)
     with pytest.raises(DataError, match="no GGA sentence with a fix"):
         read(nmea(tmp_path, "$GPGSV,1,1,00*79\n"))
+
+
+def test_nmea_among_binary_messages(tmp_path: Path) -> None:
+    """Of a receiver that sends both: a byte of a message may be a dollar sign, and no line end need be between."""
+    ns = [START_NS + k * 10**9 for k in range(4)]
+    before = [b"\xb5b\x01\x07$\x00\xff", b"$", b"\x24GN\x24", b""]
+    parts = [raw + gga(t).encode().rstrip() for raw, t in zip(before, ns, strict=True)]
+    path = tmp_path / "rover.nmea"
+    path.write_bytes(rmc(START_NS).encode() + b"\xb5\x62\n".join(parts))
+    assert read(path).stamps_ns.tolist() == ns
+
+
+def test_nmea_without_checksums(tmp_path: Path) -> None:
+    """A file that has none is read; one sentence without, among others, was cut."""
+    sentences = [rmc(START_NS), *(gga(START_NS + k * 10**9) for k in range(3))]
+    without = [one[: one.index("*")] + "\n" for one in sentences]
+    assert len(read(nmea(tmp_path, *without)).stamps_ns) == 3
+    found = read(nmea(tmp_path, *sentences[:3], without[3]))
+    assert len(found.stamps_ns) == 2
+    assert [skip.reason for skip in found.skips] == ["1 sentences: damaged"]
+
+
+def test_nmea_dates_of_another_count_of_weeks_and_of_void_sentences(tmp_path: Path) -> None:
+    early = START_NS - 1024 * 7 * 86400 * 10**9
+    found = read(nmea(tmp_path, rmc(early), gga(early), gga(early + 10**9)))
+    assert found.stamps_ns.tolist() == [START_NS, START_NS + 10**9]
+    assert any("1024 weeks early" in skip.reason for skip in found.skips)
+    void = rmc(early).replace(",A,", ",V,", 1)
+    void = void[: void.index("*")] + "*" + f"{reduce(xor, void[1 : void.index('*')].encode()):02X}\n"
+    found = read(nmea(tmp_path, rmc(START_NS), void, gga(START_NS), gga(START_NS + 10**9)))
+    assert found.stamps_ns.tolist() == [START_NS, START_NS + 10**9]
+
+
+def test_of_two_nmea_fixes_of_one_moment_the_better_is_kept(tmp_path: Path) -> None:
+    path = nmea(tmp_path, rmc(START_NS), gga(START_NS, 1), gga(START_NS, 4), gga(START_NS + 10**9, 5))
+    found = read(path)
+    assert found.stamps_ns.tolist() == [START_NS, START_NS + 10**9]
+    assert found.rows[:, 4].tolist() == [0.02, 0.3]
+    assert [skip.frames for skip in found.skips] == [1]
 
 
 # ---- SBET

@@ -73,6 +73,11 @@ ROWS = {
         "vehicles kept": (percent("refinement", f"{OURS}/SA_vehicle"),
                           percent("refinement", f"{PAPER}/SA_vehicle")),
     },
+    "docs/results.md": {
+        f"| {name} |": (f"{of['horizontal_m']:.3f} m", f"{of['heading_deg']:.2f}°", f"{of['deviations']:.2f}",
+                        f"{100 * of['covered']:.0f} %")
+        for name, of in results("field").items() if name != "made by"
+    },
     "docs/comparison.md": IN_BOTH | {
         "parked kept": tuple(percent("refinement", f"{rule}/{what}")
                              for rule in (OURS, PAPER) for what in ("DA", "SA_vehicle")),

@@ -67,23 +67,23 @@ IN_BOTH = {
                    of_drives(lambda drive: drive["peers"]["ratio"]["open3d"])),
 }  # fmt: skip
 """What a row of a table holds, by a word in it."""
+FIELD = {
+    f"| {name} |": (f"{of['horizontal_m']:.3f} m", f"{of['heading_deg']:.2f}°", f"{of['deviations']:.2f}",
+                    f"{100 * of['covered']:.0f} %")
+    for name, of in results("field").items() if name != "made by"
+}  # fmt: skip
 ROWS = {
     "README.md": IN_BOTH | {
         "vehicles removed": (percent("refinement", f"{OURS}/DA"), percent("refinement", f"{PAPER}/DA")),
         "vehicles kept": (percent("refinement", f"{OURS}/SA_vehicle"),
                           percent("refinement", f"{PAPER}/SA_vehicle")),
     },
-    "docs/results.md": {
-        f"| {name} |": (f"{of['horizontal_m']:.3f} m", f"{of['heading_deg']:.2f}°", f"{of['deviations']:.2f}",
-                        f"{100 * of['covered']:.0f} %")
-        for name, of in results("field").items() if name != "made by"
-    },
     "docs/comparison.md": IN_BOTH | {
         "parked kept": tuple(percent("refinement", f"{rule}/{what}")
                              for rule in (OURS, PAPER) for what in ("DA", "SA_vehicle")),
         "the same in numpy": (of_drives(lambda drive: drive["full chain"]["ratio_labels_decoded"]),),
     },
-    "docs/results.md": {
+    "docs/results.md": FIELD | {
         "strict mean IoU": tuple(f"{100 * value('fusion', f'{LABELS}/{way}/pooled/mean_iou'):.1f}"
                                  for way in ("single frame", "eq. 6", "default", "calibrated")),
         "expected calibration error": tuple(percent("fusion", f"{LABELS}/{way}/pooled/ece")

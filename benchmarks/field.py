@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def simulate(
     hertz: float = 1.0,
     moves: Callable[[float, np.random.Generator], RigidMotion] = random_drive,
     means: bool = False,
-    **gnss: object,
+    **gnss: Any,
 ) -> Log:
     """A drive without a mistake; with `means`, samples of the IMU are means of the interval before their stamp."""
     rng = np.random.default_rng(seed)
@@ -71,7 +72,7 @@ def simulate(
     values[:, 3:] += np.mean([part.angular_rate for part in exact], axis=0)
     imu = ImuSamples(stamps, values[:, :3], values[:, 3:])
     fix_stamps = np.arange(0.47, seconds - 0.5, 1 / hertz)
-    return Log(motion, imu, simulate_gnss(motion, fix_stamps, stddevs, LEVER, rng, **gnss), LEVER)  # type: ignore[arg-type]
+    return Log(motion, imu, simulate_gnss(motion, fix_stamps, stddevs, LEVER, rng, **gnss), LEVER)
 
 
 def turned(yaw_deg: float) -> Callable[[float, np.random.Generator], RigidMotion]:

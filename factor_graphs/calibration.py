@@ -170,7 +170,7 @@ def correct(
     )[1 - of_time : 1 + of_steps + of_lever]
     stddevs = np.repeat([CLOCK_STDDEV, ANTENNA_STDDEV], [of_time + of_steps, of_lever])
     found, covariance = errors.estimate(columns, stddevs, moved)
-    sigma, better = np.sqrt(np.diag(covariance)), replace(now)
+    sigma, better = np.sqrt(np.diag(covariance)), now
     if with_time:
         offset = now.time_offset_s + float(found[0])
         better = replace(better, time_offset_s=offset, time_offset_stddev_s=float(sigma[0]))

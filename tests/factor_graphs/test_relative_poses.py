@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.alignment import AttitudePrior
+from factor_graphs.doubts import NOTABLE_REJECTION
 from factor_graphs.errors import MeasurementError
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.measurements import GnssFixes, ImuNoise, ImuSamples
 from factor_graphs.relative_poses import NO_RELATIVE_POSES, RelativePoses
 from factor_graphs.settings import SmootherSettings
 from factor_graphs.simulation import Motion, follow, simulate_gnss
-from factor_graphs.smoothing import NOTABLE_REJECTION, Solution, smooth
+from factor_graphs.smoothing import Solution, smooth
 from factor_graphs.streaming import StreamingSmoother
 
 Array = NDArray[np.float64]

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import M
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from factor_graphs.intervals import ImuIntervals
 from factor_graphs.measurements import GnssFixes
@@ -19,6 +20,8 @@ STANDING_SPEED, QUIET = 0.3, 2.0
 # It creeps when its fixes go faster than the first, m/s, by so many standard deviations: fixes of a vehicle that stands
 # wander a little. Slower than the last, m/s, it may stand or creep.
 CREEP, SURELY, CREEPING_SPEED = 0.05, 4.0, 0.6
+# It turns on the spot when it turns faster than this, rad/s, which no left-over bias does, and by more than noise.
+TURNING_RATE = 1e-3
 
 
 def non_holonomic_factors(
@@ -65,6 +68,24 @@ def creeping(slow: NDArray[np.bool_], fixes: GnssFixes, at: NDArray[np.intp]) ->
     creeps[0] = False
     crept: NDArray[np.bool_] = creeps[which]
     return crept
+
+
+def resting(
+    stands: NDArray[np.bool_], R_map_imu: Array, stamps: Array, gyroscope_noise_density: float
+) -> NDArray[np.bool_]:
+    """The intervals (k - 1,) between keyframes of one stop in which the vehicle does not turn on the spot either.
+
+    A robot or a tripod that turns at one rate is as quiet as one that stands, so the whole stop must not turn.
+    """
+    begins = stands & ~np.append(False, stands[:-1])
+    stop = np.cumsum(begins) * stands
+    first = np.append(0, np.flatnonzero(begins))[stop]
+    turned = np.swapaxes(R_map_imu[first], 1, 2) @ R_map_imu
+    angles, lasted = Rotation.from_matrix(turned).magnitude(), stamps - stamps[first]
+    turns = stands & (angles > TURNING_RATE * lasted + SURELY * gyroscope_noise_density * np.sqrt(3 * lasted))
+    rests = stands & (np.bincount(stop, turns) == 0)[stop]
+    within: NDArray[np.bool_] = rests[1:] & rests[:-1]
+    return within
 
 
 def _sums(which: NDArray[np.intp], values: Array, n: int) -> Array:

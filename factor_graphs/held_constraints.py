@@ -13,13 +13,14 @@ from factor_graphs.constraints import (
     creeping,
     non_holonomic_factors,
     quiet_intervals,
+    resting,
     standing,
 )
 from factor_graphs.covariances import keyframe_covariances
 from factor_graphs.fitting import FITTING_CHI2, fit_noise_from
 from factor_graphs.heading import stddevs_of_heading
 from factor_graphs.measurements import WheelSpeeds
-from factor_graphs.model import from_values, zero_velocity_factors
+from factor_graphs.model import from_values, zero_motion_factors, zero_velocity_factors
 from factor_graphs.problem import RELATIVE_TOLERANCE, ROUGH, Fit, Problem
 from factor_graphs.side_measurements import Observed, factors_of
 from factor_graphs.slip import Slip
@@ -79,8 +80,14 @@ class _Held:
 
     def factors(self, problem: Problem, fit: Fit, stands: NDArray[np.bool_]) -> list[gtsam.NonlinearFactor]:
         """What holds where it stands, and of axle and wheels, linearised at a solution."""
+        settings, keyframes = problem.settings, problem.intervals.keyframes
+        R_map_imu = np.swapaxes(self.motion.R_imu_map, 1, 2)
+        density = problem.noise.gyroscope_noise_density * fit.inflation
+        rests = resting(stands, R_map_imu, keyframes, density)
+        still = settings.standing_stddev_mps or 1.0
         factors: list[gtsam.NonlinearFactor] = [
-            *zero_velocity_factors(stands, problem.settings.standing_stddev_mps or 1.0)
+            *zero_velocity_factors(stands, still),
+            *zero_motion_factors(rests, np.diff(keyframes), settings.standing_stddev_radps, still),
         ]
         if self.axle is not None:
             factors += non_holonomic_factors(fit.values, self.motion, self.axle.slip_stddevs(self.motion))

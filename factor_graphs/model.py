@@ -8,6 +8,7 @@
     axle            on X(i), V(i), M     a point on the axle does not slide; M is the mounting of the IMU, with a prior
     wheels          on X(i), V(i), W     it moves ahead as fast as they roll; W is their calibration, with a prior
     zero velocity   on V(i)              while the vehicle stands
+    zero motion     on X(i), X(i + 1)    while it stands, the pose stays the same (zero angular rate)
 
 Keyframes are at the fixes, at the ends of relative poses (LiDAR odometry), and in between where these are far apart.
 `problem.optimise` adds the factors up and solves the graph.
@@ -167,6 +168,19 @@ def zero_velocity_factors(
     model = gtsam.noiseModel.Isotropic.Sigma(3, stddev_mps)
     for i in np.flatnonzero(standing).tolist():
         yield gtsam.PriorFactorVector(V(i), np.zeros(3), model)
+
+
+def zero_motion_factors(
+    resting: NDArray[np.bool_], durations: Array, stddev_radps: float, stddev_mps: float
+) -> Iterator[gtsam.BetweenFactorPose3]:
+    """The pose stays the same in every interval at rest: what the gyroscope says there is its bias.
+
+    `resting` (k - 1,), `durations` (k - 1,) s.
+    """
+    rates = np.repeat([stddev_radps, stddev_mps], 3)
+    for i in np.flatnonzero(resting).tolist():
+        model = gtsam.noiseModel.Diagonal.Sigmas(rates * durations[i])
+        yield gtsam.BetweenFactorPose3(X(i), X(i + 1), gtsam.Pose3(), model)
 
 
 def to_values(T: Array, velocities: Array, biases: Array) -> gtsam.Values:

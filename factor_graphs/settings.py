@@ -52,6 +52,9 @@ class SmootherSettings(BaseModel):
     standing_stddev_mps: float | None = Field(
         0.03, gt=0, description="Velocity of a vehicle seen to stand (zero-velocity update). Empty: not used."
     )
+    standing_stddev_radps: float = Field(
+        1e-4, gt=0, description="Angular rate of a vehicle seen to stand (zero-angular-rate update)."
+    )
     vehicle_constraint: Literal["auto", "on", "off"] = Field(
         "auto",
         description="The axle of a vehicle does not slide. auto: where the drive shows that, without LiDAR odometry.",

@@ -5,7 +5,7 @@ from gtsam.symbol_shorthand import M, V, X
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.accuracy import errors
-from factor_graphs.constraints import creeping, non_holonomic_factors, quiet_intervals, standing
+from factor_graphs.constraints import creeping, non_holonomic_factors, quiet_intervals, resting, standing
 from factor_graphs.geodesy import LocalFrame
 from factor_graphs.intervals import split
 from factor_graphs.measurements import GnssFixes, ImuNoise
@@ -73,6 +73,42 @@ def test_stops_and_the_axle_each_improve_an_outage(simulate):
             gains[name].append(worst[name] / worst["plain"])
     assert np.mean(gains["standing"]) < 1.0
     assert np.mean(gains["vehicle"]) < 0.8
+
+
+def stops_for_a_minute(seconds: float, rng: np.random.Generator) -> Motion:
+    x = np.linspace(0, 3000, 60)
+    way = np.column_stack([x, 60 * np.sin(x / 150), 0 * x])
+    return follow(way, [0, 10, 60, 70, 130, 140, 200, 210, 240], [0, 10, 10, 0, 0, 10, 10, 0, 0])
+
+
+def test_a_stop_shows_the_bias_of_the_gyroscope_about_the_vertical(simulate):
+    noise = ImuNoise(gyroscope_bias_walk=10 * ImuNoise().gyroscope_bias_walk)
+    off: dict[float, list[float]] = {1e-4: [], 100.0: []}
+    for seed in range(6):
+        drive = simulate(seed, 240.0, noise, stops_for_a_minute, outages=[(70.0, 200.0)])
+        for rate, found in off.items():
+            settings = SmootherSettings(imu_noise=noise, standing_stddev_radps=rate, vehicle_constraint="off")
+            s = smooth(drive.imu, drive.fixes, FRAME, settings, LEVER)
+            k = np.searchsorted(s.keyframes.stamps, 130.0)  # the end of the stop
+            wrong = (
+                s.biases[k, 3:] - drive.biases[np.searchsorted(drive.imu.stamps, s.keyframes.stamps[k]), 3:]
+            )
+            found.append(abs(wrong[2]))
+            assert np.all(np.abs(wrong) < 3.5 * np.sqrt(np.diag(s.state_covariances[k])[12:]))
+    assert np.mean(off[1e-4]) < 0.6 * np.mean(off[100.0]), off
+
+
+def test_what_turns_on_the_spot_is_not_held_in_its_attitude():
+    stamps, stands = np.arange(60.0), np.ones(60, dtype=bool)
+    stands[25:30] = False
+    rates = np.where(stamps < 27, 0.0, np.where((stamps > 40) & (stamps < 45), 0.02, 0.0))
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(60)
+    R = Rotation.from_euler("z", np.cumsum(rates + noise)[:, None]).as_matrix()
+    rests = resting(stands, R, stamps, 1e-3)
+    np.testing.assert_array_equal(rests, (stamps < 24)[:-1])
+    still = Rotation.from_euler("z", np.cumsum(noise)[:, None]).as_matrix()
+    np.testing.assert_array_equal(resting(stands, still, stamps, 1e-3), (stands[1:] & stands[:-1]))
+    assert not resting(~stands & False, still, stamps, 1e-3).any()
 
 
 @pytest.mark.slow

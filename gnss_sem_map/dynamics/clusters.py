@@ -21,7 +21,7 @@ SPLIT_EPS_SHARE = 0.5
 """A segment that may be two vehicles is clustered again with this share of the distance."""
 PART_M = 0.2
 """A segment inside the bounding box of another, extended by this, is a part of it: the far edge of a roof, a mirror."""
-LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 12.0, 4.0, 0.5
+LARGE_M, LONGEST_M, HIGHEST_M, LEAST_HEIGHT_M = 8.0, 19.0, 4.2, 0.5
 """A segment longer than LARGE_M may be two vehicles. A segment that extends beyond the image has at most LONGEST_M and
 HIGHEST_M, the size of a lorry or a bus. One without vehicle labels is at least LEAST_HEIGHT_M high: of a car behind the
 LiDAR only the front returns points, not the windscreen."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from scipy.special import betaincc
 
 from gnss_sem_map.dynamics.object_track import ObjectTrack
-from gnss_sem_map.dynamics.own_motion import motion_of
+from gnss_sem_map.dynamics.own_motion import OwnMotion, motion_of
 from gnss_sem_map.dynamics.range_images import FARTHEST_M
-from gnss_sem_map.dynamics.seen_through import PERSON_M
-from gnss_sem_map.dynamics.standing import is_occupied
+from gnss_sem_map.dynamics.seen_through import CERTAIN_MISSES_PER_HIT, PERSON_M
+from gnss_sem_map.dynamics.standing import LARGEST_MISSES_PER_HIT, is_occupied
 from gnss_sem_map.dynamics.tracking import Segment, track
 
 LEAST_TRACKED_POINTS = 5
@@ -24,11 +24,14 @@ LEAST_TRACKED_POINTS = 5
 MISSES_OF_ONE_SEGMENT = 20
 """A segment with more misses than this, and twice as many misses as hits, has moved, whatever its track says."""
 LENGTH_M = 5.0
-"""Length of a car."""
+"""Length of a car: what is seen of an object may be shorter."""
 FARTHEST_APART_M = 1.5
 """Places of a track that are farther from its median position than this are elsewhere, or than a quarter of its way."""
 STANDING_MISSES_PER_HIT = 0.15
 """What stands has at most so many misses per hit."""
+STANDING_SHARE, STANDING_MARGIN = 0.8, 3.0
+"""With blurred poses, what stands has at most so many times the misses per hit that this share of the tracks that go
+nowhere have at most: the rest may be of what moves."""
 ASKED_PLACES = 8
 """So many segments at either end of a track tell whether it was free while the object was elsewhere."""
 SIZE_RATIO, SIZE_MARGIN_M, FREE_SHARE = 1.5, 0.5, 0.2
@@ -126,6 +129,18 @@ class TrackedObject:
     """Number of the chunk of scans in which it was found."""
 
 
+@dataclass(frozen=True)
+class _Free:
+    """Misses per hit of what is free."""
+
+    misses_per_hit: float
+    """The least, of all places of an object."""
+    of_displaced: float
+    """The least, of a place that it left or came into, wholly."""
+    of_standing: float
+    """The most that what stands has."""
+
+
 def classify_motion(
     segments: list[Segment],
     hits: NDArray[np.float64],
@@ -149,12 +164,17 @@ def classify_motion(
     alone = [n for n, segment in enumerate(segments) if segment.points < LEAST_TRACKED_POINTS]
     objects = []
     mostly_free = (misses > settings.misses_per_hit * hits)[large]
-    for one in track([segments[n] for n in large], settings.gate_m, mostly_free):
-        members = [large[place] for place in one.segments]
+    tracks = track([segments[n] for n in large], settings.gate_m, mostly_free)
+    listed = [[large[place] for place in one.segments] for one in tracks]
+    own = [motion_of([segments[n] for n in members]) for members in listed]
+    stands = LARGEST_MISSES_PER_HIT if is_sharp else _of_what_stands(listed, own, hits, misses)
+    displaced = settings.displaced_misses_per_hit * misses_per_hit
+    free = _Free(misses_per_hit, displaced, min(stands, misses_per_hit))
+    for members, moved in zip(listed, own, strict=True):
         is_shown = any(segments[n].shown for n in members)
-        elsewhere = settings.displaced_misses_per_hit if is_shown or is_sharp else misses_per_hit
-        whole = _motion_of_track(members, segments, hits, misses, misses_per_hit, elsewhere, counted_in)
-        if not (is_shown or is_sharp or whole.displaced):
+        whole = _motion_of_track(members, segments, hits, misses, moved, free, counted_in)
+        is_free = misses[members].sum() > CERTAIN_MISSES_PER_HIT * hits[members].sum()
+        if not (is_shown or is_sharp or whole.displaced or is_free):
             continue
         beside = _beside(members, segments, hits, misses)
         if not whole.displaced:  # else it may have come to stand there
@@ -178,6 +198,20 @@ def classify_motion(
     return [*objects, *(_motion_of_segment(n, segments, hits, misses) for n in alone)]
 
 
+def _of_what_stands(
+    tracks: Sequence[list[int]],
+    own: Sequence[OwnMotion | None],
+    hits: NDArray[np.float64],
+    misses: NDArray[np.float64],
+) -> float:
+    """Misses per hit that what stands has at most, by the tracks that go nowhere: blurred poses see through it, too."""
+    stay = [members for members, moved in zip(tracks, own, strict=True) if moved and not moved.is_moving]
+    if not stay:
+        return np.inf
+    ratios = [misses[members].sum() / max(hits[members].sum(), 1.0) for members in stay]
+    return STANDING_MARGIN * float(np.quantile(ratios, STANDING_SHARE))
+
+
 def _motion_of_segment(
     n: int, segments: list[Segment], hits: NDArray[np.float64], misses: NDArray[np.float64]
 ) -> TrackedObject:
@@ -193,19 +227,18 @@ def _motion_of_track(
     segments: list[Segment],
     hits: NDArray[np.float64],
     misses: NDArray[np.float64],
-    misses_per_hit: float,
-    elsewhere_misses_per_hit: float,
+    moved: OwnMotion | None,
+    free: _Free,
     counted_in: CountedIn | None,
 ) -> TrackedObject:
     """Motion state of a track: it went elsewhere, or its volume was free at other times."""
     hit, missed = float(hits[members].sum()), float(misses[members].sum())
-    vanished = _probability(missed, misses_per_hit * hit)
-    moved = motion_of([segments[n] for n in members])
+    vanished = _probability(missed, free.misses_per_hit * hit)
     displaced = False
     if moved and moved.is_moving:
         # the volume that it left or came into is free at other times, as far as it did not cover it itself
-        share = min(1.0, moved.shift_m / LENGTH_M)
-        least = elsewhere_misses_per_hit * share
+        share = min(1.0, moved.shift_m / max(LENGTH_M, moved.length_m))
+        least = max(free.of_displaced * share, free.of_standing)
         displaced = _free_elsewhere(members, segments, hits, misses, moved.shift_m, least)
         displaced &= not bool(is_occupied(hit, missed))
         if not displaced and counted_in is not None:
@@ -277,7 +310,7 @@ def _free_without(
         counted = [counted_in(members[k], away) for k in near[:: len(near) // ASKED_PLACES + 1]]
         total += np.median(counted, axis=0)  # in a few something else is in its segment, too
     hit, missed = total
-    return bool(missed > max(STANDING_MISSES_PER_HIT, share / 2) * hit)
+    return bool(missed > STANDING_MISSES_PER_HIT * hit)
 
 
 def _probability(misses: float, hits: float) -> float:

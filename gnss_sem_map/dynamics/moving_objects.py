@@ -22,7 +22,7 @@ from gnss_sem_map.dynamics.lost_parts import joined_to_movers, with_next_parts
 from gnss_sem_map.dynamics.motion_state import GONE, MotionSettings, TrackedObject, classify_motion
 from gnss_sem_map.dynamics.object_track import track_of
 from gnss_sem_map.dynamics.observation import BODY_HEIGHT_M, NearPoints, Observation
-from gnss_sem_map.dynamics.pose_sharpness import are_sharp
+from gnss_sem_map.dynamics.pose_sharpness import are_sharp, stand_still
 from gnss_sem_map.dynamics.presence import near_movers, presence, unusually_large
 from gnss_sem_map.dynamics.seen_through import free_groups, with_free_groups
 from gnss_sem_map.dynamics.standing import is_occupied, standing
@@ -131,7 +131,14 @@ def _told_by_others(
 ) -> tuple[NDArray[np.int32], bool]:
     """Hits and misses of every place (2, p), with a margin as wide as the poses need; whether these are sharp."""
     counts = _observations_by_others(observations, places, before, settings, SHARP_RATIO)
-    if are_sharp(counts, places):
+    of_segments = np.concatenate(
+        [
+            seen.segments.sums_of(counts.take(place, axis=1))
+            for seen, place in zip(observations, places, strict=True)
+        ],
+        axis=1,
+    )
+    if are_sharp(counts, places) or stand_still(of_segments):
         return counts, True
     return _observations_by_others(observations, places, before, settings, WIDE_RATIO), False
 

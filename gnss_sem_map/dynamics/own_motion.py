@@ -25,8 +25,13 @@ SMOOTHED = 5
 """Scans in the running median of positions."""
 STEADY_SHARE = 0.6
 """What moves goes on: its shift is at least this share of its way, to and fro."""
+HIDDEN_SHARE = 0.1
+"""What is abeam, and hidden by more than this share of its length at each end, has no place."""
 LARGEST_STEP_SHARE = 0.6
-"""A step from one scan to the next that is a larger share of the shift is an error of the clusters."""
+"""A step that is a larger share of the shift is an error of the clusters: from one scan to the next, and in a long
+track over as many as are smoothed."""
+LONG_SCANS = 15
+"""In a long track, a cluster grows by what stands beside it within some scans, and stays so."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +44,8 @@ class OwnMotion:
     """Its standard deviation."""
     is_steady: bool
     """It went on in one direction, and not at one jump."""
+    length_m: float
+    """The greatest extent of the object along its course."""
 
     @property
     def is_moving(self) -> bool:
@@ -63,6 +70,10 @@ def own_motion(
     low, high = (median_filter(side, SMOOTHED, mode="nearest") for side in (low, high))
     length = float(np.quantile(high - low, 0.9))
     centre, side, hidden = by_near_side(low, high, lidar, length)
+    placed = np.flatnonzero((side != 0) | (hidden < HIDDEN_SHARE * length))
+    if len(placed) < LEAST_SCANS:
+        return None
+    centre, side, hidden, ranges = centre[placed], side[placed], hidden[placed], ranges[placed]
     start, end = np.sort([centre.argmin(), centre.argmax()])
     shift = centre[end] - centre[start]
     # a vehicle that showed less of its length may be as long as a car
@@ -70,10 +81,11 @@ def own_motion(
     unknown += sum(hidden[k] for k in (start, end) if side[k] == 0)
     known = np.maximum(EDGE_STDDEV_M + EDGE_STDDEV_RATIO * ranges[[start, end]], noise)
     stddev = float(np.hypot(*known))
-    steps = np.diff(centre[start : end + 1])
-    way, largest = abs(steps).sum(), abs(steps).max(initial=0.0)
+    span = SMOOTHED if len(centre) >= LONG_SCANS else 1
+    jumps = centre[np.minimum(np.arange(start, end) + span, end)] - centre[start:end]
+    way, largest = abs(np.diff(centre[start : end + 1])).sum(), abs(jumps).max(initial=0.0)
     is_steady = bool(abs(shift) > STEADY_SHARE * way and largest < LARGEST_STEP_SHARE * abs(shift))
-    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady)
+    return OwnMotion(max(abs(float(shift)) - float(unknown), 0.0), stddev, is_steady, length)
 
 
 def scatter(values: NDArray[np.float64]) -> float:

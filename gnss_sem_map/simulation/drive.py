@@ -18,6 +18,7 @@ from gnss_sem_map.files.ownership import MARKER, read_list, write_list
 from gnss_sem_map.machine import threads
 from gnss_sem_map.simulation.camera import Camera, SimulatedImage, render_image
 from gnss_sem_map.simulation.compiled import Floats
+from gnss_sem_map.simulation.jam import drive_through_jam
 from gnss_sem_map.simulation.kitti_rig import T_IMU_LIDAR, camera_in_lidar, write_calibration
 from gnss_sem_map.simulation.lidar import Lidar, SimulatedScan, render_scan
 from gnss_sem_map.simulation.oxts import DATAFORMAT, Gnss, oxts_rows, row_text, sweep_rows
@@ -182,6 +183,7 @@ def prepare(
     laps: int = 1,
     session: int = 0,
     gnss: Gnss = "unit",
+    jam: bool = False,
     rig: Rig | None = None,
 ) -> Simulation:
     """Build the town, the traffic and the measurements of the navigation unit; nothing is rendered yet.
@@ -200,7 +202,10 @@ def prepare(
             f"a drive of {seconds} s has {frames} scans, expected at least 3; ask for 0.3 s or more"
         )
     day, built = day_of(seed, session), session_of(usual, seed, session)
-    town, ego, movers = drive_through(built, seconds, day, laps=laps, weaves=laps > 1 or session > 0)
+    town, ego, movers = (
+        drive_through_jam(built, seconds, day) if jam
+        else drive_through(built, seconds, day, laps=laps, weaves=laps > 1 or session > 0)
+    )  # fmt: skip
     rng = np.random.default_rng([day, 5])
     # no two days' scans are of the same places
     first = 0.05 + (float(rng.uniform(0.0, 0.1)) if session else 0.0)
@@ -240,19 +245,20 @@ def simulate(
     laps: int = 1,
     session: int = 0,
     gnss: Gnss = "unit",
+    jam: bool = False,
 ) -> Path:
     """Write the drive of a seed in KITTI raw format, with its truth, under `folder`; returns the drive's folder.
 
     `seconds` (None: 30, or as long as the laps take) is the length of the drive. More than one of `laps` lead around a
     block of the town. `session` K is the drive K days later. `gnss`: positions of the inertial unit, or of a consumer's
-    receiver of 1 m.
+    receiver of 1 m. `jam`: slow traffic in place of the usual one, in the first street of the route.
     `progress(done, frames)` is called after every frame; `workers` threads render (None: one per core). The bytes
     do not depend on the threads. Raises DataError when the drive is already there or is too short.
     """
     date = str(_date_of(session)).replace("-", "_")
     drive = Path(folder) / date / f"{drive_name(seed, session)}_sync"
     refuse_there(drive, _twin(drive))
-    simulation = prepare(seconds, seed, lidar, camera, laps=laps, session=session, gnss=gnss)
+    simulation = prepare(seconds, seed, lidar, camera, laps=laps, session=session, gnss=gnss, jam=jam)
     with _for_us_alone(drive) as partial:
         write_calibration(partial / "calibration", camera or Camera())
         _refuse_other_calibration(partial / "calibration", drive.parent)

@@ -152,6 +152,25 @@ def truck() -> Model:
     )
 
 
+def tanker() -> Model:
+    """A tractor with a tank of twelve metres behind it: longer and higher than any other vehicle of the town."""
+    kind, y = Kind.TRUCK, 1.25
+    wheels = [_round(Form.AXLE, (x, z * (y - 0.15), 0.5), (0.5, 0.13, 0.5), Surface.RUBBER, kind)
+              for x in (-6.6, -5.3, 3.4, 6.4) for z in (1, -1)]  # fmt: skip
+    return _model(
+        "tanker",
+        [
+            _block((-7.8, 5.0), (-y + 0.3, y - 0.3), (0.8, 1.15), Surface.STEEL, kind),
+            _block((-7.9, 4.2), (-y, y), (1.15, 2.3), Surface.CARGO, kind),
+            _block((-7.9, 4.2), (-y, y), (2.3, 3.6), Surface.CARGO, kind, (0.15, 0.15, 0.6)),
+            _block((5.0, 7.6), (-y + 0.05, y - 0.05), (0.5, 1.9), Surface.PAINT, kind),
+            _block((5.0, 7.6), (-y + 0.05, y - 0.05), (1.9, 3.1), Surface.CABIN, kind, (0.2, 0.0, 0.05)),
+            *_lamps(7.6, y - 0.12, (0.8, 1.0), kind),
+            *wheels,
+        ],
+    )
+
+
 def person() -> Model:
     """A pedestrian."""
     kind = Kind.PERSON

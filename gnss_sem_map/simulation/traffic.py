@@ -29,7 +29,7 @@ _CLOTHES: list[Colour] = [
 
 
 @dataclass(frozen=True, eq=False)
-class _Path:
+class Path:
     """A path on the ground of the map: points (k, 3) m and their arc length (k,) m."""
 
     points: Floats
@@ -45,13 +45,13 @@ class _Path:
         return float(self.way[np.argmin(((self.points[:, :2] - point[:2]) ** 2).sum(1))])
 
 
-def _path(town: Town, uv: Floats) -> _Path:
+def path_of(town: Town, uv: Floats) -> Path:
     points = town.to_map(uv)
-    return _Path(points, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]))
+    return Path(points, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]))
 
 
 def _profile(
-    path: _Path,
+    path: Path,
     start: float,
     speed: float,
     limit: float,
@@ -89,7 +89,7 @@ def _profile(
 
 
 def _drive(
-    path: _Path,
+    path: Path,
     seconds: float,
     *,
     start: float,
@@ -103,7 +103,7 @@ def _drive(
     return follow(path.beyond(start) + np.array([0.0, 0.0, lift]), stamps, speeds, suspension_deg)
 
 
-class _Crowd:
+class Crowd:
     """Moving objects placed so far; a new one that would collide with them is refused."""
 
     def __init__(self, town: Town, ego: Motion, seconds: float) -> None:
@@ -136,14 +136,19 @@ class _Crowd:
 def lap_length(town: Town) -> float:
     """Length of one lap of a route around the block, m."""
     rest = replace(town, route=town.route[4:])
-    return float(_path(town, _own_lane(town)).way[-1] - _path(town, _own_lane(rest)).way[-1])
+    return float(path_of(town, _own_lane(town)).way[-1] - path_of(town, _own_lane(rest)).way[-1])
 
 
 def lap_seconds(town: Town, laps: int) -> float:
     """How long so many laps around the block take, in whole tenths of a second."""
     stamps = np.arange(0.0, 120.0 * laps, 0.1)
-    way = _ride(town, _path(town, _own_lane(town)), 120.0 * laps).way(stamps)
+    way = _ride(town, own_path(town), 120.0 * laps).way(stamps)
     return round(float(stamps[np.searchsorted(way, laps * lap_length(town))]), 1)
+
+
+def own_path(town: Town) -> Path:
+    """The path of the recording vehicle, from one crossing before its route."""
+    return path_of(town, _own_lane(town))
 
 
 def _own_lane(town: Town) -> Floats:
@@ -166,7 +171,7 @@ def _weaving(uv: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(uv + aside[:, None] * course[:, ::-1] * [-1.0, 1.0])
 
 
-def _start_and_line(town: Town, own: _Path) -> tuple[float, float]:
+def start_and_line(town: Town, own: Path) -> tuple[float, float]:
     """Where on its path the recording vehicle starts, and where the stop line of the first crossing is, m."""
     before = _before(town)
     first = own.nearest(town.to_map(town.streets.position(town.route[1])[None])[0])
@@ -181,9 +186,9 @@ def _start_and_line(town: Town, own: _Path) -> tuple[float, float]:
     return start, line
 
 
-def _ride(town: Town, own: _Path, seconds: float) -> Motion:
+def _ride(town: Town, own: Path, seconds: float) -> Motion:
     """The motion of the recording vehicle on its path."""
-    start, line = _start_and_line(town, own)
+    start, line = start_and_line(town, own)
     cruise = {"speed": 7.0, "limit": 8.5}
     return _drive(
         own, seconds, start=start, stops=_stops(line - 10.2), lift=IMU_HEIGHT_M, suspension_deg=0.25, **cruise
@@ -200,14 +205,13 @@ def drive_through(
     them all. A vehicle that weaves does not come back to the very same points.
     """
     rng = np.random.default_rng([day, 4])
-    lane = _own_lane(town)
-    own = _path(town, lane)
+    own = own_path(town)
     usual = ego = _ride(town, own, seconds)
     if weaves:
-        own = _path(town, _weaving(lane, np.random.default_rng([day, 6])))
+        own = path_of(town, _weaving(_own_lane(town), np.random.default_rng([day, 6])))
         ego = _ride(town, own, seconds)
-    start, line = _start_and_line(town, own)
-    crowd = _Crowd(town, ego, seconds)
+    start, line = start_and_line(town, own)
+    crowd = Crowd(town, ego, seconds)
     ahead = _drive(own, seconds, start=start + 14.0, stops=_stops(line - 2.6, -1.0), speed=7.0, limit=9.5)
     crowd.admit("leader", 4, CAR_COLOURS[0], ahead)
     behind = _drive(own, seconds, start=start - 13.0, stops=_stops(line - 18.0, 1.3), speed=7.0, limit=8.0)
@@ -215,7 +219,7 @@ def drive_through(
     _meet_at_the_light(town, crowd, seconds, rng)
     town = _creep(town, crowd, usual, seconds)  # the same car every day
     _oncoming(town, crowd, seconds, rng, laps)
-    _on_foot(town, crowd, seconds, rng, laps)
+    on_foot(town, crowd, seconds, rng, laps)
     return town, ego, crowd.movers
 
 
@@ -227,17 +231,16 @@ def _length(town: Town, a: Node, b: Node) -> float:
     return float(np.linalg.norm(town.streets.position(b) - town.streets.position(a)))
 
 
-def _meet_at_the_light(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator) -> None:
+def _meet_at_the_light(town: Town, crowd: Crowd, seconds: float, rng: np.random.Generator) -> None:
     """A vehicle waits on the other side until the light is green, and others cross before."""
     before, here = town.route[0], town.route[1]
     step = (here[0] - before[0], here[1] - before[1])
     across = (-step[1], step[0])
-    opposite = [(here[0] + 2 * step[0], here[1] + 2 * step[1])]
-    opposite += [(here[0] + step[0], here[1] + step[1]), here, before]
-    path = _path(town, lane_path(town.streets, _within(town, opposite)))
-    line = _length(town, opposite[0], opposite[1]) * (len(_within(town, opposite)) == 4)
+    opposite = towards_us(town)
+    path = path_of(town, lane_path(town.streets, opposite))
+    line = _length(town, opposite[0], opposite[1]) * (len(opposite) == 4)
     line += (
-        _length(town, opposite[1], here) - town.streets.crossing_edge(opposite[1], here) - STOP_LINE_M - 2.6
+        _length(town, opposite[-3], here) - town.streets.crossing_edge(opposite[-3], here) - STOP_LINE_M - 2.6
     )
     for late in (0.7, 4.0, 7.0, 10.0):
         stop = [(line, _GREEN_S + late)]
@@ -246,13 +249,20 @@ def _meet_at_the_light(town: Town, crowd: _Crowd, seconds: float, rng: np.random
             break
     for side in (1, -1):
         nodes = [(here[0] + k * side * across[0], here[1] + k * side * across[1]) for k in (-2, -1, 0, 1, 2)]
-        path = _path(town, lane_path(town.streets, _within(town, nodes)))
+        path = path_of(town, lane_path(town.streets, _within(town, nodes)))
         middle = path.nearest(town.to_map(town.streets.position(here)[None])[0])
         for back in (24.0, 36.0, 52.0, 66.0):
             if middle - back < 0:
                 continue
             motion = _drive(path, seconds, start=middle - back, speed=7.5, limit=8.5)
             crowd.admit("crosses", int(rng.integers(0, 6)), _colour(rng), motion)
+
+
+def towards_us(town: Town) -> list[Node]:
+    """The crossings of those who come towards the first street of the route, and drive on along it."""
+    (a, b), (c, d) = town.route[:2]
+    step = c - a, d - b
+    return _within(town, [(c + k * step[0], d + k * step[1]) for k in (2, 1, 0, -1)])
 
 
 def _within(town: Town, nodes: list[Node]) -> list[Node]:
@@ -263,7 +273,7 @@ def _colour(rng: np.random.Generator) -> Colour:
     return CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
 
 
-def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
+def _oncoming(town: Town, crowd: Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
     """Traffic against the drive on every street of the route, some of it stop and go; a cyclist on the first.
 
     Who is to be met in a later lap comes from so much farther away.
@@ -273,14 +283,14 @@ def _oncoming(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generato
         nodes = _within(town, [(b[0] + k * step[0], b[1] + k * step[1]) for k in (2, 1, 0, -1, -2)])
         lane = lane_path(town.streets, nodes)
         if number == 0:
-            edge = _path(town, _shifted(lane, town.streets.half_width(a, b) - 2.6 - LANE_M))
+            edge = path_of(town, _shifted(lane, town.streets.half_width(a, b) - 2.6 - LANE_M))
             for share in np.linspace(0.15, 0.75, 13):
                 motion = _drive(edge, seconds, start=float(share * edge.way[-1]), speed=4.0, limit=4.2)
                 if crowd.admit("cyclist", CYCLIST, _CLOTHES[1], motion):
                     break
         later = seconds / laps * ((number + 1) // 4) if laps > 1 else 0.0
         far = 7.0 * later
-        path = _path(town, _from_afar(lane, far))
+        path = path_of(town, _from_afar(lane, far))
         for k in range(8):
             start = float(rng.uniform(0.05, 0.7) * (path.way[-1] - far))
             halt = (start + far + float(rng.uniform(15, 40)), later + float(rng.uniform(6, 14)))
@@ -302,7 +312,7 @@ def _shifted(uv: Floats, right: float) -> Floats:
     return np.asarray(uv + right * np.array([course[1], -course[0]]))
 
 
-def _creep(town: Town, crowd: _Crowd, ego: Motion, seconds: float) -> Town:
+def _creep(town: Town, crowd: Crowd, ego: Motion, seconds: float) -> Town:
     """One car rolls out of its bay for a metre and a half as the drive passes: a trail hardly longer than the car."""
     track = ego.poses(np.arange(0.0, seconds, 0.5))[:, :3, 3]
     best: tuple[float, int, float] | None = None
@@ -317,7 +327,7 @@ def _creep(town: Town, crowd: _Crowd, ego: Motion, seconds: float) -> Town:
     _, k, passing = best
     thing = town.things[k]
     ahead = np.array([np.cos(thing.heading), np.sin(thing.heading)])
-    path = _path(town, np.array([thing.u, thing.v]) + np.arange(0.0, 5.0, 0.5)[:, None] * ahead)
+    path = path_of(town, np.array([thing.u, thing.v]) + np.arange(0.0, 5.0, 0.5)[:, None] * ahead)
     begin = max(passing - 5.0, 1.0)
     stamps = np.array([-EARLY_S - 0.1, begin, begin + 0.8, begin + 4.0, begin + 4.8, seconds + 30.0])
     speeds = np.array([0.0, 0.0, 0.38, 0.38, 0.0, 0.0])
@@ -340,7 +350,7 @@ def _depth(town: Town, uv: Floats) -> float:
     return float(min((np.abs(v[0] - u.u) - u.half_u).min(), (np.abs(v[1] - u.v) - u.half_v).min()))
 
 
-def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
+def on_foot(town: Town, crowd: Crowd, seconds: float, rng: np.random.Generator, laps: int) -> None:
     """People on both sidewalks of the route, and one on the zebra while the drive waits."""
     route, reach = (town.route, 60.0) if laps == 1 else (town.route[:5], 60.0 + 1.5 * seconds)
     for a, b in pairwise(route):
@@ -354,7 +364,7 @@ def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator
             towards = course if rng.random() < 0.5 else -course
             line = here + np.arange(0.0, reach, 1.5)[:, None] * towards
             speed = float(rng.uniform(1.0, 1.5))
-            motion = _drive(_path(town, line), seconds, start=0.0, speed=speed, limit=speed)
+            motion = _drive(path_of(town, line), seconds, start=0.0, speed=speed, limit=speed)
             crowd.admit("walks", PERSON, _CLOTHES[k % 5], motion)
     a, b = town.route[0], town.route[1]
     pa, pb = town.streets.position(a), town.streets.position(b)
@@ -367,5 +377,5 @@ def _on_foot(town: Town, crowd: _Crowd, seconds: float, rng: np.random.Generator
         "crosses on foot",
         PERSON,
         _CLOTHES[0],
-        _drive(_path(town, line), seconds, start=0.0, speed=1.4, limit=1.4),
+        _drive(path_of(town, line), seconds, start=0.0, speed=1.4, limit=1.4),
     )

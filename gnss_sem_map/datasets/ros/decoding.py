@@ -28,9 +28,9 @@ def typestore(is_ros1: bool) -> Any:
 
 def decode(bag: Bag, messages: Messages, k: int) -> Any:
     """A message, as an object with the fields of its type; raises DataError for one that is damaged."""
-    data, store = memoryview(bag.read(messages, k)), typestore(bag.is_ros1)  # whose parts are no copies
+    data, store = memoryview(bag.read(messages, k)), typestore(messages.is_ros1)  # whose parts are no copies
     try:
-        if bag.is_ros1:
+        if messages.is_ros1:
             return store.deserialize_ros1(data, messages.kind)
         return store.deserialize_cdr(data, messages.kind)
     except Exception as error:
@@ -46,7 +46,7 @@ def header_ns(bag: Bag, messages: Messages, k: int) -> int:
     """The stamp in the header of a message, Unix ns; raises DataError for a message that is too short for one."""
     head = bag.read(messages, k, HEAD_BYTES)
     try:
-        if bag.is_ros1:
+        if messages.is_ros1:
             _, seconds, nanoseconds = struct.unpack_from("<III", head)
         else:
             order = "<" if head[1] & 1 else ">"

@@ -51,7 +51,7 @@ class Ros1File:
                 f" {shown(path.name)}, and move the copy that it leaves (.orig.bag) to another folder"
             ) from None
         try:
-            self.topics = {one.topic: one.msgtype for one in reader.connections}
+            self.topics = {one.topic: (one.msgtype, "ros1") for one in reader.connections}
             names = {function: name for name, function in decompressors.items()}
             starts = sorted(reader.chunks)
             self._chunk = np.array(

@@ -81,7 +81,7 @@ def _found(bag: Bag, transforms: StaticTransforms, target: str, source: str, nam
     if T is None:
         frames = ", ".join(transforms.frames)[:300] or "none"
         raise DataError(
-            f"{shown(bag.path)}: no static transform leads from {source!r} to {target!r} (frames in /tf_static:"
+            f"{shown(bag.path)}: no fixed transform leads from {source!r} to {target!r} (frames of fixed transforms:"
             f" {frames}); set {name} in rig.yaml, or `frame:` where a frame has another name"
         )
     return T

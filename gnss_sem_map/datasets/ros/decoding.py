@@ -1,4 +1,4 @@
-"""What the messages say: decoded by `rosbags` with the message types of ROS itself, never with those of the bag."""
+"""What the messages say: decoded by `rosbags` with the types of ROS and of `kinds`, never with those of the bag."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
+from gnss_sem_map.datasets.ros.kinds import DEFINITIONS, HEADLESS
 from gnss_sem_map.errors import DataError
 
 HEAD_BYTES = 16
@@ -19,10 +20,9 @@ def typestore(is_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    if is_ros1:  # its store lacks tf2_msgs
-        store.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-        )
+    for name, text in DEFINITIONS.items():
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(text, name))
     return store
 
 
@@ -43,7 +43,9 @@ def decode(bag: Bag, messages: Messages, k: int) -> Any:
 
 
 def header_ns(bag: Bag, messages: Messages, k: int) -> int:
-    """The stamp in the header of a message, Unix ns; raises DataError for a message that is too short for one."""
+    """The stamp in the header of a message, Unix ns, or its arrival where the type has none; raises DataError."""
+    if messages.kind in HEADLESS:
+        return int(messages.received_ns[k])
     head = bag.read(messages, k, HEAD_BYTES)
     try:
         if messages.is_ros1:

@@ -91,5 +91,7 @@ def test_what_is_not_of_ros_beside_what_is_stays_unread(tmp_path: Path) -> None:
 )
 def test_a_file_without_an_index_is_not_called_damaged(tmp_path: Path, options: dict[str, Any]) -> None:
     file = ros.write_mcap(tmp_path / "drive.mcap", ros.drive(), "ros2", **options)
-    with pytest.raises(DataError, match=r"drive.mcap: not indexed .*mcap recover drive.mcap -o repaired.mcap"):
+    with pytest.raises(
+        DataError, match=r"drive.mcap: not indexed .*mcap recover drive.mcap -o repaired.mcap"
+    ):
         open_drive(file)

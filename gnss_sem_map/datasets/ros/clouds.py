@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -63,7 +64,7 @@ class PointTimes:
 def fields_of(cloud: Any) -> list[str]:
     """Names of the fields of a cloud."""
     if hasattr(cloud, "points"):
-        return list(LIVOX_POINT.names or ())
+        return list(LIVOX_POINT)
     return [str(field.name) for field in cloud.fields]
 
 
@@ -190,39 +191,26 @@ def _table(bag: Bag, messages: Messages, k: int, more: tuple[str, ...]) -> NDArr
     return np.frombuffer(data, dtype, n)
 
 
-LIVOX_POINT = np.dtype(
-    {
-        "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
-        "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"],
-    }
-)
+LIVOX_POINT = {
+    "offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1",
+}  # fmt: skip
 LIVOX_HEAD = "QIB3xI"
 """Time of the first point, number of points, LiDAR, reserved bytes, and the number of points again."""
 
 
 def _livox_table(data: bytes, is_ros1: bool, where: str) -> NDArray[Any]:
     """The points (n,) of a CustomMsg: ROS 1 packs them, in CDR each begins at a multiple of four bytes."""
-    start, step = (12, 19) if is_ros1 else (12, 20)
-    try:
-        order = "<" if is_ros1 or data[1] & 1 else ">"
-        start += 4 + struct.unpack_from(f"{order}I", data, start)[0]
+    order, n, start = "<" if is_ros1 or data[1:2] == b"\1" else ">", 0, 16
+    dtype = np.dtype([(name, order + kind) for name, kind in LIVOX_POINT.items()])
+    step = dtype.itemsize if is_ros1 else dtype.itemsize + 1
+    with suppress(struct.error):
+        start += struct.unpack_from(f"{order}I", data, start - 4)[0]  # behind the name of the frame
         start = start if is_ros1 else 4 + (start - 4 + 7) // 8 * 8
-        *_, n = struct.unpack_from(f"{order}{LIVOX_HEAD}", data, start)
-    except (struct.error, IndexError):
-        n = 0
-    start += struct.calcsize(f"<{LIVOX_HEAD}")
-    if not 0 < n <= MOST_POINTS or len(data) < start + n * step - (step - 19):
+        *_, n = struct.unpack_from(order + LIVOX_HEAD, data, start)
+        start += struct.calcsize(order + LIVOX_HEAD)
+    if not 0 < n <= MOST_POINTS or len(data) < start + (n - 1) * step + dtype.itemsize:
         raise DataError(f"{where}: found {n} points in {len(data)} bytes, expected 1 to {MOST_POINTS} points")
-    fields = dict(LIVOX_POINT.fields or {})
-    dtype = np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind.newbyteorder(order) for kind, *_ in fields.values()],
-            "offsets": [offset for _, offset, *_ in fields.values()],
-            "itemsize": step,
-        }
-    )
-    return np.frombuffer(data[start : start + n * step].ljust(n * step, b"\0"), dtype, n)
+    return np.ndarray(n, dtype, data, start, step)
 
 
 def _rows(table: NDArray[Any]) -> NDArray[np.float32]:

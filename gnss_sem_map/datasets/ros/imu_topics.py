@@ -62,14 +62,15 @@ def samples_of(
     messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
     rates = _rows(bag, messages, believed, _rate)
-    stamps = (said[believed] - epoch_ns) * 1e-9
+    stamps = np.asarray((said[believed] - epoch_ns) * 1e-9, np.float64)
     if about.force_topic is None:
         forces = _rows(bag, messages, believed, _force)
     else:
         others = bag.messages(about.force_topic)
         theirs, trusted, lost = stamps_of(bag, others, about.stamps) if with_all else _ends(others)
-        measured = _rows(bag, others, trusted, _force)
-        forces, inside = _interpolated(stamps, (theirs[trusted] - epoch_ns) * 1e-9, measured, with_all)
+        measured = np.asarray((theirs[trusted] - epoch_ns) * 1e-9, np.float64)
+        forces, inside = _interpolated(stamps, measured, _rows(bag, others, trusted, _force))
+        inside |= not with_all  # only their ends were read
         skips += lost
         if count := int((~inside).sum()):
             reason = f"{count} turn rates without a force of {about.force_topic} near them"
@@ -104,19 +105,14 @@ def _numbers(vector: Any) -> tuple[float, float, float]:
     return vector.x, vector.y, vector.z
 
 
-def _interpolated(
-    stamps: Array, theirs: Array, measured: Array, is_dense: bool
-) -> tuple[Array, NDArray[np.bool_]]:
+def _interpolated(stamps: Array, theirs: Array, measured: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Forces (n, 3) at the stamps, linear between those that were measured, and which stamps lie near such (n,)."""
     order = np.argsort(theirs, kind="stable")
     theirs, measured = theirs[order], measured[order]
-    if len(theirs) == 0:
+    if len(theirs) < 2:
         return np.zeros((len(stamps), 3)), np.zeros(len(stamps), np.bool_)
-    after = np.searchsorted(theirs, stamps).clip(1, max(len(theirs) - 1, 1)).clip(max=len(theirs) - 1)
-    inside = (stamps >= theirs[0]) & (stamps <= theirs[-1])
-    inside &= theirs[after] - theirs[after - 1] <= MOST_APART_S
-    if not is_dense:  # only their ends were read
-        inside[:] = True
+    after = np.searchsorted(theirs, stamps).clip(1, len(theirs) - 1)
+    inside = (stamps >= theirs[0]) & (stamps <= theirs[-1]) & (np.diff(theirs)[after - 1] <= MOST_APART_S)
     return np.column_stack([np.interp(stamps, theirs, column) for column in measured.T]), inside
 
 

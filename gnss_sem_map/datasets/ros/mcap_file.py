@@ -8,7 +8,6 @@ its schema or itself: what profile the file has is not asked.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +22,7 @@ from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import shown
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, ChunkIndex, Schema, Statistics
+    from mcap.records import Channel, McapRecord, Schema
 
 Ints = NDArray[np.int64]
 
@@ -43,47 +42,18 @@ OF_SCHEMA = {"ros1msg": "ros1", "ros2msg": "cdr", "ros2idl": "cdr", "omgidl": "c
 """How messages are encoded that have a schema of ROS."""
 
 
-class _Summary:
-    """What the end of a file says of all of it."""
-
-    def __init__(self, records: Iterable[object]) -> None:
-        from mcap import records as of_kind
-
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
-        self.statistics: Statistics | None = None
-        for record in records:
-            if isinstance(record, of_kind.Schema):
-                self.schemas[record.id] = record
-            elif isinstance(record, of_kind.Channel):
-                self.channels[record.id] = record
-            elif isinstance(record, of_kind.ChunkIndex):
-                self.chunks.append(record)
-            elif isinstance(record, of_kind.Statistics):
-                self.statistics = record
-
-    def kind_of(self, channel: Channel) -> tuple[str, str]:
-        """The type of a channel's messages, as ROS 2 writes it, and their encoding."""
-        schema = self.schemas.get(channel.schema_id)
-        name, encoding = ("", channel.message_encoding) if schema is None else (schema.name, schema.encoding)
-        package, slash, kind = name.partition("/")
-        if slash and "/" not in kind:
-            name = f"{package}/msg/{kind}"
-        return name, OF_SCHEMA.get(encoding, channel.message_encoding)
-
-
 class McapFile:
     """Messages of the topics of one file; raises DataError when its index is missing or damaged."""
 
     def __init__(self, path: Path, codec: str = "") -> None:
+        from mcap import records
         from mcap.exceptions import McapError
 
         self.path, self._codec = path, codec
         self._file = OpenFile(path)
         try:
-            summary = self._summary()
-            chunks = summary.chunks
+            found = self._summary()
+            chunks = [one for one in found if isinstance(one, records.ChunkIndex)]
             sizes = [(chunk.compressed_size, chunk.uncompressed_size) for chunk in chunks]
             spans = [(one.chunk_start_offset + one.chunk_length, one.message_index_length) for one in chunks]
             self._starts = np.array([chunk.chunk_start_offset for chunk in chunks], np.int64)
@@ -94,19 +64,21 @@ class McapFile:
                 f" {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             ) from None
         self._codecs = [chunk.compression for chunk in chunks]
-        self.topics = {one.topic: summary.kind_of(one) for one in summary.channels.values()}
-        channels = {one.id: one.topic for one in summary.channels.values()}
+        schemas = {one.id: one for one in found if isinstance(one, records.Schema)}
+        channels = {one.id: one for one in found if isinstance(one, records.Channel)}
+        self.topics = {one.topic: _kind_of(one, schemas.get(one.schema_id)) for one in channels.values()}
         self._chunks = Chunks(self._expanded)
-        self._index = self._read_indexes(channels)
+        self._index = self._read_indexes({number: one.topic for number, one in channels.items()})
         indexed = sum(len(times) for times, _ in self._index.values())
-        expected = 1 if summary.statistics is None else summary.statistics.message_count
+        counts = [one.message_count for one in found if isinstance(one, records.Statistics)]
+        expected = counts[0] if counts else 1
         if indexed < expected:
             raise DataError(
                 f"{shown(path)}: not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
                 f" recover {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             )
 
-    def _summary(self) -> _Summary:
+    def _summary(self) -> list[McapRecord]:
         """The records between the data and the footer; raises McapError or one of DAMAGED for a file without."""
         from mcap.stream_reader import StreamReader
 
@@ -120,7 +92,7 @@ class McapFile:
             raise ValueError(f"a summary from byte {start} on")
         start = start or ends
         content = self._file.read_up_to(start, self._file.size - start)
-        return _Summary(StreamReader(BytesIO(content), skip_magic=True).records)
+        return list(StreamReader(BytesIO(content), skip_magic=True).records)
 
     def index(self, topic: str) -> tuple[Ints, Ints]:
         """Arrival (n,), ns, and place (n, 2) of the messages of a topic, in the order of the file."""
@@ -185,6 +157,15 @@ class McapFile:
         if len(content) != plain:
             raise DataError(f"{where}: damaged; found {len(content)} bytes, expected {plain}")
         return content
+
+
+def _kind_of(channel: Channel, schema: Schema | None) -> tuple[str, str]:
+    """The type of a channel's messages, as ROS 2 writes it, and their encoding."""
+    if schema is None:
+        return "", channel.message_encoding
+    package, slash, kind = schema.name.partition("/")
+    name = f"{package}/msg/{kind}" if slash and "/" not in kind else schema.name
+    return name, OF_SCHEMA.get(schema.encoding, channel.message_encoding)
 
 
 def _joined(parts: list[tuple[int, NDArray[np.uint64]]]) -> tuple[Ints, Ints]:

@@ -303,7 +303,8 @@ def test_an_encoding_that_is_not_known_is_named(tmp_path: Path) -> None:
 def test_missing_and_circular_transforms(tmp_path: Path) -> None:
     bag = ros.write(tmp_path / "none", ros.drive(frames=False))
     with pytest.raises(
-        DataError, match=r"no fixed transform leads from 'lidar' to 'imu' \(frames of fixed transforms: none\)"
+        DataError,
+        match=r"no fixed transform leads from 'lidar' to 'imu' \(frames of fixed transforms: none\)",
     ):
         open_drive(bag)
     rig = ros.drive(frames=False)

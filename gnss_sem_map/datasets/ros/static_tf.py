@@ -79,7 +79,7 @@ def read_static_transforms(bag: Bag) -> StaticTransforms:
     edges: Edges = {}
     for name, kinds, read in (
         ("tf", TRANSFORMS, _that_stay),
-        (URDF, (STRING,), _fixed_joints),
+        (URDF, (STRING,), _described),
         ("tf_static", TRANSFORMS, _static),
     ):
         for topic, last in named.items():
@@ -124,10 +124,14 @@ def _transforms(message: Any) -> Iterator[tuple[str, str, list[float], list[floa
         yield parent, child, [q.x, q.y, q.z, q.w], [t.x, t.y, t.z]
 
 
-def _fixed_joints(bag: Bag, topic: str) -> Edges:
-    """The fixed joints of the first URDF of a topic; none of what is no URDF, or has a document type."""
-    messages, edges = bag.messages(topic), Edges()
-    text = str(decode(bag, messages, 0).data) if len(messages) else ""
+def _described(bag: Bag, topic: str) -> Edges:
+    messages = bag.messages(topic)
+    return fixed_joints(str(decode(bag, messages, 0).data), topic) if len(messages) else {}
+
+
+def fixed_joints(text: str, topic: str) -> Edges:
+    """The fixed joints of a URDF; none of what is no URDF, or has a document type."""
+    edges = Edges()
     if len(text) > MOST_XML_BYTES or "<!" in text.replace(
         "<!--", ""
     ):  # entities may stand for any amount of text

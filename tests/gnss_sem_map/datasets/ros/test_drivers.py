@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import ros
 from ros import START_NS, rig_yaml, sweep
+from ros_drivers import livox
 from typer.testing import CliRunner
 
 from gnss_sem_map.cli import app
@@ -149,23 +150,6 @@ def test_two_fields_of_one_name_that_is_read_are_refused(tmp_path: Path) -> None
         DataError, match=r"/points: message 0: found fields x, y, z, intensity, time, x, expected x"
     ):
         opened(tmp_path, rig).scans[0].read()
-
-
-def livox(rig: ros.Rig, package: str, ns: int, table: np.ndarray, frame: str = "lidar") -> None:
-    made = [
-        rig.make(
-            f"{package}/msg/CustomPoint",
-            offset_time=round(float(row["time"]) * 1e9), x=float(row["x"]), y=float(row["y"]), z=float(row["z"]),
-            reflectivity=round(float(row["intensity"]) * 255), tag=16, line=3,
-        )
-        for row in table
-    ]  # fmt: skip
-    message = rig.make(
-        f"{package}/msg/CustomMsg",
-        header=rig.header(ns, frame), timebase=ns, point_num=len(made), lidar_id=1, rsvd=np.zeros(3, np.uint8),
-        points=made,
-    )  # fmt: skip
-    rig.messages.append(("/livox/lidar", ns, message))
 
 
 @pytest.mark.parametrize("is_ros1", [False, True])

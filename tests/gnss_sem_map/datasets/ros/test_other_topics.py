@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 import ros
 from ros import START_NS, rig_yaml
+from ros_drivers import EDGES, describe, fix_ns, force, gps_fix, joint, sentences, speeds, split_imu, urdf
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -46,37 +45,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> SensorLog:
     return open_drive(written(tmp_path_factory.mktemp("plain"), ros.drive()))
 
 
-def fix_ns(k: int) -> int:
-    return START_NS + 3_000_000 + k * 400_000_000
-
-
 # the receiver
-
-
-def gps_fix(rig: ros.Rig, k: int, package: str, **other: Any) -> None:
-    header = rig.header(fix_ns(k), "antenna")
-    status: dict[str, Any] = dict.fromkeys(
-        ("satellites_used", "satellites_visible", "status", "motion_source", "orientation_source", "position_source"), 0
-    ) | {
-        name: np.zeros(2, np.int32)
-        for name in (
-            "satellite_used_prn", "satellite_visible_prn", "satellite_visible_z", "satellite_visible_azimuth",
-            "satellite_visible_snr",
-        )
-    }  # fmt: skip
-    names = "track speed climb pitch roll dip time gdop pdop hdop vdop tdop err err_horz err_vert err_track err_speed"
-    numbers = dict.fromkeys(
-        [*names.split(), "err_climb", "err_time", "err_pitch", "err_roll", "err_dip"], 0.0
-    )
-    if "status" in other:
-        status["status"] = other.pop("status")
-    about = {
-        "header": header, "status": rig.make(f"{package}/msg/GPSStatus", header=header, **status), "latitude": 49.0,
-        "longitude": 8.4 + k * 1e-5, "altitude": 115.0, "position_covariance_type": 2,
-        "position_covariance": np.diag([0.25, 0.25, 1.0]).ravel(),
-    }  # fmt: skip
-    message = rig.make(f"{package}/msg/GPSFix", **numbers | about | other)
-    rig.messages.append(("/gps", fix_ns(k), message))
 
 
 def same_fixes(one: SensorLog, other: SensorLog, atol: float = 1e-6) -> None:
@@ -112,26 +81,6 @@ def test_gps_fixes_are_fixes(
     log = opened(tmp_path, rig)
     same_fixes(log, plain)
     assert [skip.reason for skip in log.skips] == ["1 messages: no fix"]
-
-
-def sentence(body: str) -> str:
-    return f"${body}*{reduce(xor, body.encode()):02X}\r\n"
-
-
-def sentences(rig: ros.Rig, kind: str = "nmea_msgs/msg/Sentence", late_ns: int = 0) -> None:
-    for k in range(5):
-        moment = np.datetime64(fix_ns(k), "ns").astype("datetime64[ms]").item()
-        clock, date = f"{moment:%H%M%S}.{moment.microsecond // 10000:02d}", f"{moment:%d%m%y}"
-        lon = 8.4 + k * 1e-5
-        for body in (
-            f"GPRMC,{clock},A,4900.000000,N,00824.000000,E,0.0,0.0,{date},,,A",
-            f"GPGST,{clock},1.0,,,,0.5,0.5,1.0",
-            f"GPGGA,{clock},4900.000000,N,{8:03d}{(lon - 8) * 60:010.7f},E,4,12,0.8,67.0,M,48.0,M,,",
-        ):
-            ns = fix_ns(k) + late_ns
-            header = {} if kind == "std_msgs/msg/String" else {"header": rig.header(ns, "antenna")}
-            name = "sentence" if header else "data"
-            rig.messages.append(("/nmea_sentence", ns, rig.make(kind, **header, **{name: sentence(body)})))
 
 
 @pytest.mark.parametrize("is_ros1", [True, False])
@@ -197,32 +146,6 @@ def test_a_covariance_that_is_none_needs_stddevs(tmp_path: Path, kind: int, vari
 # the IMU
 
 
-def force(seconds: Any) -> Any:
-    return np.column_stack([0.1 + seconds, 0.0 * seconds, 9.81 - 0.5 * seconds])
-
-
-def split_imu(rig: ros.Rig, kind: str = ros.IMU, until_s: float = 2.0) -> None:
-    """A gyroscope at 100 Hz, and an accelerometer at 62.5 Hz from a little before on."""
-    for topic, step_ns, first_ns in (
-        ("/gyro/sample", 10_000_000, 0),
-        ("/accel/sample", 16_000_000, -5_000_000),
-    ):
-        for k in range(int((until_s if "accel" in topic else 2.0) * 1e9 / step_ns) + 2):
-            ns = START_NS + first_ns + k * step_ns
-            vector = force(np.array([(ns - START_NS) * 1e-9]))[0] if "accel" in topic else [0.0, 0.0, 0.01]
-            if kind == ros.IMU:
-                rig.imu(ns, topic=topic)
-                message = rig.messages[-1][2]
-                measured, other = message.linear_acceleration, message.angular_velocity
-                if "gyro" in topic:
-                    measured, other = other, measured
-                measured.x, measured.y, measured.z = (float(v) for v in vector)
-                other.x = other.y = other.z = 0.0
-            else:
-                message = rig.make(kind, header=rig.header(ns, "imu"), vector=rig.vector(*map(float, vector)))
-                rig.messages.append((topic, ns, message))
-
-
 @pytest.mark.parametrize("is_ros1", [True, False])
 @pytest.mark.parametrize("kind", [ros.IMU, "geometry_msgs/msg/Vector3Stamped"])
 def test_a_gyroscope_and_an_accelerometer_are_an_imu(tmp_path: Path, is_ros1: bool, kind: str) -> None:
@@ -278,33 +201,6 @@ def test_a_whole_imu_beside_parts_of_another_is_the_imu(tmp_path: Path, plain: S
 # the wheels
 
 
-def speeds(rig: ros.Rig, kind: str, unit: float = 1.0) -> None:
-    for k in range(40):
-        ns, v = START_NS + k * 50_000_000, (1.0 + 0.1 * k) * unit
-        header = rig.header(ns, "base")
-        twist = rig.make(
-            "geometry_msgs/msg/Twist", linear=rig.vector(v, 0.0, 0.0), angular=rig.vector(0, 0, 0.1)
-        )
-        covered = rig.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36))
-        if kind.endswith("Odometry"):
-            point = rig.make("geometry_msgs/msg/Point", x=5.0, y=6.0, z=7.0)
-            turn = rig.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-            pose = rig.make("geometry_msgs/msg/Pose", position=point, orientation=turn)
-            pose = rig.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
-            message = rig.make(kind, header=header, child_frame_id="base", pose=pose, twist=covered)
-        elif kind.endswith("VelocityReport"):
-            message = rig.make(
-                kind, header=header, longitudinal_velocity=v, lateral_velocity=0.0, heading_rate=0.1
-            )
-        elif "Float" in kind:
-            message = rig.make(kind, data=v)
-        elif kind.endswith("/Twist"):
-            message = twist
-        else:
-            message = rig.make(kind, header=header, twist=covered if "Covariance" in kind else twist)
-        rig.messages.append(("/speed", ns, message))
-
-
 @pytest.mark.parametrize("is_ros1", [True, False])
 @pytest.mark.parametrize(
     "kind",
@@ -342,28 +238,6 @@ def test_wheels_are_suggested_and_not_taken_unasked(tmp_path: Path) -> None:
 
 
 # fixed transforms
-
-EDGES = (
-    ("base", "imu", (1.0, 0.0, 0.0)),
-    ("base", "lidar", (2.0, 0.0, 0.5)),
-    ("imu", "antenna", (0.0, 0.0, 0.8)),
-)
-
-
-def urdf(*joints: str) -> str:
-    return f'<?xml version="1.0"?>\n<!-- of xacro --><robot name="car"><link name="base"/>{"".join(joints)}</robot>'
-
-
-def joint(parent: str, child: str, xyz: tuple[float, float, float], more: str = "") -> str:
-    place = " ".join(map(str, xyz))
-    return (
-        f'<joint name="{child}_joint" type="fixed"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{place}" {more}/></joint>'
-    )
-
-
-def describe(rig: ros.Rig, text: str, topic: str = "/robot_description") -> None:
-    rig.messages.append((topic, START_NS, rig.make("std_msgs/msg/String", data=text)))
 
 
 def same_poses(log: SensorLog, plain: SensorLog) -> None:

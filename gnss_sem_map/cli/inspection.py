@@ -25,7 +25,8 @@ def inspect(
 ) -> None:
     """List the topics of a bag, and write a rig.yaml to edit: which topic is which sensor."""
     from gnss_sem_map.datasets.ros.bag import Bag
-    from gnss_sem_map.datasets.ros.contents import SENSORS, contents_of, suggested_rig
+    from gnss_sem_map.datasets.ros.contents import contents_of, suggested_rig
+    from gnss_sem_map.datasets.ros.kinds import KINDS
     from gnss_sem_map.datasets.ros.rig import NAME, rig_file
     from gnss_sem_map.datasets.ros.roles import nothing_read
     from gnss_sem_map.files.atomic import replacing
@@ -33,7 +34,7 @@ def inspect(
     opened = Bag(bag)
     topics = contents_of(opened)
     file = out or rig_file(bag) or bag.absolute().parent / NAME
-    is_read = any(topic.taken_for in SENSORS and topic.messages for topic in topics)
+    is_read = any(topic.taken_for in KINDS and topic.messages for topic in topics)
     is_new = is_read and not os.path.lexists(file)
     if is_new:
         with replacing(file) as written:

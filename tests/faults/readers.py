@@ -95,7 +95,7 @@ def robot(folder: Path) -> Reader:
     file = folder / "robot.urdf"
     file.write_text(ros_drivers.urdf(*(ros_drivers.joint(*edge) for edge in ros_drivers.EDGES)))
     return Reader(
-        file, lambda: fixed_joints(file.read_bytes().decode("utf-8", "replace"), "/robot"), mutations.text
+        file, lambda: list(fixed_joints(file.read_bytes().decode("utf-8", "replace"))), mutations.text
     )
 
 

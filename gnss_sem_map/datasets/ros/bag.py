@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -48,6 +47,10 @@ class Messages:
 
     def __len__(self) -> int:
         return len(self.received_ns)
+
+    def some(self, count: int) -> list[int]:
+        """Positions of so many messages over all the time, of all where there are fewer."""
+        return np.unique(np.linspace(0, len(self) - 1, count).astype(int)).tolist() if len(self) else []
 
 
 class Bag:
@@ -99,10 +102,6 @@ class Bag:
         file, *place = messages.places[k].tolist()
         one: BagFile = self._files[file]
         return one.read((place[0], place[1]), most)
-
-    def each(self, messages: Messages) -> Iterator[bytes]:
-        """All messages of a topic, one after the other."""
-        return (self.read(messages, k) for k in range(len(messages)))
 
     def file_of(self, messages: Messages, k: int) -> Path:
         """The file that holds a message."""

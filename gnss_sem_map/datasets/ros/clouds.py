@@ -6,6 +6,7 @@
 | `t`, uint32 | Ouster | ns after the stamp |
 | `offset_time`, uint32 | Livox | ns after the stamp |
 | `timestamp`, float64 | Hesai, RoboSense: s; Livox: ns | Unix time |
+| `time_stamp`, `time_offset`, `time_offset_ns`, uint32 | Nebula, Aeva | ns after the stamp |
 
 Other fields, and their unit, may be named in rig.yaml. Else the size of the numbers tells Unix times and their unit,
 and the time from one sweep to the next the unit of others; where neither does, whole numbers are ns, others s. A cloud
@@ -35,7 +36,7 @@ Array = NDArray[np.float64]
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of PointField's datatypes."""
-TIME_FIELDS = ("time", "t", "offset_time", "timestamp")
+TIME_FIELDS = ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset", "time_offset_ns")
 """Those that are known, in this order."""
 INTENSITY_FIELDS = ("intensity", "reflectivity")
 COMPENSATED = "compensated"
@@ -98,8 +99,7 @@ def times_of(
     field = time_field(names, said)
     if field is None:
         raise no_times(messages.topic, names)
-    looked_at = np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist()
-    told = np.array(list(_middles_and_spans(bag, messages, looked_at, field))).reshape(-1, 3)
+    told = np.array(list(_middles_and_spans(bag, messages, field))).reshape(-1, 3)
     middle, span, is_whole = np.median(told, axis=0) if len(told) else (0.0, 0.0, 0.0)
     for one in UNITS if unit is None else (unit,):
         if UNIX_S[0] < middle * UNITS[one] * 1e-9 < UNIX_S[1]:
@@ -113,11 +113,9 @@ def times_of(
     return PointTimes(field, found), found != usual
 
 
-def _middles_and_spans(
-    bag: Bag, messages: Messages, looked_at: list[int], field: str
-) -> Iterator[tuple[float, float, bool]]:
+def _middles_and_spans(bag: Bag, messages: Messages, field: str) -> Iterator[tuple[float, float, bool]]:
     """Of the times of the returns of some clouds, and whether they are whole numbers; nothing of those without any."""
-    for k in looked_at:
+    for k in messages.some(LOOKED_AT):
         try:
             table = _table(bag, messages, k, (field,))
         except DataError:  # told where the cloud is read

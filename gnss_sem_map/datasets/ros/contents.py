@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gnss_sem_map.datasets.ros import clouds, imu_topics, pictures, roles
+from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.fix_topics import covariance_of
+from gnss_sem_map.datasets.ros.imu_topics import part_of
 from gnss_sem_map.datasets.ros.kinds import HEADLESS, IMAGE, KINDS, STRING, TAKEN_FOR, unread
 from gnss_sem_map.datasets.ros.static_tf import URDF, StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
@@ -21,12 +22,7 @@ GAP_STEPS = 3.0
 LOOKED_AT = 50
 """Messages of a topic whose headers are compared with their arrival."""
 LATE_S = 1.0
-ORDER = [
-    imu_topics.WHOLE, imu_topics.GYROSCOPE, imu_topics.ACCELEROMETER, *(sensor for sensor in KINDS if sensor != "IMU"),
-    "calibration", "transforms", "",
-]  # fmt: skip
-"""What topics are taken for, as they are listed."""
-SENSORS = ORDER[:-3]
+NOT_READ = "not read: its images have the encoding"
 
 
 @dataclass(frozen=True)
@@ -62,9 +58,11 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
         usual = float(np.median(later)) if len(later) else 0.0
         gaps = steps[steps > GAP_STEPS * usual] if len(steps) > 2 else steps[:0]
         if taken == "IMU":
-            taken = imu_topics.part_of(bag, name)
-        is_sensor = taken in SENSORS and len(messages) > 0
+            taken = part_of(bag, name)
+        is_sensor = taken in KINDS and len(messages) > 0
         frame, notes = _looked_into(bag, messages, taken, transforms) if is_sensor else ("", [])
+        if notes and notes[0].startswith(NOT_READ):
+            taken, notes = "", notes[:1]
         if kind == STRING and name.endswith(URDF):
             taken = "transforms"
         elif not taken and (note := unread(kind)):
@@ -75,17 +73,17 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
                 len(gaps), float(gaps.max(initial=0.0)), taken, frame, tuple(notes),
             )
         )  # fmt: skip
-    return tuple(sorted(found, key=lambda topic: (ORDER.index(topic.taken_for), topic.name)))
+    order = [*KINDS, "calibration", "transforms", ""]
+    return tuple(sorted(found, key=lambda topic: (order.index(topic.taken_for), topic.name)))
 
 
 def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
     """A rig.yaml with every topic that may be a sensor; of several IMUs or receivers, all but the first as comments."""
     transforms = read_static_transforms(bag)
-    of = {sensor: _sensors(topics, sensor) for sensor in ORDER}
-    preferred = roles.of_kind(bag, "receiver")
-    of["receiver"].sort(key=lambda topic: topic.name not in preferred)
-    forces = of[imu_topics.ACCELEROMETER]
-    of["IMU"] += of[imu_topics.GYROSCOPE] if len(forces) == 1 or not of["IMU"] else []
+    of = {sensor: _sensors(topics, sensor) for sensor in KINDS}
+    of["receiver"].sort(key=lambda topic: KINDS["receiver"].index(topic.kind))
+    of["IMU"] += of["gyroscope"]
+    force = {"force_topic": of["accelerometer"][0].name} if of["accelerometer"] else {}
     about: dict[str, Any]
     parts = [
         "# Which topic of the bag is which sensor. All LiDARs and cameras here are used: remove those you do not want.",
@@ -93,8 +91,7 @@ def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
     ]
     for key, sensor in (("imu", "IMU"), ("gnss", "receiver")):
         for k, topic in enumerate(of[sensor]):
-            force = {"force_topic": forces[0].name} if topic.taken_for != sensor and len(forces) == 1 else {}
-            about = {"topic": topic.name} | (force if key == "imu" else {}) | _stamps(topic)
+            about = {"topic": topic.name} | (force if topic.taken_for == "gyroscope" else {}) | _stamps(topic)
             lines = _yaml({key: about})
             if sensor == "receiver" and not _has_lever_arm(topic, of["IMU"], transforms):
                 lines += "  p_imu_antenna: [0.0, 0.0, 0.0]  # antenna ahead, left, above of the IMU, m: measure it\n"
@@ -140,7 +137,7 @@ def _looked_into(
     if taken == "receiver" and hasattr(first, "position_covariance") and (why := covariance_of(first)[0]):
         notes.append(f"{why}: set stddevs_m")
     if taken == "camera" and messages.kind == IMAGE and first.encoding not in pictures.ENCODINGS:
-        notes.append(f"encoding {first.encoding} is not read: record colours, grey or a Bayer pattern")
+        notes.insert(0, f"{NOT_READ} {first.encoding}, which no colours have: depth, for example")
     if taken == "camera" and roles.info_beside(bag, messages.topic) is None:
         notes.append("no CameraInfo topic beside it: set info, or K and image_size")
     if taken in ("LiDAR", "camera") and frame not in transforms.frames:
@@ -149,7 +146,7 @@ def _looked_into(
 
 
 def _stamp_notes(bag: Bag, messages: Messages) -> list[str]:
-    some = np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist()
+    some = messages.some(LOOKED_AT)
     late = np.array([messages.received_ns[k] - header_ns(bag, messages, k) for k in some]) * 1e-9
     zero = sum(header_ns(bag, messages, k) == 0 for k in some)
     if zero:

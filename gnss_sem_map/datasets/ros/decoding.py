@@ -22,7 +22,7 @@ def typestore(is_ros1: bool) -> Any:
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     for name, text in DEFINITIONS.items():
         if name not in store.fielddefs:
-            store.register(get_types_from_msg(text, name))
+            store.register(get_types_from_msg(text.replace(";", "\n"), name))
     return store
 
 
@@ -56,8 +56,3 @@ def header_ns(bag: Bag, messages: Messages, k: int) -> int:
     except (struct.error, IndexError):
         raise DataError(f"{messages.topic}: message {k} has {len(head)} bytes, no header") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def stamp_ns(header: Any) -> int:
-    """The stamp of a decoded header, Unix ns."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 
 LOOKED_AT = 20
 """Messages of an Imu topic that tell which of its numbers are measured."""
-WHOLE, GYROSCOPE, ACCELEROMETER, ORIENTATION = "IMU", "gyroscope", "accelerometer", "heading"
 MOST_APART_S = 0.1
 """Between two forces that are farther apart none is interpolated."""
 
@@ -32,22 +31,14 @@ MOST_APART_S = 0.1
 def part_of(bag: Bag, topic: str) -> str:
     """What a topic of Imu measures: drivers leave zeros where another topic has the rest, or say -1."""
     messages = bag.messages(topic)
-    some = (
-        np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist() if len(messages) else []
-    )
     try:
-        found = [decode(bag, messages, k) for k in some]
+        found = [decode(bag, messages, k) for k in messages.some(LOOKED_AT)]
     except DataError:
-        return WHOLE
-    unknown = [
-        one.angular_velocity_covariance[0] == one.linear_acceleration_covariance[0] == -1 for one in found
-    ]
-    if any(unknown):
-        return ORIENTATION
-    has_rate, has_force = (any(any(_numbers(of(one))) for one in found) for of in (_rate, _force))
-    if has_rate == has_force:
-        return WHOLE
-    return GYROSCOPE if has_rate else ACCELEROMETER
+        return "IMU"
+    if any(m.angular_velocity_covariance[0] == m.linear_acceleration_covariance[0] == -1 for m in found):
+        return "heading"
+    has_rate, has_force = (any(any(of(message)) for message in found) for of in (_rate, _force))
+    return "IMU" if has_rate == has_force else "gyroscope" if has_rate else "accelerometer"
 
 
 def samples_of(
@@ -61,10 +52,9 @@ def samples_of(
         return None, None, []
     messages = bag.messages(about.topic)
     said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
-    rates = _rows(bag, messages, believed, _rate)
     stamps = np.asarray((said[believed] - epoch_ns) * 1e-9, np.float64)
     if about.force_topic is None:
-        forces = _rows(bag, messages, believed, _force)
+        forces, rates = np.hsplit(_rows(bag, messages, believed, _force, _rate), 2)
     else:
         others = bag.messages(about.force_topic)
         theirs, trusted, lost = stamps_of(bag, others, about.stamps) if with_all else _ends(others)
@@ -75,7 +65,8 @@ def samples_of(
         if count := int((~inside).sum()):
             reason = f"{count} turn rates without a force of {about.force_topic} near them"
             skips.append(Skip("samples", messages.topic, reason, count))
-        stamps, rates, forces = stamps[inside], rates[inside], forces[inside]
+        rates = _rows(bag, messages, believed, _rate)[inside]
+        stamps, forces = stamps[inside], forces[inside]
     try:
         samples, repairs = clean_imu(stamps, forces, rates)
     except MeasurementError as error:
@@ -88,21 +79,24 @@ def samples_of(
     return samples, attitude, skips
 
 
-def _rows(bag: Bag, messages: Messages, believed: NDArray[np.bool_], of: Callable[[Any], Any]) -> Array:
-    rows = [_numbers(of(decode(bag, messages, k))) for k in np.flatnonzero(believed).tolist()]
-    return np.array(rows, np.float64).reshape(-1, 3)
+def _rows(
+    bag: Bag, messages: Messages, believed: NDArray[np.bool_], *parts: Callable[[Any], list[float]]
+) -> Array:
+    rows = []
+    for k in np.flatnonzero(believed).tolist():
+        message = decode(bag, messages, k)
+        rows.append([number for part in parts for number in part(message)])
+    return np.array(rows, np.float64).reshape(-1, 3 * len(parts))
 
 
-def _rate(message: Any) -> Any:
-    return message.vector if message.__msgtype__ == VECTOR else message.angular_velocity
+def _rate(message: Any) -> list[float]:
+    v = message.vector if message.__msgtype__ == VECTOR else message.angular_velocity
+    return [v.x, v.y, v.z]
 
 
-def _force(message: Any) -> Any:
-    return message.vector if message.__msgtype__ == VECTOR else message.linear_acceleration
-
-
-def _numbers(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
+def _force(message: Any) -> list[float]:
+    v = message.vector if message.__msgtype__ == VECTOR else message.linear_acceleration
+    return [v.x, v.y, v.z]
 
 
 def _interpolated(stamps: Array, theirs: Array, measured: Array) -> tuple[Array, NDArray[np.bool_]]:

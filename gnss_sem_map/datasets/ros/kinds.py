@@ -11,8 +11,7 @@ FIX, GPS_FIXES = "sensor_msgs/msg/NavSatFix", ("gps_msgs/msg/GPSFix", "gps_commo
 SENTENCE, STRING = "nmea_msgs/msg/Sentence", "std_msgs/msg/String"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 LIVOX = tuple(
-    f"{package}/msg/CustomMsg"
-    for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces", "livox_ros2_driver")
+    f"{name}/msg/CustomMsg" for name in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 )
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -25,6 +24,8 @@ _REPORTS = tuple(
 
 KINDS = {
     "IMU": (IMU,),
+    "gyroscope": (),
+    "accelerometer": (),
     "receiver": (FIX, *GPS_FIXES, SENTENCE),
     "LiDAR": (CLOUD, *LIVOX),
     "camera": (IMAGE, COMPRESSED_IMAGE),
@@ -32,8 +33,8 @@ KINDS = {
     "heading": (QUATERNION, FLOATS[0]),
     "wheels": ("nav_msgs/msg/Odometry", *_REPORTS),
 }
-"""Those of velocities, headings and wheels, which may also be a command or an angle of anything, are never taken
-unasked. Of receivers, the first type that is there: others most often say the same once more."""
+"""Parts of an IMU are of the type of the whole. Velocities, headings and wheels, which may also be a command or an
+angle of anything, are never taken unasked. Of receivers, the first type that is there: others say the same again."""
 NAMED = {
     "IMU": (VECTOR,),
     "receiver": (STRING,),
@@ -46,67 +47,61 @@ HEADLESS = (*FLOATS, STRING, "geometry_msgs/msg/Twist")
 TAKEN_FOR = {kind: sensor for sensor, kinds in KINDS.items() for kind in kinds}
 TAKEN_FOR |= {INFO: "calibration"} | dict.fromkeys(TRANSFORMS, "transforms")
 
-_DRIVERS = {
-    "velodyne_msgs": "velodyne_pointcloud",
-    "ouster_ros": "ouster_ros", "ouster_msgs": "ouster_ros", "ouster_sensor_msgs": "ouster_ros",
-    "rslidar_msg": "rslidar_sdk", "rslidar_msgs": "rslidar_sdk",
-    "hesai_ros_driver": "hesai_ros_driver", "hesai_lidar": "hesai_lidar", "pandar_msgs": "hesai_ros_driver or nebula",
-    "nebula_msgs": "nebula", "lslidar_msgs": "lslidar_driver", "seyond": "seyond", "innovusion_msgs": "seyond",
-}  # fmt: skip
-"""What makes clouds of the packets of a LiDAR, by the package of their type."""
-_OTHERS = {
-    "can_msgs/msg/Frame": "raw CAN frames: write the speed of its wheels as std_msgs/Float64 (by your DBC file)",
-    "sensor_msgs/msg/LaserScan": "a LiDAR of one plane, which makes no map",
-    "sensor_msgs/msg/PointCloud": "the old cloud without times of points: record PointCloud2",
+_PACKETS = {
+    "velodyne_pointcloud": ("velodyne_msgs",),
+    "ouster_ros": ("ouster_ros", "ouster_msgs", "ouster_sensor_msgs"),
+    "rslidar_sdk": ("rslidar_msg", "rslidar_msgs"),
+    "hesai_ros_driver or nebula": ("hesai_ros_driver", "hesai_lidar", "pandar_msgs", "nebula_msgs"),
+    "lslidar_driver": ("lslidar_msgs",),
+    "the driver of Seyond": ("seyond", "innovusion_msgs"),
 }
+"""Packages whose messages are packets of a LiDAR, by the driver that makes clouds of them."""
+_OTHERS = {
+    "reports of a vehicle's bus: write its speed as std_msgs/Float64 (of CAN frames by your DBC file)": (
+        "can_msgs", "dbw_mkz_msgs", "dbw_fca_msgs", "dbw_ford_msgs", "raptor_dbw_msgs", "pacmod_msgs", "pacmod3_msgs",
+    ),
+    "a receiver's own messages: record the NavSatFix of its driver": (
+        "ublox_msgs", "novatel_gps_msgs", "novatel_oem7_msgs", "septentrio_gnss_driver",
+    ),
+    "a video: republish it as compressed images": ("ffmpeg_image_transport_msgs", "theora_image_transport"),
+    "a LiDAR of one plane, which makes no map": ("sensor_msgs/msg/LaserScan",),
+    "the old cloud without times of points: record PointCloud2": ("sensor_msgs/msg/PointCloud",),
+}  # fmt: skip
+_NOTES = {
+    package: f"packets of a LiDAR: play the bag, run {driver}, and record its sensor_msgs/PointCloud2"
+    for driver, packages in _PACKETS.items()
+    for package in packages
+} | {name: note for note, names in _OTHERS.items() for name in names}
 
-_GPS_STATUS = """std_msgs/Header header
-uint16 satellites_used
-int32[] satellite_used_prn
-uint16 satellites_visible
-int32[] satellite_visible_prn
-int32[] satellite_visible_z
-int32[] satellite_visible_azimuth
-int32[] satellite_visible_snr
-int16 status
-uint16 motion_source
-uint16 orientation_source
-uint16 position_source
-"""
+_HEADER = "std_msgs/Header header;"
+_GPS_STATUS = (
+    "uint16 satellites_used;int32[] satellite_used_prn;uint16 satellites_visible;int32[] satellite_visible_prn;"
+    "int32[] satellite_visible_z;int32[] satellite_visible_azimuth;int32[] satellite_visible_snr;int16 status;"
+    "uint16 motion_source;uint16 orientation_source;uint16 position_source"
+)
 _GPS_NUMBERS = (
     "latitude longitude altitude track speed climb pitch roll dip time gdop pdop hdop vdop tdop err err_horz err_vert"
     " err_track err_speed err_climb err_time err_pitch err_roll err_dip"
 )
-_GPS_FIX = (
-    "std_msgs/Header header\nGPSStatus status\n"
-    + "".join(f"float64 {name}\n" for name in _GPS_NUMBERS.split())
-    + "float64[9] position_covariance\nuint8 position_covariance_type\n"
-)
-_LIVOX_POINT = (
-    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-)
-_LIVOX = (
-    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
-    "CustomPoint[] points\n"
-)
-_REPORT = (
-    "std_msgs/Header header\nfloat32 longitudinal_velocity\nfloat32 lateral_velocity\nfloat32 heading_rate\n"
-)
+_GPS_FIX = f"GPSStatus status;{''.join(f'float64 {name};' for name in _GPS_NUMBERS.split())}"
+_LIVOX_POINT = "uint32 offset_time;float32 x;float32 y;float32 z;uint8 reflectivity;uint8 tag;uint8 line"
+_LIVOX = "uint64 timebase;uint32 point_num;uint8 lidar_id;uint8[3] rsvd;CustomPoint[] points"
 DEFINITIONS = {
-    **dict.fromkeys(TRANSFORMS, "geometry_msgs/TransformStamped[] transforms\n"),
-    **dict.fromkeys((kind.replace("Fix", "Status") for kind in GPS_FIXES), _GPS_STATUS),
-    **dict.fromkeys(GPS_FIXES, _GPS_FIX),
-    SENTENCE: "std_msgs/Header header\nstring sentence\n",
-    **dict.fromkeys((kind.replace("Msg", "Point") for kind in LIVOX), _LIVOX_POINT),
-    **dict.fromkeys(LIVOX, _LIVOX),
-    **dict.fromkeys(_REPORTS, _REPORT),
+    **dict.fromkeys(TRANSFORMS, "geometry_msgs/TransformStamped[] transforms"),
+    **{kind.replace("Fix", "Status"): _HEADER + _GPS_STATUS for kind in GPS_FIXES},
+    **dict.fromkeys(
+        GPS_FIXES, f"{_HEADER}{_GPS_FIX}float64[9] position_covariance;uint8 position_covariance_type"
+    ),
+    SENTENCE: f"{_HEADER}string sentence",
+    **{kind.replace("Msg", "Point"): _LIVOX_POINT for kind in LIVOX},
+    **dict.fromkeys(LIVOX, _HEADER + _LIVOX),
+    **dict.fromkeys(
+        _REPORTS, f"{_HEADER}float32 longitudinal_velocity;float32 lateral_velocity;float32 heading_rate"
+    ),
 }
-"""Of the types that ROS itself lacks."""
+"""Of the types that ROS itself lacks: their fields, between semicolons."""
 
 
 def unread(kind: str) -> str:
     """What a type is that is not read, and the way out; empty where there is nothing to say of it."""
-    driver = _DRIVERS.get(kind.partition("/")[0])
-    if driver is not None:
-        return f"packets of a LiDAR: play the bag, run {driver}, and record its sensor_msgs/PointCloud2"
-    return _OTHERS.get(kind, "")
+    return _NOTES.get(kind) or _NOTES.get(kind.partition("/")[0], "")

@@ -163,8 +163,9 @@ def _kind_of(channel: Channel, schema: Schema | None) -> tuple[str, str]:
     """The type of a channel's messages, as ROS 2 writes it, and their encoding."""
     if schema is None:
         return "", channel.message_encoding
-    package, slash, kind = schema.name.partition("/")
-    name = f"{package}/msg/{kind}" if slash and "/" not in kind else schema.name
+    name = schema.name.replace("::", "/")
+    if name.count("/") == 1:
+        name = name.replace("/", "/msg/")
     return name, OF_SCHEMA.get(schema.encoding, channel.message_encoding)
 
 

@@ -34,7 +34,13 @@ def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | Non
     """RGB pixels (h, w, 3); raises DataError for a damaged image, another encoding, or another (width, height)."""
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
     if messages.kind == COMPRESSED_IMAGE:
-        return decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
+        picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
+        recorded = message.format.partition(";")[0].strip()
+        if recorded.startswith("bayer") and recorded in ENCODINGS and (picture == picture[..., :1]).all():
+            return _as_rgb(
+                np.ascontiguousarray(picture[..., :1]), ENCODINGS[recorded][2], where
+            )  # a mosaic, as it was
+        return picture
     return _raw(message, where, size)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from gnss_sem_map.datasets.ros import imu_topics
 from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.imu_topics import part_of
 from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, unread
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError
@@ -67,68 +67,59 @@ def info_beside(bag: Bag, topic: str) -> str | None:
 
 def missing(bag: Bag, rig: Rig) -> list[Skip]:
     """That there is no IMU, no receiver or, where packets of one are there, no LiDAR."""
+    skips = [] if rig.lidars else [Skip("scan", topic, note) for topic, note in _notes(bag)]
+    if rig.imu is not None and rig.gnss is not None:
+        return skips
+    what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
-    lost = [
+    reason = (
         f"found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file), in rig.yaml"
-        for sensor, what in (
-            (rig.imu, "an IMU (sensor_msgs/Imu)"),
-            (rig.gnss, "a receiver (sensor_msgs/NavSatFix)"),
-        )
-        if sensor is None
-    ]
-    skips = [Skip(SENSOR, shown(bag.path), reason) for reason in lost[:1]]
-    if not rig.lidars:
-        skips += [Skip("scan", topic, note) for topic, kind in bag.kinds.items() if (note := unread(kind))]
-    return skips
+    )
+    return [*skips, Skip(SENSOR, shown(bag.path), reason)]
+
+
+def _notes(bag: Bag) -> list[tuple[str, str]]:
+    """What is to be said of topics that are not read."""
+    return [(topic, note) for topic, kind in sorted(bag.kinds.items()) if (note := unread(kind))]
 
 
 def nothing_read(bag: Bag) -> DataError:
     """The error that no topic of a bag is of a sensor, with what may be done about its types."""
-    notes = [f"{topic}: {note}" for topic, kind in sorted(bag.kinds.items()) if (note := unread(kind))]
+    notes = "; ".join(f"{topic}: {note}" for topic, note in _notes(bag))
     found = ", ".join(sorted(set(bag.kinds.values())))[:300] or "no topics"
     return DataError(
         f"{shown(bag.path)}: nothing of it is read; found no topic of an IMU, a receiver, a LiDAR or a camera, but"
-        f" {found}; {' '.join(notes)[:300] or 'docs/your_own_log.md lists the types that are read'}"
+        f" {found}; {notes[:300] or 'docs/your_own_log.md lists the types that are read'}"
     )
 
 
 def _imu(bag: Bag, topics: list[str]) -> ImuTopic | None:
     """The only IMU, or the only gyroscope with the only accelerometer."""
-    if len(topics) < 2:
-        return ImuTopic(topic=topics[0]) if topics else None
-    parts = {
-        part: [topic for topic in topics if imu_topics.part_of(bag, topic) == part]
-        for part in (imu_topics.WHOLE, imu_topics.GYROSCOPE, imu_topics.ACCELEROMETER)
-    }
-    whole, turns, forces = parts.values()
-    if len(whole) == 1:
-        return ImuTopic(topic=whole[0])
+    parts = {topic: part_of(bag, topic) for topic in topics} if len(topics) > 1 else {}
+    whole, turns, forces = (
+        [topic for topic, part in parts.items() if part == name]
+        for name in ("IMU", "gyroscope", "accelerometer")
+    )
     if not whole and len(turns) == len(forces) == 1:
         return ImuTopic(topic=turns[0], force_topic=forces[0])
-    raise _several(bag, "IMU", topics, "imu: {topic: ...}")
+    topic = _only(bag, "IMU", "imu: {topic: ...}", whole or topics)
+    return None if topic is None else ImuTopic(topic=topic)
 
 
-def _only(bag: Bag, sensor: str, key: str) -> str | None:
-    found = of_kind(bag, sensor)
+def _only(bag: Bag, sensor: str, key: str, among: list[str] | None = None) -> str | None:
+    found = of_kind(bag, sensor) if among is None else among
     if len(found) > 1:
-        raise _several(bag, sensor, found, key)
+        raise DataError(
+            f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
+            f" rig.yaml, {key}; `gnss-sem-map inspect` writes one to edit"
+        )
     return found[0] if found else None
-
-
-def _several(bag: Bag, sensor: str, found: list[str], key: str) -> DataError:
-    return DataError(
-        f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
-        f" rig.yaml, {key}; `gnss-sem-map inspect` writes one to edit"
-    )
 
 
 def _check(bag: Bag, rig: Rig) -> None:
     named: list[tuple[str, str, str | None]] = [
-        *(
-            [("imu", "IMU", rig.imu.topic), ("imu.force_topic", "IMU", rig.imu.force_topic)]
-            if rig.imu
-            else []
-        ),
+        *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
+        *([("imu.force_topic", "IMU", rig.imu.force_topic)] if rig.imu else []),
         *([("wheels", "wheels", rig.wheels.topic)] if rig.wheels else []),
         *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),
         *([("gnss.velocity", "velocity", rig.gnss.velocity.topic)] if rig.gnss and rig.gnss.velocity else []),

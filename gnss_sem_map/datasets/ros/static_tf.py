@@ -7,7 +7,7 @@ counts, then the URDF.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 from xml.etree import ElementTree
@@ -23,8 +23,9 @@ from gnss_sem_map.errors import DataError
 
 Array = NDArray[np.float64]
 
-TOPIC = "/tf_static"
-URDF = "robot_description"
+STATIC, URDF = "tf_static", "robot_description"
+Told = tuple[str, str, tuple[float, ...]]
+"""Parent, child, and the child's place and quaternion in its parent."""
 Edges = dict[str, tuple[str, Array]]
 """Parents of frames, and T_parent_child (4, 4)."""
 LOOKED_AT = 500
@@ -74,92 +75,75 @@ class StaticTransforms:
 
 
 def read_static_transforms(bag: Bag) -> StaticTransforms:
-    """The fixed transforms of a bag; none where it has no such topic. Raises DataError for one that is no pose."""
-    named = {topic: topic.rpartition("/")[2] for topic in sorted(bag.kinds)}
+    """The fixed transforms of a bag; none where it has none. Raises DataError for a static one that is no pose."""
     edges: Edges = {}
     for name, kinds, read in (
         ("tf", TRANSFORMS, _that_stay),
-        (URDF, (STRING,), _described),
-        ("tf_static", TRANSFORMS, _static),
+        (URDF, (STRING,), _of_robots),
+        (STATIC, TRANSFORMS, _transforms),
     ):
-        for topic, last in named.items():
-            if last == name and bag.kinds[topic] in kinds:
-                edges |= read(bag, topic)
+        for topic in sorted(bag.kinds):
+            if topic.rpartition("/")[2] != name or bag.kinds[topic] not in kinds:
+                continue
+            messages = bag.messages(topic)
+            some = range(len(messages)) if name == STATIC else messages.some(LOOKED_AT)
+            for parent, child, numbers in read([decode(bag, messages, k) for k in some]):
+                T = _pose(numbers)
+                if T is not None:
+                    edges[child] = (parent, T)
+                elif name == STATIC:  # others may have frames that nobody needs
+                    raise DataError(
+                        f"{topic}: {parent} to {child}: found {list(numbers)}, expected metres x y z and a unit"
+                        " quaternion x y z w"
+                    )
     return StaticTransforms(edges)
 
 
-def _static(bag: Bag, topic: str) -> Edges:
-    messages = bag.messages(topic)
-    return {
-        child: (parent, _pose(topic, parent, child, xyzw, xyz))
-        for k in range(len(messages))
-        for parent, child, xyzw, xyz in _transforms(decode(bag, messages, k))
-    }
+def _transforms(messages: Iterable[Any]) -> Iterator[Told]:
+    for one in (one for message in messages for one in message.transforms):
+        t, q = one.transform.translation, one.transform.rotation
+        names = one.header.frame_id.strip("/"), one.child_frame_id.strip("/")
+        yield *names, (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
 
 
-def _that_stay(bag: Bag, topic: str) -> Edges:
+def _that_stay(messages: Iterable[Any]) -> Iterator[Told]:
     """Those that are told several times, and are always the same."""
-    messages = bag.messages(topic)
-    told: dict[str, set[tuple[Any, ...]]] = {}
-    counts: dict[str, int] = {}
-    for k in (
-        np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist() if len(messages) else []
-    ):
-        for parent, child, xyzw, xyz in _transforms(decode(bag, messages, k)):
-            told.setdefault(child, set()).add((parent, *xyzw, *xyz))
-            counts[child] = counts.get(child, 0) + 1
-    edges: Edges = {}
-    for child, found in told.items():
-        if len(found) == 1 and counts[child] > 1:
-            [(parent, *numbers)] = found
-            with suppress(DataError):  # of one that is not needed, perhaps
-                edges[child] = (parent, _pose(topic, parent, child, numbers[:4], numbers[4:]))
-    return edges
+    found: dict[str, list[Told]] = {}
+    for one in _transforms(messages):
+        found.setdefault(one[1], []).append(one)
+    return (told[0] for told in found.values() if len(told) > 1 and len(set(told)) == 1)
 
 
-def _transforms(message: Any) -> Iterator[tuple[str, str, list[float], list[float]]]:
-    for one in message.transforms:
-        q, t = one.transform.rotation, one.transform.translation
-        parent, child = one.header.frame_id.strip("/"), one.child_frame_id.strip("/")
-        yield parent, child, [q.x, q.y, q.z, q.w], [t.x, t.y, t.z]
+def _of_robots(messages: Iterable[Any]) -> Iterator[Told]:
+    return (joint for message in messages for joint in fixed_joints(str(message.data)))
 
 
-def _described(bag: Bag, topic: str) -> Edges:
-    messages = bag.messages(topic)
-    return fixed_joints(str(decode(bag, messages, 0).data), topic) if len(messages) else {}
-
-
-def fixed_joints(text: str, topic: str) -> Edges:
-    """The fixed joints of a URDF; none of what is no URDF, or has a document type."""
-    edges = Edges()
-    if len(text) > MOST_XML_BYTES or "<!" in text.replace(
-        "<!--", ""
-    ):  # entities may stand for any amount of text
-        return edges
+def fixed_joints(text: str) -> Iterator[Told]:
+    """The fixed joints of a URDF; none of what is no URDF, or has a document type: entities may be of any size."""
+    if len(text) > MOST_XML_BYTES or "<!" in text.replace("<!--", ""):
+        return
     try:
         joints = ElementTree.fromstring(text).findall("joint[@type='fixed']")
     except (ElementTree.ParseError, ValueError):
-        return edges
+        return
     for joint in joints:
         parts = {part.tag: part.attrib for part in joint}
         parent, child = (parts.get(name, {}).get("link", "").strip("/") for name in ("parent", "child"))
         origin = parts.get("origin", {})
-        with suppress(ValueError, DataError):
+        with suppress(ValueError):
             xyz, rpy = ([float(v) for v in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
-            xyzw = Rotation.from_euler("xyz", rpy).as_quat().tolist()
-            edges[child] = (parent, _pose(topic, parent, child, xyzw, xyz))
-    return edges
+            yield parent, child, (*xyz, *Rotation.from_euler("xyz", rpy).as_quat().tolist())
 
 
-def _pose(
-    topic: str, parent: str, child: str, quaternion_xyzw: list[float], translation: list[float]
-) -> Array:
-    off = abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0)
-    if not (off <= MOST_OFF_UNIT and len(translation) == 3 and np.isfinite(translation).all()):
-        raise DataError(
-            f"{topic}: {parent} to {child}: found quaternion {quaternion_xyzw} and translation {translation}, expected"
-            " a unit quaternion x y z w and metres"
-        )
+def _pose(numbers: tuple[float, ...]) -> Array | None:
+    """The transform (4, 4) of x y z and a quaternion x y z w; None where they are none."""
+    values = np.array(numbers, np.float64)
+    if (
+        values.shape != (7,)
+        or not np.isfinite(values).all()
+        or abs(np.linalg.norm(values[3:]) - 1) > MOST_OFF_UNIT
+    ):
+        return None
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat(quaternion_xyzw).as_matrix(), translation
+    T[:3, :3], T[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
     return T

@@ -49,7 +49,7 @@ def test_what_would_stop_a_run_is_noted(tmp_path: Path) -> None:
     assert "no time per point among x, y, z, intensity, ring" in found["/points"].notes[0]
     assert "its frame 'lidar' is in no fixed transform" in found["/points"].notes[1]
     assert found["/fix"].notes == ("its covariance is unknown: set stddevs_m",)
-    assert "encoding 32FC1 is not read" in found["/image_rect"].notes[0]
+    assert "not read: its images have the encoding 32FC1" in found["/image_rect"].notes[0]
     assert found["/imu_without_clock"].notes == ("5 of 5 header stamps are zero: set stamps: received",)
 
 

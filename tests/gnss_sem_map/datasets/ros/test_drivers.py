@@ -187,6 +187,7 @@ def test_a_damaged_livox_message_is_refused(tmp_path: Path) -> None:
         ("rslidar_msg/msg/RslidarPacket", "rslidar_sdk"),
         ("hesai_ros_driver/msg/UdpFrame", "hesai_ros_driver"),
         ("pandar_msgs/msg/PandarScan", "nebula"),
+        ("nebula_msgs/msg/NebulaPackets", "nebula"),
     ],
 )
 def test_packets_are_named_with_the_driver_to_run(tmp_path: Path, kind: str, driver: str) -> None:

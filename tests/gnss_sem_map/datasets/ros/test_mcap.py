@@ -49,6 +49,13 @@ def test_what_is_encoded_as_ros_is_read_whatever_the_profile_says(
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.parametrize("name", ["sensor_msgs/Imu", "sensor_msgs/msg/Imu", "sensor_msgs::msg::Imu"])
+@pytest.mark.parametrize("schema", ["ros2msg", "ros2idl", "omgidl"])
+def test_types_have_one_name_however_they_are_written(tmp_path: Path, name: str, schema: str) -> None:
+    file = foreign(tmp_path / "drive.mcap", "cdr", schema, name)
+    assert Bag(file).kinds == {"/lidar": "sensor_msgs/msg/Imu"}
+
+
 def foreign(path: Path, encoding: str, schema: str, kind: str, topic: str = "/lidar") -> Path:
     with path.open("wb") as file:
         writer = Writer(file)

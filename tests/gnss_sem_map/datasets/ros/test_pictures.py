@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import ros
@@ -12,7 +13,10 @@ from numpy.typing import NDArray
 from ros import START_NS
 
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.contents import contents_of, suggested_rig
 from gnss_sem_map.errors import DataError
+from gnss_sem_map.files.structured import parse_yaml
 
 HEIGHT, WIDTH = 4, 6
 RED, GREEN, BLUE = 200, 120, 40
@@ -99,6 +103,27 @@ def test_grey_of_8_bits_arrives(tmp_path: Path, encoding: str) -> None:
 def test_grey_of_16_bits_and_of_12_in_them_arrives(tmp_path: Path, factor: int) -> None:
     pixels = GREY.astype(np.uint16) * factor
     np.testing.assert_array_equal(read(tmp_path, pixels.view(np.uint8), "mono16"), np.dstack([GREY] * 3))
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("said", ["bayer_{}8; png compressed ", "bayer_{}8; png compressed bgr8"])
+def test_a_mosaic_that_was_compressed_has_its_colours(tmp_path: Path, pattern: str, said: str) -> None:
+    """Drivers compress the mosaic itself, or the colours."""
+    rig = ros.with_camera()
+    pixels = COLOUR[..., ::-1] if "bgr8" in said else mosaic(pattern)
+    rig.compressed(START_NS, cv2.imencode(".png", pixels)[1].tobytes())
+    rig.messages[-1][2].format = said.format(pattern)
+    [image] = open_drive(ros.write(tmp_path / "drive", rig)).images
+    np.testing.assert_array_equal(image.read(), COLOUR)
+
+
+def test_depth_beside_colours_is_no_camera(tmp_path: Path) -> None:
+    rig = ros.with_camera()
+    rig.image(START_NS, COLOUR, "rgb8", topic="/color/image_raw")
+    rig.image(START_NS, np.zeros((HEIGHT, WIDTH, 2), np.uint8), "16UC1", topic="/depth/image_rect_raw")
+    bag = Bag(ros.write(tmp_path / "drive", rig))
+    rig_file = parse_yaml(suggested_rig(bag, contents_of(bag)))
+    assert [one["topic"] for one in rig_file["cameras"].values()] == ["/color/image_raw"]
 
 
 def test_a_mosaic_of_one_pixel_is_an_error_of_ours(tmp_path: Path) -> None:

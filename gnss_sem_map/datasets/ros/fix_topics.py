@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -70,10 +71,8 @@ def fix_rows(bag: Bag, topic: str, about: GnssTopic) -> tuple[Array, Ints, list[
 
 def covariance_of(fix: Any) -> tuple[str, Array | None]:
     """Why a fix has no covariance, or nothing; and the covariance (3, 3) m² that its message tells."""
-    kind, covariance = (
-        fix.position_covariance_type,
-        np.array(fix.position_covariance, np.float64).reshape(3, 3),
-    )
+    covariance = np.array(fix.position_covariance, np.float64).reshape(3, 3)
+    kind = fix.position_covariance_type
     if kind != UNKNOWN_COVARIANCE and (covariance.diagonal() > 0).all():
         return "", covariance * np.eye(3) if kind == DIAGONAL_COVARIANCE else covariance
     across, up = getattr(fix, "err_horz", 0.0), getattr(fix, "err_vert", 0.0)
@@ -86,14 +85,12 @@ def _of_sentences(
     bag: Bag, messages: Messages, said: Ints, about: GnssTopic
 ) -> tuple[Array, Ints, list[Skip]]:
     """The fixes of NMEA sentences at their own time, UTC; on the clock of their stamps where that is another one."""
-    texts = [decode(bag, messages, k) for k in range(len(messages))]
-    lines = [str(one.sentence if messages.kind == SENTENCE else one.data) for one in texts]
+    name = "sentence" if messages.kind == SENTENCE else "data"
+    lines = [str(getattr(decode(bag, messages, k), name)) for k in range(len(messages))]
     near_ns = int(np.median(said)) if len(said) else None
     found = nmea.read(Path(messages.topic), near_ns, None, False, lines)
     stamps, skips = found.stamps_ns, found.skips
-    are_fixes = [
-        "GGA," in line and line.split("GGA,")[1].split(",")[5:6] not in ([""], ["0"]) for line in lines
-    ]
+    are_fixes = [re.search(r"GGA(,[^,]*){5},[1-9]", line) is not None for line in lines]
     off_ns = round(float(np.median(said[are_fixes])) - float(np.median(stamps))) if any(are_fixes) else 0
     if abs(off_ns) > JUMP_NS:
         stamps = stamps + off_ns

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,8 @@ from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
 
+RATE, FORCE = "angular_velocity", "linear_acceleration"
+"""Of Imu."""
 LOOKED_AT = 20
 """Messages of an Imu topic that tell which of its numbers are measured."""
 MOST_APART_S = 0.1
@@ -37,7 +38,7 @@ def part_of(bag: Bag, topic: str) -> str:
         return "IMU"
     if any(m.angular_velocity_covariance[0] == m.linear_acceleration_covariance[0] == -1 for m in found):
         return "heading"
-    has_rate, has_force = (any(any(of(message)) for message in found) for of in (_rate, _force))
+    has_rate, has_force = (any(any(_vector(m, name)) for m in found) for name in (RATE, FORCE))
     return "IMU" if has_rate == has_force else "gyroscope" if has_rate else "accelerometer"
 
 
@@ -54,18 +55,18 @@ def samples_of(
     said, believed, skips = stamps_of(bag, messages, about.stamps) if with_all else _ends(messages)
     stamps = np.asarray((said[believed] - epoch_ns) * 1e-9, np.float64)
     if about.force_topic is None:
-        forces, rates = np.hsplit(_rows(bag, messages, believed, _force, _rate), 2)
+        forces, rates = np.hsplit(_rows(bag, messages, believed, FORCE, RATE), 2)
     else:
         others = bag.messages(about.force_topic)
         theirs, trusted, lost = stamps_of(bag, others, about.stamps) if with_all else _ends(others)
         measured = np.asarray((theirs[trusted] - epoch_ns) * 1e-9, np.float64)
-        forces, inside = _interpolated(stamps, measured, _rows(bag, others, trusted, _force))
+        forces, inside = _interpolated(stamps, measured, _rows(bag, others, trusted, FORCE))
         inside |= not with_all  # only their ends were read
         skips += lost
         if count := int((~inside).sum()):
             reason = f"{count} turn rates without a force of {about.force_topic} near them"
             skips.append(Skip("samples", messages.topic, reason, count))
-        rates = _rows(bag, messages, believed, _rate)[inside]
+        rates = _rows(bag, messages, believed, RATE)[inside]
         stamps, forces = stamps[inside], forces[inside]
     try:
         samples, repairs = clean_imu(stamps, forces, rates)
@@ -79,24 +80,18 @@ def samples_of(
     return samples, attitude, skips
 
 
-def _rows(
-    bag: Bag, messages: Messages, believed: NDArray[np.bool_], *parts: Callable[[Any], list[float]]
-) -> Array:
+def _rows(bag: Bag, messages: Messages, believed: NDArray[np.bool_], *names: str) -> Array:
+    """Vectors of those names (n, 3 for each)."""
     rows = []
     for k in np.flatnonzero(believed).tolist():
         message = decode(bag, messages, k)
-        rows.append([number for part in parts for number in part(message)])
-    return np.array(rows, np.float64).reshape(-1, 3 * len(parts))
+        rows.append([number for name in names for number in _vector(message, name)])
+    return np.array(rows, np.float64).reshape(-1, 3 * len(names))
 
 
-def _rate(message: Any) -> list[float]:
-    v = message.vector if message.__msgtype__ == VECTOR else message.angular_velocity
-    return [v.x, v.y, v.z]
-
-
-def _force(message: Any) -> list[float]:
-    v = message.vector if message.__msgtype__ == VECTOR else message.linear_acceleration
-    return [v.x, v.y, v.z]
+def _vector(message: Any, name: str) -> tuple[float, float, float]:
+    v = getattr(message, "vector" if message.__msgtype__ == VECTOR else name)
+    return v.x, v.y, v.z
 
 
 def _interpolated(stamps: Array, theirs: Array, measured: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -67,13 +67,15 @@ def info_beside(bag: Bag, topic: str) -> str | None:
 
 def missing(bag: Bag, rig: Rig) -> list[Skip]:
     """That there is no IMU, no receiver or, where packets of one are there, no LiDAR."""
-    skips = [] if rig.lidars else [Skip("scan", topic, note) for topic, note in _notes(bag)]
+    notes = [] if rig.lidars else [(topic, note) for topic, note in _notes(bag) if "LiDAR" in note]
+    skips = [Skip("scan", topic, note) for topic, note in notes]
     if rig.imu is not None and rig.gnss is not None:
         return skips
     what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
     reason = (
         f"found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file), in rig.yaml"
+        + "".join(f"; {topic}: {note}" for topic, note in _notes(bag))[:300]
     )
     return [*skips, Skip(SENSOR, shown(bag.path), reason)]
 

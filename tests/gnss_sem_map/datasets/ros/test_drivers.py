@@ -220,11 +220,9 @@ def test_messages_of_a_receiver_alone_are_named_with_the_topic_to_record(tmp_pat
     rig = without_clouds()
     rig.messages = [one for one in rig.messages if one[0] != "/fix"]
     rig.messages += foreign(rig, "ublox_msgs/msg/NavPVT", "/ublox/navpvt")
-    log = open_drive(ros.write_mcap(tmp_path / "drive.mcap", rig, "ros2"))
+    file = ros.write_mcap(tmp_path / "drive.mcap", rig, "ros2")
     with pytest.raises(DataError, match=r"no topic of a receiver .*; /ublox/navpvt: .*record the NavSatFix"):
-        log.check_located()
-    with pytest.raises(DataError, match=r"no LiDAR scan to map, or none that --frames names; for the"):
-        log.check_scans()
+        open_drive(file)
 
 
 @pytest.mark.parametrize("kind", ["velodyne_msgs/msg/VelodyneScan", "my_msgs/msg/Whatever"])

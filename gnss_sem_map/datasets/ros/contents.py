@@ -13,7 +13,7 @@ from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
 from gnss_sem_map.datasets.ros.fix_topics import covariance_of
 from gnss_sem_map.datasets.ros.imu_topics import part_of
-from gnss_sem_map.datasets.ros.kinds import HEADLESS, IMAGE, KINDS, STRING, TAKEN_FOR, unread
+from gnss_sem_map.datasets.ros.kinds import HEADLESS, KINDS, STRING, TAKEN_FOR, unread
 from gnss_sem_map.datasets.ros.static_tf import URDF, StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
 
@@ -136,8 +136,8 @@ def _looked_into(
         notes.append(f"no time per point among {', '.join(clouds.fields_of(first))}: set point_times")
     if taken == "receiver" and hasattr(first, "position_covariance") and (why := covariance_of(first)[0]):
         notes.append(f"{why}: set stddevs_m")
-    if taken == "camera" and messages.kind == IMAGE and first.encoding not in pictures.ENCODINGS:
-        notes.insert(0, f"{NOT_READ} {first.encoding}, which no colours have: depth, for example")
+    if taken == "camera" and (encoding := pictures.unread_encoding(first)):
+        notes.insert(0, f"{NOT_READ} {encoding}: depth, a video, or an unknown one")
     if taken == "camera" and roles.info_beside(bag, messages.topic) is None:
         notes.append("no CameraInfo topic beside it: set info, or K and image_size")
     if taken in ("LiDAR", "camera") and frame not in transforms.frames:

@@ -11,7 +11,7 @@ from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
 from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE
 from gnss_sem_map.errors import DataError, ImageSizeError
-from gnss_sem_map.files.pictures import MOST_PIXELS, decoded_picture
+from gnss_sem_map.files.pictures import JPEG, MOST_PIXELS, PNG, decoded_picture
 
 ENCODINGS: dict[str, tuple[int, int, str]] = {
     **{
@@ -33,6 +33,11 @@ ENCODINGS: dict[str, tuple[int, int, str]] = {
 def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     """RGB pixels (h, w, 3); raises DataError for a damaged image, another encoding, or another (width, height)."""
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
+    if why := unread_encoding(message):
+        raise DataError(
+            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert the images"
+            " when they are recorded"
+        )
     if messages.kind == COMPRESSED_IMAGE:
         picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
         recorded = message.format.partition(";")[0].strip()
@@ -44,13 +49,18 @@ def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | Non
     return _raw(message, where, size)
 
 
+def unread_encoding(message: Any) -> str:
+    """The encoding of an image that is not read; empty where it is."""
+    if hasattr(message, "encoding"):
+        return "" if message.encoding in ENCODINGS else str(message.encoding)[:40]
+    said = str(message.format).lower()
+    is_said = any(name in said for name in ("png", "jpeg", "jpg")) and "compresseddepth" not in said
+    is_seen = bytes(np.asarray(message.data[: len(PNG)], np.uint8)).startswith((PNG, JPEG))
+    return "" if is_said or is_seen else str(message.format)[:40] or "none"
+
+
 def _raw(message: Any, where: str, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     width, height, step = int(message.width), int(message.height), int(message.step)
-    if message.encoding not in ENCODINGS:
-        raise DataError(
-            f"{where}: found encoding {message.encoding[:40]!r}, expected one of {', '.join(ENCODINGS)}; convert the"
-            " images when they are recorded"
-        )
     if size is not None and (width, height) != size:
         raise ImageSizeError(
             f"{where}: found {width} x {height} pixels, expected {size[0]} x {size[1]} as in the calibration",

@@ -117,6 +117,31 @@ def test_a_mosaic_that_was_compressed_has_its_colours(tmp_path: Path, pattern: s
     np.testing.assert_array_equal(image.read(), COLOUR)
 
 
+@pytest.mark.parametrize(
+    ("said", "content"),
+    [("16UC1; compressedDepth png", b"\0" * 12 + b"\x89PNG\r\n\x1a\n"), ("h264", b"\0\0\0\1gB")],
+)
+def test_what_is_compressed_otherwise_is_no_camera(tmp_path: Path, said: str, content: bytes) -> None:
+    rig = ros.with_camera()
+    rig.compressed(START_NS, content)
+    rig.messages[-1][2].format = said
+    path = ros.write(tmp_path / "drive", rig)
+    [topic] = [one for one in contents_of(Bag(path)) if one.name == "/image_rect/compressed"]
+    assert topic.taken_for == ""
+    assert topic.notes[0].startswith(f"not read: its images have the encoding {said}")
+    with pytest.raises(DataError, match=f"found encoding '{said}', expected PNG, JPEG, or one of rgb8"):
+        open_drive(path).images[0].read()
+
+
+@pytest.mark.parametrize("said", ["", "bgr8", "jpeg"])
+def test_a_png_is_read_whatever_it_says(tmp_path: Path, said: str) -> None:
+    rig = ros.with_camera()
+    rig.compressed(START_NS, cv2.imencode(".png", COLOUR[..., ::-1])[1].tobytes())
+    rig.messages[-1][2].format = said
+    [image] = open_drive(ros.write(tmp_path / "drive", rig)).images
+    np.testing.assert_array_equal(image.read(), COLOUR)
+
+
 def test_depth_beside_colours_is_no_camera(tmp_path: Path) -> None:
     rig = ros.with_camera()
     rig.image(START_NS, COLOUR, "rgb8", topic="/color/image_raw")

@@ -297,7 +297,9 @@ def test_images_of_an_unknown_lens_are_refused(tmp_path: Path) -> None:
 def test_an_encoding_that_is_not_known_is_named(tmp_path: Path) -> None:
     rig = with_camera()
     rig.image(START_NS, np.zeros((4, 6), np.uint8), "32FC1")
-    with pytest.raises(DataError, match=r"found encoding '32FC1', expected one of rgb8, bgr8, .*convert"):
+    with pytest.raises(
+        DataError, match=r"found encoding '32FC1', expected PNG, JPEG, or one of rgb8, bgr8, .*convert"
+    ):
         open_drive(ros.write(tmp_path / "drive", rig)).images[0].read()
 
 

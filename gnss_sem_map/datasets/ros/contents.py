@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ GAP_STEPS = 3.0
 LOOKED_AT = 50
 """Messages of a topic whose headers are compared with their arrival."""
 LATE_S = 1.0
+USUAL_WORDS = re.compile("points|image(_raw|_rect|_rect_color)?|raw|rect|color|compressed")
 NOT_READ = "not read: its images have the encoding"
 
 
@@ -197,18 +199,7 @@ def _named(topics: list[Topic]) -> dict[str, Topic]:
 
 def _name(topic: Topic) -> str:
     """A name for a sensor: the words of its topic but for those that all have."""
-    usual = (
-        "points",
-        "image",
-        "raw",
-        "rect",
-        "color",
-        "compressed",
-        "image_raw",
-        "image_rect",
-        "image_rect_color",
-    )
-    words = [word for word in topic.name.strip("/").split("/") if word not in usual]
+    words = [word for word in topic.name.strip("/").split("/") if not USUAL_WORDS.fullmatch(word)]
     return "_".join(words) or topic.taken_for.lower()
 
 

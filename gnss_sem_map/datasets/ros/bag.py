@@ -111,7 +111,7 @@ class Bag:
         others = set[str]()
         for file in self._files:
             for topic, (name, encoding) in file.topics.items():
-                kind = name if encoding in ENCODINGS else f"{name} ({encoding})"
+                kind = name if encoding in ENCODINGS else f"{name or 'messages'} ({encoding})"
                 if encoding == "ros1":
                     self._ros1.add(topic)
                 elif encoding not in ENCODINGS:

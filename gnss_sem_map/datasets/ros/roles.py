@@ -153,6 +153,6 @@ def _check_kind(bag: Bag, place: str, topic: str, kinds: Iterable[str]) -> None:
         )
     if kind not in kinds:
         raise DataError(
-            f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)}; `gnss-sem-map inspect` lists the"
-            " topics"
+            f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)};"
+            f" {unread(kind) or '`gnss-sem-map inspect` lists the topics'}"
         )

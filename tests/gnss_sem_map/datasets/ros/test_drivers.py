@@ -198,6 +198,9 @@ def test_packets_are_named_with_the_driver_to_run(tmp_path: Path, kind: str, dri
         DataError, match=rf"no LiDAR scan.*/packets: packets of a LiDAR: play the bag, run .*{driver}"
     ):
         log.check_scans()
+    rig_yaml(tmp_path / "drive.mcap", lidars={"top": {"topic": "/packets"}})
+    with pytest.raises(DataError, match=rf"lidars.top: /packets is of {kind}, expected .*; .*run .*{driver}"):
+        open_drive(tmp_path / "drive.mcap")
     shown = CliRunner().invoke(app, ["inspect", str(tmp_path / "drive.mcap")])
     assert driver in shown.output
     assert shown.exit_code == 0

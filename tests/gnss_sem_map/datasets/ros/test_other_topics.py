@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from gnss_sem_map.cli import app
-from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets import open_drive, rosbag
 from gnss_sem_map.datasets.ros.bag import Bag
 from gnss_sem_map.datasets.ros.contents import contents_of, suggested_rig
 from gnss_sem_map.datasets.ros.static_tf import read_static_transforms
@@ -175,6 +175,16 @@ def test_turn_rates_without_forces_near_them_are_counted(tmp_path: Path) -> None
     assert not ((stamps > 0.52) & (stamps < 0.79)).any()
     [skip] = [skip for skip in log.skips if "without a force" in skip.reason]
     assert skip.frames == 202 - len(stamps)
+
+
+def test_with_poses_in_a_file_the_ends_of_both_parts_are_enough(tmp_path: Path) -> None:
+    rig = without("/imu")
+    split_imu(rig)
+    bag = written(tmp_path, rig)
+    log = rosbag.read(bag, with_imu=False)
+    assert log.imu is not None
+    assert len(log.imu) == 2
+    assert len(log.scans) == 10
 
 
 def test_inspect_suggests_both_parts_of_an_imu(tmp_path: Path) -> None:

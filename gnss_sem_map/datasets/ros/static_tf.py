@@ -2,7 +2,7 @@
 
 They are in topics named tf_static, under any namespace; in tf, where a transform stays the same; and in
 robot_description, as fixed joints of a URDF (http://wiki.ros.org/urdf/XML/joint). Of one that is told twice, tf_static
-counts, then the URDF.
+counts, then the URDF; what tf_static alone joins, it tells alone.
 """
 
 from __future__ import annotations
@@ -36,47 +36,53 @@ MOST_OFF_UNIT = 1e-3
 
 
 class StaticTransforms:
-    """Poses of frames in their parents: `T_parent_child`, by child."""
+    """Poses of frames in their parents: `T_parent_child`, by child; `more` count only where `edges` join no frames."""
 
-    def __init__(self, edges: Edges) -> None:
-        self._edges = edges
+    def __init__(self, edges: Edges, more: Edges | None = None) -> None:
+        self._edges, self._all = edges, (more or {}) | edges
 
     @property
     def frames(self) -> list[str]:
         """All frames, sorted."""
-        return sorted({*self._edges, *(parent for parent, _ in self._edges.values())})
+        return sorted({*self._all, *(parent for parent, _ in self._all.values())})
 
     def between(self, target: str, source: str) -> Array | None:
         """T_target_source (4, 4), None where no chain of transforms joins them; raises DataError for a circle."""
-        to_target, to_source = self._ancestors(target), self._ancestors(source)
-        common = next((frame for frame in to_target if frame in to_source), None)
-        if common is None:
-            return None
-        up, down = to_target[common], to_source[common]
-        if target == common:
-            return down
-        inverse = np.asarray(np.linalg.inv(up), np.float64)
-        return inverse if source == common else inverse @ down
+        found = _between(self._edges, target, source)
+        return _between(self._all, target, source) if found is None else found
 
-    def _ancestors(self, frame: str) -> dict[str, Array]:
-        """T_ancestor_frame of the frame itself and of all above it, from the nearest on."""
-        found, T = {frame: np.eye(4)}, None
-        at = frame
-        while at in self._edges:
-            at, edge = self._edges[at]
-            if at in found:
-                raise DataError(
-                    f"fixed transforms: found a circle of frames, {' > '.join([*found, at])}; expected a tree; give"
-                    " the poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
-                )
-            T = edge if T is None else edge @ T  # no product with the identity: the edge to the bit
-            found[at] = T
-        return found
+
+def _between(edges: Edges, target: str, source: str) -> Array | None:
+    to_target, to_source = _ancestors(edges, target), _ancestors(edges, source)
+    common = next((frame for frame in to_target if frame in to_source), None)
+    if common is None:
+        return None
+    up, down = to_target[common], to_source[common]
+    if target == common:
+        return down
+    inverse = np.asarray(np.linalg.inv(up), np.float64)
+    return inverse if source == common else inverse @ down
+
+
+def _ancestors(edges: Edges, frame: str) -> dict[str, Array]:
+    """T_ancestor_frame of the frame itself and of all above it, from the nearest on."""
+    found, T = {frame: np.eye(4)}, None
+    at = frame
+    while at in edges:
+        at, edge = edges[at]
+        if at in found:
+            raise DataError(
+                f"fixed transforms: found a circle of frames, {' > '.join([*found, at])}; expected a tree; give the"
+                " poses (T_imu_lidar, T_camera_lidar) in rig.yaml"
+            )
+        T = edge if T is None else edge @ T  # no product with the identity: the edge to the bit
+        found[at] = T
+    return found
 
 
 def read_static_transforms(bag: Bag) -> StaticTransforms:
     """The fixed transforms of a bag; none where it has none. Raises DataError for a static one that is no pose."""
-    edges: Edges = {}
+    static, more = Edges(), Edges()
     for name, kinds, read in (
         ("tf", TRANSFORMS, _that_stay),
         (URDF, (STRING,), _of_robots),
@@ -90,13 +96,13 @@ def read_static_transforms(bag: Bag) -> StaticTransforms:
             for parent, child, numbers in read([decode(bag, messages, k) for k in some]):
                 T = _pose(numbers)
                 if T is not None:
-                    edges[child] = (parent, T)
+                    (static if name == STATIC else more)[child] = (parent, T)
                 elif name == STATIC:  # others may have frames that nobody needs
                     raise DataError(
                         f"{topic}: {parent} to {child}: found {list(numbers)}, expected metres x y z and a unit"
                         " quaternion x y z w"
                     )
-    return StaticTransforms(edges)
+    return StaticTransforms(static, more)
 
 
 def _transforms(messages: Iterable[Any]) -> Iterator[Told]:

@@ -339,6 +339,18 @@ def test_static_transforms_count_where_a_robot_says_otherwise(tmp_path: Path, pl
     same_poses(opened(tmp_path, rig), plain)
 
 
+def test_a_robot_with_another_tree_than_the_static_transforms_does_no_harm(
+    tmp_path: Path, plain: SensorLog
+) -> None:
+    """Its parents are the children of the others: together they are a circle."""
+    rig = ros.drive()
+    describe(rig, urdf(joint("lidar", "base", (9.0, 9.0, 9.0)), joint("base", "wheel", (0.0, 1.0, 0.0))))
+    bag = written(tmp_path, rig)
+    same_poses(open_drive(bag), plain)
+    with pytest.raises(DataError, match=r"a circle of frames, .*; give the poses"):
+        read_static_transforms(Bag(bag)).between("wheel", "imu")
+
+
 def test_inspect_lists_all_of_them(tmp_path: Path) -> None:
     rig = without("/fix")
     sentences(rig)

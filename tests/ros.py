@@ -236,6 +236,31 @@ def _write(writer: Any, store: Any, messages: Iterable[Message], is_ros1: bool) 
         writer.write(connections[topic], ns, data)
 
 
+def write_mcap(path: Path, rig: Rig, profile: str, is_listed: bool = True, **options: Any) -> Path:
+    """An MCAP file of the format's own writer, without the metadata of a bag; as `ros2 bag` or Foxglove write them.
+
+    ROS 1 messages have schemas named package/Type. `is_listed`: whether channels name their encoding.
+    """
+    from mcap.writer import Writer
+
+    store = typestore(rig.is_ros1)
+    encoding, schema_encoding = ("ros1", "ros1msg") if rig.is_ros1 else ("cdr", "ros2msg")
+    with path.open("wb") as file:
+        writer, channels = Writer(file, **options), dict[str, int]()
+        writer.start(profile)
+        for topic, ns, message in sorted(rig.messages, key=lambda one: one[1]):
+            kind = message.__msgtype__
+            if topic not in channels:
+                name = kind.replace("/msg/", "/") if rig.is_ros1 else kind
+                text, _ = store.generate_msgdef(kind, ros_version=1 if rig.is_ros1 else 2)
+                schema = writer.register_schema(name, schema_encoding, text.encode())
+                channels[topic] = writer.register_channel(topic, encoding if is_listed else "", schema)
+            data = store.serialize_ros1(message, kind) if rig.is_ros1 else store.serialize_cdr(message, kind)
+            writer.add_message(channels[topic], ns, bytes(data), ns)
+        writer.finish()
+    return path
+
+
 def rig_yaml(bag: Path, **about: object) -> None:
     """Write a rig.yaml for a bag."""
     (bag / "rig.yaml" if bag.is_dir() else bag.parent / "rig.yaml").write_text(json.dumps(about))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.kitti_calibration import quaternion_of
 from gnss_sem_map.datasets.ros.decoding import typestore
-from gnss_sem_map.datasets.ros.static_tf import TOPIC as TF_STATIC
+from gnss_sem_map.datasets.ros.static_tf import STATIC
 from gnss_sem_map.errors import DataError, how_to_install
 from gnss_sem_map.sensor_log.cameras import Distortion
 
@@ -65,7 +65,7 @@ class BagWriter:
                     header=self._header(ns, parent), child_frame_id=child, transform=transform,
                 )
             )  # fmt: skip
-        self._write(TF_STATIC, self._make("tf2_msgs/msg/TFMessage", transforms=transforms), ns)
+        self._write(f"/{STATIC}", self._make("tf2_msgs/msg/TFMessage", transforms=transforms), ns)
 
     def write_imu(self, ns: int, force: Array, rate: Array, quaternion_xyzw: Array | None) -> None:
         """Specific force (3,), angular rate (3,), and the attitude, where it is known."""

@@ -62,6 +62,43 @@ def table(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     return Reader(drive / name, _whole_drive(drive), mutate)
 
 
+def bag(is_ros1: bool, folder: Path) -> Reader:
+    """An MCAP file with messages of all kinds: what is in it, the log, and its first scans and images."""
+    import ros
+    import ros_drivers
+    from mcap.writer import CompressionType
+
+    from gnss_sem_map.datasets.ros.bag import Bag
+    from gnss_sem_map.datasets.ros.contents import contents_of, suggested_rig
+
+    folder.mkdir(parents=True)
+    file = ros.write_mcap(
+        folder / "drive.mcap", ros_drivers.small(is_ros1), "", compression=CompressionType.NONE
+    )
+
+    def read() -> object:
+        opened = Bag(file)
+        log = open_drive(file)
+        seen = [item.read() for item in (*log.scans[:2], *log.images[:2])]
+        return suggested_rig(opened, contents_of(opened)), seen
+
+    return Reader(file, read, mutations.binary)
+
+
+def robot(folder: Path) -> Reader:
+    """A URDF, which is a message of a bag."""
+    import ros_drivers
+
+    from gnss_sem_map.datasets.ros.static_tf import fixed_joints
+
+    folder.mkdir(parents=True)
+    file = folder / "robot.urdf"
+    file.write_text(ros_drivers.urdf(*(ros_drivers.joint(*edge) for edge in ros_drivers.EDGES)))
+    return Reader(
+        file, lambda: list(fixed_joints(file.read_bytes().decode("utf-8", "replace"))), mutations.text
+    )
+
+
 def scan(folder: Path) -> Reader:
     """A scan with point times, and the map's idea of where its points are."""
     from factor_graphs.errors import MeasurementError
@@ -349,6 +386,9 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "gnss.csv": functools.partial(table, "gnss.csv", mutations.text),
     "log.yaml": functools.partial(table, "log.yaml", mutations.text),
     "stamps.csv": functools.partial(table, "lidar/stamps.csv", mutations.text),
+    "MCAP of ROS 1": functools.partial(bag, True),
+    "MCAP of ROS 2": functools.partial(bag, False),
+    "URDF": robot,
     "scan of four columns": functools.partial(kitti, "velodyne_points/data/0000000000.bin", mutations.floats),
     "scan of five columns": scan,
     "PNG": functools.partial(picture, ".png", mutations.png),

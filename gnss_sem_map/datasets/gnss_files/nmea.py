@@ -38,8 +38,13 @@ AT_REST_MPS = 0.1
 """Slower than this, receivers leave the course out."""
 
 
-def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool) -> Positions:
-    """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none."""
+def read(
+    path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bool, lines: list[str] | None = None
+) -> Positions:
+    """The positions of a file; what is no fix is skipped and counted. Raises DataError where there is none.
+
+    `lines`: its sentences, where they are not in a file.
+    """
     del accuracy, has_stddevs
     if find_spec("pynmeagps") is None:
         raise DataError(f"{shown(path)}: NMEA needs pynmeagps; {how_to_install('ros')}")
@@ -50,7 +55,7 @@ def read(path: Path, near_ns: int | None, accuracy: Path | None, has_stddevs: bo
     clock: int | None = None  # of the last sentence with a time
     fixes: list[tuple[int, bool, list[float]]] = []
     lost: dict[str, int] = {}
-    for sentence in _sentences(path):
+    for sentence in _sentences(read_lines(path) if lines is None else lines):
         if isinstance(sentence, str):
             lost[sentence] = lost.get(sentence, 0) + 1
             continue
@@ -169,12 +174,12 @@ def _heading(sentence: Any) -> float | None:
     return float(said) if isinstance(said, float | int) else None
 
 
-def _sentences(path: Path) -> Iterator[Any]:
+def _sentences(lines: list[str]) -> Iterator[Any]:
     """The sentences that are used, and for what looks like one why it is not.
 
     Bytes of other messages may stand before and behind them. Where no sentence of a file has a checksum, none needs it.
     """
-    found = [one for line in read_lines(path) for one in SENTENCE.findall(line)]
+    found = [one for line in lines for one in SENTENCE.findall(line)]
     are_checked = any(checksum for _, checksum in found)
     for body, checksum in found:
         if checksum or not are_checked:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +23,8 @@ BagFile = McapFile | Ros1File | SqliteFile
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
+ENCODINGS = ("ros1", "cdr")
+"""Of messages of ROS 1 and ROS 2; an MCAP file may have others."""
 WHOLE_FILE = ".zstd"
 """Ending of the files of a bag that was compressed file by file."""
 NOT_CLOSED = ".active"
@@ -37,6 +38,8 @@ class Messages:
     topic: str
     kind: str
     """Type of the messages, as ROS 2 writes it: sensor_msgs/msg/Imu."""
+    is_ros1: bool
+    """Whether they are encoded as ROS 1 does it."""
     received_ns: Ints
     """(n,) Unix time of arrival."""
     places: NDArray[np.int64]
@@ -44,6 +47,10 @@ class Messages:
 
     def __len__(self) -> int:
         return len(self.received_ns)
+
+    def some(self, count: int) -> list[int]:
+        """Positions of so many messages over all the time, of all where there are fewer."""
+        return np.unique(np.linspace(0, len(self) - 1, count).astype(int)).tolist() if len(self) else []
 
 
 class Bag:
@@ -63,15 +70,15 @@ class Bag:
             raise DataError(
                 f"{shown(path)}: found files of {' and '.join(suffixes)} in one folder, expected the parts of one bag"
             )
-        if find_spec("rosbags") is None:
-            raise DataError(f"{shown(path)}: ROS bags need rosbags; {how_to_install('ros')}")
-        self.is_ros1 = suffixes == [".bag"]
-        about = {} if self.is_ros1 else _metadata(path)
+        if find_spec("rosbags") is None or find_spec("mcap") is None:
+            raise DataError(f"{shown(path)}: ROS bags need rosbags and mcap; {how_to_install('ros')}")
+        about = {} if suffixes == [".bag"] else _metadata(path)
         codec = _message_codec(about)
         self.lost = _lost(about, names)
         """Names of the files that the bag's metadata list, and that are not there."""
         self._files: list[BagFile] = [_opened(name, codec) for name in names]
-        self.kinds = self._kinds()
+        self._ros1, self.kinds = set[str](), dict[str, str]()
+        self._read_kinds()
 
     def messages(self, topic: str) -> Messages:
         """The messages of a topic in the order of their arrival; raises DataError when there is no such topic."""
@@ -86,7 +93,9 @@ class Bag:
             places.append(np.column_stack([np.full(len(where), number, np.int64), where]))
         joined = np.concatenate(times)
         order = np.argsort(joined, kind="stable")
-        return Messages(topic, self.kinds[topic], joined[order], np.concatenate(places)[order])
+        return Messages(
+            topic, self.kinds[topic], topic in self._ros1, joined[order], np.concatenate(places)[order]
+        )
 
     def read(self, messages: Messages, k: int, most: int | None = None) -> bytes:
         """A message of a topic, by its position in time, or its first `most` bytes; raises DataError."""
@@ -94,23 +103,29 @@ class Bag:
         one: BagFile = self._files[file]
         return one.read((place[0], place[1]), most)
 
-    def each(self, messages: Messages) -> Iterator[bytes]:
-        """All messages of a topic, one after the other."""
-        return (self.read(messages, k) for k in range(len(messages)))
-
     def file_of(self, messages: Messages, k: int) -> Path:
         """The file that holds a message."""
         return self._files[int(messages.places[k, 0])].path
 
-    def _kinds(self) -> dict[str, str]:
-        kinds: dict[str, str] = {}
+    def _read_kinds(self) -> None:
+        others = set[str]()
         for file in self._files:
-            for topic, kind in file.topics.items():
-                if kinds.setdefault(topic, kind) != kind:
+            for topic, (name, encoding) in file.topics.items():
+                kind = name if encoding in ENCODINGS else f"{name or 'messages'} ({encoding})"
+                if encoding == "ros1":
+                    self._ros1.add(topic)
+                elif encoding not in ENCODINGS:
+                    others.add(kind)
+                if self.kinds.setdefault(topic, kind) != kind:
                     raise DataError(
-                        f"{shown(file.path)}: {topic} is of {kind}, in another part of the bag of {kinds[topic]}"
+                        f"{shown(file.path)}: {topic} is of {kind}, in another part of the bag of {self.kinds[topic]}"
                     )
-        return kinds
+        if others and others == set(self.kinds.values()):
+            raise DataError(
+                f"{shown(self.path)}: found no messages of ROS but {', '.join(sorted(others))[:300]}; expected the"
+                " encodings ros1 or cdr; record or convert it with messages of ROS, or write a CSV log"
+                " (docs/your_own_log.md)"
+            )
 
 
 def bag_files(path: Path) -> list[Path]:

@@ -81,7 +81,7 @@ def _found(bag: Bag, transforms: StaticTransforms, target: str, source: str, nam
     if T is None:
         frames = ", ".join(transforms.frames)[:300] or "none"
         raise DataError(
-            f"{shown(bag.path)}: no static transform leads from {source!r} to {target!r} (frames in /tf_static:"
+            f"{shown(bag.path)}: no fixed transform leads from {source!r} to {target!r} (frames of fixed transforms:"
             f" {frames}); set {name} in rig.yaml, or `frame:` where a frame has another name"
         )
     return T
@@ -109,8 +109,9 @@ def _intrinsics(
         return np.array(camera.K, np.float64), camera.image_size, None, camera.distortion
     info = _info(bag, camera)
     K, P, D = (np.asarray(_any(info, name), np.float64) for name in ("k", "p", "d"))
-    K, P = K.reshape(3, 3), P.reshape(3, 4)
-    size = camera.image_size or (int(info.width), int(info.height))
+    to_image, found = _to_image(info)
+    K, P = to_image @ K.reshape(3, 3), to_image @ P.reshape(3, 4)
+    size = camera.image_size or found
     if not K.any() and not P.any():
         raise DataError(
             f"{camera.info}: its CameraInfo is all zero: the camera was not calibrated; set K and image_size of the"
@@ -131,9 +132,21 @@ def _intrinsics(
     return P[:, :3].copy(), size, shift, None
 
 
-MODELS = {
-    "plumb_bob": "brown", "rational_polynomial": "brown", "equidistant": "fisheye", "fisheye": "fisheye",
-}  # fmt: skip
+def _to_image(info: Any) -> tuple[Array, tuple[int, int]]:
+    """What takes pixels of the whole sensor to those of the images (3, 3), and the images' width and height.
+
+    A CameraInfo is of the whole sensor; a region of it is read, and its pixels are binned (ROS, `image_geometry`).
+    """
+    x, y = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    width, height = int(info.roi.width) or int(info.width), int(info.roi.height) or int(info.height)
+    shift = np.array(
+        [[1.0, 0.0, -int(info.roi.x_offset)], [0.0, 1.0, -int(info.roi.y_offset)], [0.0, 0.0, 1.0]]
+    )
+    return np.diag([1.0 / x, 1.0 / y, 1.0]) @ shift, (width // x, height // y)
+
+
+MODELS = dict.fromkeys(("plumb_bob", "rational_polynomial", "thin_prism", "radtan", "brown_conrady"), "brown")
+MODELS |= dict.fromkeys(("equidistant", "fisheye", "kannala_brandt4", "kannala_brandt", "equi"), "fisheye")
 """Our names of the models of CameraInfo."""
 
 

@@ -1,4 +1,4 @@
-"""PointCloud2 messages as sweeps, with the time of every point as the drivers of LiDARs write it.
+"""PointCloud2 and Livox's CustomMsg as sweeps, with the time of every point as the drivers of LiDARs write it.
 
 | field | drivers | meaning |
 |---|---|---|
@@ -6,15 +6,20 @@
 | `t`, uint32 | Ouster | ns after the stamp |
 | `offset_time`, uint32 | Livox | ns after the stamp |
 | `timestamp`, float64 | Hesai, RoboSense: s; Livox: ns | Unix time |
+| `time_stamp`, `time_offset`, `time_offset_ns`, uint32 | Nebula, Aeva | ns after the stamp |
 
-Other fields may be named in rig.yaml. Relative and absolute times, and their unit, are told apart by the type of the
-field and by the size of the numbers; a cloud without any such field is refused, unless rig.yaml says that its points
-are compensated already.
+Other fields, and their unit, may be named in rig.yaml. Else the size of the numbers tells Unix times and their unit,
+and the time from one sweep to the next the unit of others; where neither does, whole numbers are ns, others s. A cloud
+without any such field is refused, unless rig.yaml says that its points are compensated already.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,26 +28,44 @@ from gnss_sem_map.datasets.frames import MOST_POINTS, refuse_other_bytes, scale_
 from gnss_sem_map.datasets.point_times import are_returns, leave_out_of_sweep
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.kinds import LIVOX
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Points
 
 Array = NDArray[np.float64]
 
-KIND = "sensor_msgs/msg/PointCloud2"
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """numpy's names of PointField's datatypes."""
-TIME_FIELDS = ("time", "t", "offset_time", "timestamp")
+TIME_FIELDS = ("time", "t", "offset_time", "timestamp", "time_stamp", "time_offset", "time_offset_ns")
 """Those that are known, in this order."""
 INTENSITY_FIELDS = ("intensity", "reflectivity")
 COMPENSATED = "compensated"
-ABSOLUTE_S, ABSOLUTE_NS = 1e8, 1e17
-"""Larger times are Unix times, in s and in ns: sweeps take at most 1e9 ns, and 1973 is not in any bag."""
-EVERY = 64
-"""Points between those whose times tell the kind of all."""
+Unit = Literal["s", "ms", "us", "ns"]
+UNITS: dict[Unit, int] = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
+"""Units of times, ns."""
+UNIX_S = (1e9, 1e10)
+"""Unix times of 2001 to 2286, which times after a stamp are not in any unit: sweeps take less than 1e9 ns."""
+SWEEP = (0.1, 2.0)
+"""A sweep takes so much of the time to the next one: whole circles, or a part of them, or two returns."""
+USUAL_SWEEP_S = 0.1
+LOOKED_AT = 5
+"""Clouds of a topic that tell the unit of all."""
+
+
+@dataclass(frozen=True)
+class PointTimes:
+    """Where a cloud tells the times of its points, and how."""
+
+    field: str | None
+    """None: none of them; the points are compensated."""
+    unit: Unit = "s"
+    is_unix: bool = False
 
 
 def fields_of(cloud: Any) -> list[str]:
     """Names of the fields of a cloud."""
+    if hasattr(cloud, "points"):
+        return list(LIVOX_POINT)
     return [str(field.name) for field in cloud.fields]
 
 
@@ -62,65 +85,130 @@ def no_times(where: str, names: list[str]) -> DataError:
     )
 
 
+def times_of(
+    bag: Bag, messages: Messages, said: str | None, unit: Unit | None, interval_s: float | None
+) -> tuple[PointTimes, bool]:
+    """How the clouds of a topic tell the times of their points, and whether a unit that is not usual was found.
+
+    `said` is the name of the field or COMPENSATED, `unit` its unit, by rig.yaml; `interval_s` between two clouds. The
+    first clouds tell what these do not. Raises DataError where there is no such field.
+    """
+    if said == COMPENSATED or len(messages) == 0:
+        return PointTimes(None), False
+    names = fields_of(decode(bag, messages, 0))
+    field = time_field(names, said)
+    if field is None:
+        raise no_times(messages.topic, names)
+    told = np.array(list(_middles_and_spans(bag, messages, field))).reshape(-1, 3)
+    middle, span, is_whole = np.median(told, axis=0) if len(told) else (0.0, 0.0, 0.0)
+    for one in UNITS if unit is None else (unit,):
+        if UNIX_S[0] < middle * UNITS[one] * 1e-9 < UNIX_S[1]:
+            return PointTimes(field, one, True), False
+    if unit is not None:
+        return PointTimes(field, unit), False
+    usual: Unit = "ns" if is_whole else "s"
+    sweep_s = interval_s or USUAL_SWEEP_S
+    fits = [one for one in UNITS if SWEEP[0] <= span * UNITS[one] * 1e-9 / sweep_s <= SWEEP[1]]
+    found = fits[0] if fits else usual  # one at most: units differ more than what a sweep may take
+    return PointTimes(field, found), found != usual
+
+
+def _middles_and_spans(bag: Bag, messages: Messages, field: str) -> Iterator[tuple[float, float, bool]]:
+    """Of the times of the returns of some clouds, and whether they are whole numbers; nothing of those without any."""
+    for k in messages.some(LOOKED_AT):
+        try:
+            table = _table(bag, messages, k, (field,))
+        except DataError:  # told where the cloud is read
+            continue
+        times = table[field][are_returns(_rows(table))].astype(np.float64)
+        times = times[np.isfinite(times)]
+        if len(times):
+            yield float(np.median(times)), float(np.ptp(times)), table.dtype[field].kind in "iu"
+
+
 def read_cloud(
     bag: Bag,
     messages: Messages,
     k: int,
     stamp: float,
     stamp_ns: int,
-    times: str | None,
+    times: PointTimes,
     intensity_max: float | None = None,
 ) -> Points:
-    """A sweep; `times` is the field of the points' times, COMPENSATED, or None for a known field.
+    """A sweep.
 
     `intensity_max` is the number for an intensity of 1; None: 1, and of an unsigned field its largest number.
     `stamp` s of the log, `stamp_ns` the same as Unix ns. Raises DataError for a damaged cloud, and PointTimesError for
     times that are not of one sweep.
     """
-    cloud, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
-    table = _table(cloud, where)
+    where = f"{messages.topic}: message {k}"
+    table = _table(bag, messages, k, () if times.field is None else (times.field,))
     rows = _rows(table)
     scale_intensity(rows, intensity_max or _largest_intensity(table))
     refuse_other_bytes(rows, where)
-    if times == COMPENSATED:
+    if times.field is None:
         return Points(rows[:, :3], rows[:, 3], None)
-    field = time_field(list(table.dtype.names or ()), times)
-    if field is None:
-        raise no_times(where, list(table.dtype.names or ()))
-    of_points = np.asarray(table[field])
-    after = _after(of_points, of_points[are_returns(rows)], stamp_ns)
+    after = _after(np.asarray(table[times.field]), times, stamp_ns)
     leave_out_of_sweep(rows, after, where)
     after += stamp
     return Points(rows[:, :3], rows[:, 3], after)
 
 
-def _table(cloud: Any, where: str) -> NDArray[Any]:
-    """The points (n,) as records of the cloud's fields, in the memory of the message."""
+def _table(bag: Bag, messages: Messages, k: int, more: tuple[str, ...]) -> NDArray[Any]:
+    """The points (n,) as records of the fields that are used, and of `more`, in the memory of the message."""
+    where = f"{messages.topic}: message {k}"
+    if messages.kind in LIVOX:
+        return _livox_table(bag.read(messages, k), messages.is_ros1, where)
+    cloud = decode(bag, messages, k)
     n, step = int(cloud.width) * int(cloud.height), int(cloud.point_step)
-    names = fields_of(cloud)
-    formats = [TYPES.get(int(field.datatype)) for field in cloud.fields]
-    offsets = [int(field.offset) for field in cloud.fields]
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names) or None in formats:
+    wanted = {"x", "y", "z", *INTENSITY_FIELDS, *more}
+    fields = [field for field in cloud.fields if field.name in wanted]
+    names, offsets = [str(field.name) for field in fields], [int(field.offset) for field in fields]
+    formats = [TYPES.get(int(field.datatype)) for field in fields]
+    if not {"x", "y", "z", *more} <= set(names) or len(set(names)) < len(names) or None in formats:
         raise DataError(
-            f"{where}: found fields {', '.join(names)[:200]}, expected x, y, z and others, each once"
+            f"{where}: found fields {', '.join(fields_of(cloud))[:200]}, expected {', '.join(('x', 'y', 'z', *more))},"
+            " each once and of a known type"
         )
     order = ">" if cloud.is_bigendian else "<"
     kinds = [np.dtype(f"{order}{kind}") for kind in formats]
     if any(offset + kind.itemsize > step for offset, kind in zip(offsets, kinds, strict=True)):
         raise DataError(f"{where}: a field lies outside of the {step} bytes of a point")
+    height, row, row_step = int(cloud.height), int(cloud.width) * step, int(cloud.row_step)
     data = np.asarray(cloud.data, np.uint8)
-    if (
-        n == 0
-        or n > MOST_POINTS
-        or data.size < n * step
-        or int(cloud.row_step) not in (0, int(cloud.width) * step)
-    ):
+    # of one row, and of rows without gaps, some drivers write any row_step
+    has_gaps = height > 1 and row_step > row and data.size != n * step
+    if not 0 < n <= MOST_POINTS or data.size < (row_step * (height - 1) + row if has_gaps else n * step):
         raise DataError(
-            f"{where}: found {n} points of {step} bytes in {data.size} bytes (row_step {cloud.row_step}), expected 1 to"
-            f" {MOST_POINTS} points without gaps between rows"
+            f"{where}: found {n} points of {step} bytes in {data.size} bytes (row_step {row_step}), expected 1 to"
+            f" {MOST_POINTS} points"
         )
+    if has_gaps:
+        data = np.ndarray((height, row), np.uint8, np.ascontiguousarray(data), 0, (row_step, 1)).ravel()
     dtype = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
     return np.frombuffer(data, dtype, n)
+
+
+LIVOX_POINT = {
+    "offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1",
+}  # fmt: skip
+LIVOX_HEAD = "QIB3xI"
+"""Time of the first point, number of points, LiDAR, reserved bytes, and the number of points again."""
+
+
+def _livox_table(data: bytes, is_ros1: bool, where: str) -> NDArray[Any]:
+    """The points (n,) of a CustomMsg: ROS 1 packs them, in CDR each begins at a multiple of four bytes."""
+    order, n, start = "<" if is_ros1 or data[1:2] == b"\1" else ">", 0, 16
+    dtype = np.dtype([(name, order + kind) for name, kind in LIVOX_POINT.items()])
+    step = dtype.itemsize if is_ros1 else dtype.itemsize + 1
+    with suppress(struct.error):
+        start += struct.unpack_from(f"{order}I", data, start - 4)[0]  # behind the name of the frame
+        start = start if is_ros1 else 4 + (start - 4 + 7) // 8 * 8
+        *_, n = struct.unpack_from(order + LIVOX_HEAD, data, start)
+        start += struct.calcsize(order + LIVOX_HEAD)
+    if not 0 < n <= MOST_POINTS or len(data) < start + (n - 1) * step + dtype.itemsize:
+        raise DataError(f"{where}: found {n} points in {len(data)} bytes, expected 1 to {MOST_POINTS} points")
+    return np.ndarray(n, dtype, data, start, step)
 
 
 def _rows(table: NDArray[Any]) -> NDArray[np.float32]:
@@ -153,18 +241,12 @@ def _largest_intensity(table: NDArray[Any]) -> float:
     return float(np.iinfo(kind).max) if kind is not None and kind.kind == "u" else 1.0
 
 
-def _after(times: NDArray[Any], of_returns: NDArray[Any], stamp: int) -> Array:
-    """The times of the points, s after the stamp, Unix ns, of their message; those of its returns tell their kind."""
-    told = of_returns[::EVERY].astype(np.float64)
-    told = told[np.isfinite(told)]
-    middle = float(np.median(told)) if len(told) else 0.0
-    if times.dtype.kind in "iu":  # ns, and where 64 bits hold them perhaps of Unix time
-        if times.dtype.itemsize == 8 and middle > ABSOLUTE_NS:
-            times = times.astype(np.int64) - stamp
-        return np.asarray(times * 1e-9, np.float64)
+def _after(times: NDArray[Any], how: PointTimes, stamp: int) -> Array:
+    """The times of the points, s after the stamp, Unix ns, of their message."""
+    unit = UNITS[how.unit]
+    if how.is_unix and times.dtype.kind in "iu":  # the difference of floats would be coarse
+        return np.asarray((times.astype(np.int64) - stamp // unit) * (unit * 1e-9), np.float64)
     after = times.astype(np.float64)
-    if middle > ABSOLUTE_NS:
-        return (after - float(stamp)) * 1e-9
-    if middle > ABSOLUTE_S:
-        return after - stamp * 1e-9
-    return after
+    if how.is_unix:
+        after -= stamp / unit
+    return np.asarray(after * (unit * 1e-9), np.float64)

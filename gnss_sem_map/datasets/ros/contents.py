@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,8 +12,10 @@ import yaml
 from gnss_sem_map.datasets.ros import clouds, pictures, roles
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode, header_ns
-from gnss_sem_map.datasets.ros.static_tf import TOPIC as TF_STATIC
-from gnss_sem_map.datasets.ros.static_tf import StaticTransforms, read_static_transforms
+from gnss_sem_map.datasets.ros.fix_topics import covariance_of
+from gnss_sem_map.datasets.ros.imu_topics import part_of
+from gnss_sem_map.datasets.ros.kinds import HEADLESS, KINDS, STRING, TAKEN_FOR, unread
+from gnss_sem_map.datasets.ros.static_tf import URDF, StaticTransforms, read_static_transforms
 from gnss_sem_map.errors import DataError
 
 GAP_STEPS = 3.0
@@ -20,8 +23,8 @@ GAP_STEPS = 3.0
 LOOKED_AT = 50
 """Messages of a topic whose headers are compared with their arrival."""
 LATE_S = 1.0
-TAKEN_FOR = {kind: sensor for sensor, kinds in roles.KINDS.items() for kind in kinds}
-TAKEN_FOR |= {roles.INFO: "calibration", "tf2_msgs/msg/TFMessage": "transforms"}
+USUAL_WORDS = re.compile("points|image(_raw|_rect|_rect_color)?|raw|rect|color|compressed")
+NOT_READ = "not read: its images have the encoding"
 
 
 @dataclass(frozen=True)
@@ -56,31 +59,42 @@ def contents_of(bag: Bag) -> tuple[Topic, ...]:
         later = steps[steps > 0]  # of messages that are there twice, one has no step
         usual = float(np.median(later)) if len(later) else 0.0
         gaps = steps[steps > GAP_STEPS * usual] if len(steps) > 2 else steps[:0]
-        if taken == "IMU" and len(messages) and _tells_orientation_alone(bag, messages):
-            taken = "heading"
-        is_sensor = taken in roles.KINDS and len(messages) > 0
+        if taken == "IMU":
+            taken = part_of(bag, name)
+        is_sensor = taken in KINDS and len(messages) > 0
         frame, notes = _looked_into(bag, messages, taken, transforms) if is_sensor else ("", [])
+        if notes and notes[0].startswith(NOT_READ):
+            taken, notes = "", notes[:1]
+        if kind == STRING and name.endswith(URDF):
+            taken = "transforms"
+        elif not taken and (note := unread(kind)):
+            notes = [note]
         found.append(
             Topic(
                 name, kind, len(messages), 1.0 / usual if usual > 0 else None,
                 len(gaps), float(gaps.max(initial=0.0)), taken, frame, tuple(notes),
             )
         )  # fmt: skip
-    order = [*roles.KINDS, "calibration", "transforms", ""]
+    order = [*KINDS, "calibration", "transforms", ""]
     return tuple(sorted(found, key=lambda topic: (order.index(topic.taken_for), topic.name)))
 
 
 def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
     """A rig.yaml with every topic that may be a sensor; of several IMUs or receivers, all but the first as comments."""
     transforms = read_static_transforms(bag)
-    of = {sensor: _sensors(topics, sensor) for sensor in roles.KINDS}
+    of = {sensor: _sensors(topics, sensor) for sensor in KINDS}
+    of["receiver"].sort(key=lambda topic: KINDS["receiver"].index(topic.kind))
+    of["IMU"] += of["gyroscope"]
+    force = {"force_topic": of["accelerometer"][0].name} if of["accelerometer"] else {}
+    about: dict[str, Any]
     parts = [
         "# Which topic of the bag is which sensor. All LiDARs and cameras here are used: remove those you do not want.",
-        "# Frames are those of /tf_static; what is not here is as its default: see docs/your_own_log.md.",
+        "# Frames are those of the transforms; what is not here is as its default: see docs/your_own_log.md.",
     ]
     for key, sensor in (("imu", "IMU"), ("gnss", "receiver")):
         for k, topic in enumerate(of[sensor]):
-            lines = _yaml({key: {"topic": topic.name} | _stamps(topic)})
+            about = {"topic": topic.name} | (force if topic.taken_for == "gyroscope" else {}) | _stamps(topic)
+            lines = _yaml({key: about})
             if sensor == "receiver" and not _has_lever_arm(topic, of["IMU"], transforms):
                 lines += "  p_imu_antenna: [0.0, 0.0, 0.0]  # antenna ahead, left, above of the IMU, m: measure it\n"
             parts += _noted(topic, lines if k == 0 else _commented(lines))
@@ -94,10 +108,14 @@ def suggested_rig(bag: Bag, topics: tuple[Topic, ...]) -> str:
         for what in ("velocity", "heading")
         for topic in of[what]
     ]
+    parts += [
+        f"# wheels: {{topic: {topic.name}}}  # if it is the speed of the vehicle along its x axis"
+        for topic in (*of["wheels"], *of["velocity"])
+    ]
     for key, sensor in (("lidars", "LiDAR"), ("cameras", "camera")):
         parts.append(f"{key}:" if of[sensor] else f"{key}: {{}}")
         for name, topic in _named(of[sensor]).items():
-            about: dict[str, Any] = {"topic": topic.name} | _stamps(topic)
+            about = {"topic": topic.name} | _stamps(topic)
             info = roles.info_beside(bag, topic.name) if sensor == "camera" else None
             if info is not None:
                 about["info"] = info
@@ -111,35 +129,26 @@ def _looked_into(
     """Frame of a topic's first message, and what is odd about the topic."""
     try:
         first = decode(bag, messages, 0)
-        if not hasattr(first, "header"):
+        if messages.kind in HEADLESS:
             return "", []
         frame, notes = str(first.header.frame_id).strip("/"), _stamp_notes(bag, messages)
     except DataError as error:
         return "", [str(error)]
     if taken == "LiDAR" and clouds.time_field(clouds.fields_of(first), None) is None:
         notes.append(f"no time per point among {', '.join(clouds.fields_of(first))}: set point_times")
-    if taken == "receiver" and first.position_covariance_type == roles.UNKNOWN_COVARIANCE:
-        notes.append("its covariance is unknown: set stddevs_m")
-    if taken == "camera" and messages.kind == pictures.RAW and first.encoding not in pictures.CHANNELS:
-        notes.append(f"encoding {first.encoding} is not read: rgb8, bgr8 or mono8")
+    if taken == "receiver" and hasattr(first, "position_covariance") and (why := covariance_of(first)[0]):
+        notes.append(f"{why}: set stddevs_m")
+    if taken == "camera" and (encoding := pictures.unread_encoding(first)):
+        notes.insert(0, f"{NOT_READ} {encoding}: depth, a video, or an unknown one")
     if taken == "camera" and roles.info_beside(bag, messages.topic) is None:
         notes.append("no CameraInfo topic beside it: set info, or K and image_size")
     if taken in ("LiDAR", "camera") and frame not in transforms.frames:
-        notes.append(f"its frame {frame!r} is not in {TF_STATIC}: set frame or the pose")
+        notes.append(f"its frame {frame!r} is in no fixed transform: set frame or the pose")
     return frame, notes
 
 
-def _tells_orientation_alone(bag: Bag, messages: Messages) -> bool:
-    """Whether the first message of an Imu topic says that it has neither rate nor force."""
-    try:
-        first = decode(bag, messages, 0)
-    except DataError:
-        return False
-    return bool(first.angular_velocity_covariance[0] == first.linear_acceleration_covariance[0] == -1)
-
-
 def _stamp_notes(bag: Bag, messages: Messages) -> list[str]:
-    some = np.unique(np.linspace(0, len(messages) - 1, LOOKED_AT).astype(int)).tolist()
+    some = messages.some(LOOKED_AT)
     late = np.array([messages.received_ns[k] - header_ns(bag, messages, k) for k in some]) * 1e-9
     zero = sum(header_ns(bag, messages, k) == 0 for k in some)
     if zero:
@@ -190,18 +199,7 @@ def _named(topics: list[Topic]) -> dict[str, Topic]:
 
 def _name(topic: Topic) -> str:
     """A name for a sensor: the words of its topic but for those that all have."""
-    usual = (
-        "points",
-        "image",
-        "raw",
-        "rect",
-        "color",
-        "compressed",
-        "image_raw",
-        "image_rect",
-        "image_rect_color",
-    )
-    words = [word for word in topic.name.strip("/").split("/") if word not in usual]
+    words = [word for word in topic.name.strip("/").split("/") if not USUAL_WORDS.fullmatch(word)]
     return "_".join(words) or topic.taken_for.lower()
 
 

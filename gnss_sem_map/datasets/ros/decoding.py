@@ -1,4 +1,4 @@
-"""What the messages say: decoded by `rosbags` with the message types of ROS itself, never with those of the bag."""
+"""What the messages say: decoded by `rosbags` with the types of ROS and of `kinds`, never with those of the bag."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
+from gnss_sem_map.datasets.ros.kinds import DEFINITIONS, HEADLESS
 from gnss_sem_map.errors import DataError
 
 HEAD_BYTES = 16
@@ -19,18 +20,17 @@ def typestore(is_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-    if is_ros1:  # its store lacks tf2_msgs
-        store.register(
-            get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
-        )
+    for name, text in DEFINITIONS.items():
+        if name not in store.fielddefs:
+            store.register(get_types_from_msg(text.replace(";", "\n"), name))
     return store
 
 
 def decode(bag: Bag, messages: Messages, k: int) -> Any:
     """A message, as an object with the fields of its type; raises DataError for one that is damaged."""
-    data, store = memoryview(bag.read(messages, k)), typestore(bag.is_ros1)  # whose parts are no copies
+    data, store = memoryview(bag.read(messages, k)), typestore(messages.is_ros1)  # whose parts are no copies
     try:
-        if bag.is_ros1:
+        if messages.is_ros1:
             return store.deserialize_ros1(data, messages.kind)
         return store.deserialize_cdr(data, messages.kind)
     except Exception as error:
@@ -43,10 +43,12 @@ def decode(bag: Bag, messages: Messages, k: int) -> Any:
 
 
 def header_ns(bag: Bag, messages: Messages, k: int) -> int:
-    """The stamp in the header of a message, Unix ns; raises DataError for a message that is too short for one."""
+    """The stamp in the header of a message, Unix ns, or its arrival where the type has none; raises DataError."""
+    if messages.kind in HEADLESS:
+        return int(messages.received_ns[k])
     head = bag.read(messages, k, HEAD_BYTES)
     try:
-        if bag.is_ros1:
+        if messages.is_ros1:
             _, seconds, nanoseconds = struct.unpack_from("<III", head)
         else:
             order = "<" if head[1] & 1 else ">"
@@ -54,8 +56,3 @@ def header_ns(bag: Bag, messages: Messages, k: int) -> int:
     except (struct.error, IndexError):
         raise DataError(f"{messages.topic}: message {k} has {len(head)} bytes, no header") from None
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def stamp_ns(header: Any) -> int:
-    """The stamp of a decoded header, Unix ns."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

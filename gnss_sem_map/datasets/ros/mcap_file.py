@@ -1,14 +1,16 @@
-"""An MCAP file of ROS 2: where its messages are, by the indexes at the end of the file and of each chunk.
+"""An MCAP file: where its messages are, by the indexes at the end of the file and of each chunk.
 
-Record layouts: the MCAP specification, https://mcap.dev/spec. `rosbags` reads the summary; messages are read by
-their place, so that one of them costs the same in a file of any length.
+Record layouts: the MCAP specification, https://mcap.dev/spec. `mcap` reads the summary; messages are read by their
+place, so that one of them costs the same in a file of any length. Each channel says how its messages are encoded, by
+its schema or itself: what profile the file has is not asked.
 """
 
 from __future__ import annotations
 
 import struct
-from contextlib import closing
+from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,9 @@ from gnss_sem_map.datasets.ros.open_file import OpenFile
 from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.untrusted import shown
 
+if TYPE_CHECKING:
+    from mcap.records import Channel, McapRecord, Schema
+
 Ints = NDArray[np.int64]
 
 MESSAGE_INDEX, MESSAGE = 0x07, 0x05
@@ -28,45 +33,66 @@ MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD_BYTES = 9 + 40
 """Of a chunk record before its compression's name and its data."""
 FIRST_READ = 4096
-DAMAGED = (struct.error, TypeError, ValueError, KeyError, AssertionError, OSError, OverflowError, MemoryError)
-"""What damaged bytes raise, beside ReaderError: `rosbags` takes as much memory as a wrong length says."""
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER = struct.Struct("<BQQQI8s")
+MOST_SUMMARY_BYTES = 256 << 20
+DAMAGED = (struct.error, TypeError, ValueError, KeyError, OverflowError)
+"""What damaged bytes raise, beside McapError."""
+OF_SCHEMA = {"ros1msg": "ros1", "ros2msg": "cdr", "ros2idl": "cdr", "omgidl": "cdr"}
+"""How messages are encoded that have a schema of ROS."""
 
 
 class McapFile:
     """Messages of the topics of one file; raises DataError when its index is missing or damaged."""
 
     def __init__(self, path: Path, codec: str = "") -> None:
-        from rosbags.rosbag2 import ReaderError
-        from rosbags.rosbag2.storage_mcap import McapReader
+        from mcap import records
+        from mcap.exceptions import McapError
 
         self.path, self._codec = path, codec
         self._file = OpenFile(path)
-        summary = McapReader(path)
         try:
-            summary.open()
-            with closing(summary):  # what it has found goes then
-                chunks, connections = tuple(summary.chunks), tuple(summary.connections)
+            found = self._summary()
+            chunks = [one for one in found if isinstance(one, records.ChunkIndex)]
             sizes = [(chunk.compressed_size, chunk.uncompressed_size) for chunk in chunks]
             spans = [(one.chunk_start_offset + one.chunk_length, one.message_index_length) for one in chunks]
             self._starts = np.array([chunk.chunk_start_offset for chunk in chunks], np.int64)
             self._sizes, self._spans = (np.array(rows, np.int64).reshape(-1, 2) for rows in (sizes, spans))
-        except (ReaderError, *DAMAGED) as error:
+        except (McapError, *DAMAGED) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not closed ({one_line(error, 120)}); repair it: mcap recover"
                 f" {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             ) from None
         self._codecs = [chunk.compression for chunk in chunks]
-        self.topics = {one.topic: one.msgtype for one in connections}
-        channels = {one.id: one.topic for one in connections}
-        expected = sum(one.msgcount for one in connections)
+        schemas = {one.id: one for one in found if isinstance(one, records.Schema)}
+        channels = {one.id: one for one in found if isinstance(one, records.Channel)}
+        self.topics = {one.topic: _kind_of(one, schemas.get(one.schema_id)) for one in channels.values()}
         self._chunks = Chunks(self._expanded)
-        self._index = self._read_indexes(channels)
+        self._index = self._read_indexes({number: one.topic for number, one in channels.items()})
         indexed = sum(len(times) for times, _ in self._index.values())
+        counts = [one.message_count for one in found if isinstance(one, records.Statistics)]
+        expected = counts[0] if counts else 1
         if indexed < expected:
             raise DataError(
                 f"{shown(path)}: not indexed ({indexed} of {expected} messages have a place); write an index: mcap"
                 f" recover {shown(path.name)} -o repaired.mcap, and move {shown(path.name)} to another folder"
             )
+
+    def _summary(self) -> list[McapRecord]:
+        """The records between the data and the footer; raises McapError or one of DAMAGED for a file without."""
+        from mcap.stream_reader import StreamReader
+
+        ends = self._file.size - FOOTER.size
+        if self._file.read_up_to(0, len(MAGIC)) != MAGIC or ends < 0:
+            raise ValueError("it does not begin as an MCAP file")
+        *_, start, _, _, magic = FOOTER.unpack(self._file.read_up_to(ends, FOOTER.size))
+        if magic != MAGIC:
+            raise ValueError("it does not end as an MCAP file")
+        if start and not 0 < ends - start <= MOST_SUMMARY_BYTES:
+            raise ValueError(f"a summary from byte {start} on")
+        start = start or ends
+        content = self._file.read_up_to(start, self._file.size - start)
+        return list(StreamReader(BytesIO(content), skip_magic=True).records)
 
     def index(self, topic: str) -> tuple[Ints, Ints]:
         """Arrival (n,), ns, and place (n, 2) of the messages of a topic, in the order of the file."""
@@ -131,6 +157,16 @@ class McapFile:
         if len(content) != plain:
             raise DataError(f"{where}: damaged; found {len(content)} bytes, expected {plain}")
         return content
+
+
+def _kind_of(channel: Channel, schema: Schema | None) -> tuple[str, str]:
+    """The type of a channel's messages, as ROS 2 writes it, and their encoding."""
+    if schema is None:
+        return "", channel.message_encoding
+    name = schema.name.replace("::", "/")
+    if name.count("/") == 1:
+        name = name.replace("/", "/msg/")
+    return name, OF_SCHEMA.get(schema.encoding, channel.message_encoding)
 
 
 def _joined(parts: list[tuple[int, NDArray[np.uint64]]]) -> tuple[Ints, Ints]:

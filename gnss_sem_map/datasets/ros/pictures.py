@@ -1,4 +1,4 @@
-"""Image and CompressedImage messages as RGB pixels."""
+"""Image and CompressedImage messages as RGB pixels; OpenCV converts what is not."""
 
 from __future__ import annotations
 
@@ -9,39 +9,84 @@ from numpy.typing import NDArray
 
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
+from gnss_sem_map.datasets.ros.kinds import COMPRESSED_IMAGE
 from gnss_sem_map.errors import DataError, ImageSizeError
-from gnss_sem_map.files.pictures import MOST_PIXELS, decoded_picture
+from gnss_sem_map.files.pictures import JPEG, MOST_PIXELS, PNG, decoded_picture
 
-RAW, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CHANNELS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "mono8": (0, 0, 0), "8UC1": (0, 0, 0), "8UC3": (2, 1, 0)}
-"""Which channel is red, green, blue; 8UC3 is OpenCV's order."""
+ENCODINGS: dict[str, tuple[int, int, str]] = {
+    **{
+        f"{name}{8 * size}": (size, depth, code)
+        for size in (1, 2)
+        for name, depth, code in (
+            ("rgb", 3, ""), ("bgr", 3, "BGR2RGB"), ("rgba", 4, "RGBA2RGB"), ("bgra", 4, "BGRA2RGB"),
+            ("mono", 1, "GRAY2RGB"),
+            *((f"bayer_{pattern.lower()}", 1, f"Bayer{pattern}2RGB") for pattern in ("RGGB", "BGGR", "GBRG", "GRBG")),
+        )
+    },
+    "8UC1": (1, 1, "GRAY2RGB"), "8UC3": (1, 3, "BGR2RGB"), "8UC4": (1, 4, "BGRA2RGB"),
+    **dict.fromkeys(("yuv422", "uyvy"), (1, 2, "YUV2RGB_UYVY")),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (1, 2, "YUV2RGB_YUY2")),
+}  # fmt: skip
+"""Bytes of a number, numbers of a pixel, and OpenCV's conversion (none of RGB); of Image.encoding."""
 
 
 def read_image(bag: Bag, messages: Messages, k: int, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     """RGB pixels (h, w, 3); raises DataError for a damaged image, another encoding, or another (width, height)."""
     message, where = decode(bag, messages, k), f"{messages.topic}: message {k}"
-    if messages.kind == COMPRESSED:
-        return decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
+    if why := unread_encoding(message):
+        raise DataError(
+            f"{where}: found encoding {why!r}, expected PNG, JPEG, or one of {', '.join(ENCODINGS)}; convert the images"
+            " when they are recorded"
+        )
+    if messages.kind == COMPRESSED_IMAGE:
+        picture = decoded_picture(where, bytes(np.asarray(message.data, np.uint8)), size)
+        recorded = message.format.partition(";")[0].strip()
+        if recorded.startswith("bayer") and recorded in ENCODINGS and (picture == picture[..., :1]).all():
+            return _as_rgb(
+                np.ascontiguousarray(picture[..., :1]), ENCODINGS[recorded][2], where
+            )  # a mosaic, as it was
+        return picture
     return _raw(message, where, size)
+
+
+def unread_encoding(message: Any) -> str:
+    """The encoding of an image that is not read; empty where it is."""
+    if hasattr(message, "encoding"):
+        return "" if message.encoding in ENCODINGS else str(message.encoding)[:40]
+    said = str(message.format).lower()
+    is_said = any(name in said for name in ("png", "jpeg", "jpg")) and "compresseddepth" not in said
+    is_seen = bytes(np.asarray(message.data[: len(PNG)], np.uint8)).startswith((PNG, JPEG))
+    return "" if is_said or is_seen else str(message.format)[:40] or "none"
 
 
 def _raw(message: Any, where: str, size: tuple[int, int] | None) -> NDArray[np.uint8]:
     width, height, step = int(message.width), int(message.height), int(message.step)
-    order = CHANNELS.get(message.encoding)
-    if order is None:
-        raise DataError(
-            f"{where}: found encoding {message.encoding[:40]!r}, expected rgb8, bgr8 or mono8; debayer or convert the"
-            " images when they are recorded"
-        )
     if size is not None and (width, height) != size:
         raise ImageSizeError(
             f"{where}: found {width} x {height} pixels, expected {size[0]} x {size[1]} as in the calibration",
             (width, height),
         )
-    depth, data = max(order) + 1, np.asarray(message.data, np.uint8)
-    if not 0 < width * height <= MOST_PIXELS or step < width * depth or data.size < step * height:
+    of_number, depth, code = ENCODINGS[message.encoding]
+    row, data = width * depth * of_number, np.asarray(message.data, np.uint8)
+    if not 0 < width * height <= MOST_PIXELS or step < row or data.size < step * height:
         raise DataError(
             f"{where}: damaged image; found {data.size} bytes for {width} x {height} pixels in rows of {step} bytes"
         )
-    rows = data[: step * height].reshape(height, step)[:, : width * depth].reshape(height, width, depth)
-    return np.ascontiguousarray(rows[:, :, order])
+    rows = data[: step * height].reshape(height, step)[:, :row]
+    if of_number == 2:
+        wide = np.ascontiguousarray(rows).view(">u2" if message.is_bigendian else "<u2")
+        is_of_12_bits = wide.max() < 1 << 12  # all of it would be black
+        rows = (wide >> (4 if is_of_12_bits else 8)).astype(np.uint8)
+    return _as_rgb(np.ascontiguousarray(rows).reshape(height, width, depth), code, where)
+
+
+def _as_rgb(pixels: NDArray[np.uint8], code: str, where: str) -> NDArray[np.uint8]:
+    import cv2
+
+    if not code:
+        return pixels
+    try:
+        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{code}")), np.uint8)
+    except cv2.error:
+        height, width = pixels.shape[:2]
+        raise DataError(f"{where}: {width} x {height} pixels are too few or odd for {code}") from None

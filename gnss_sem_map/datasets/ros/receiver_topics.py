@@ -1,4 +1,4 @@
-"""Velocity and heading of a receiver in topics of their own, as rows like those of its fixes."""
+"""Velocity and heading of a receiver in topics of their own, as rows like those of its fixes; speed of the wheels."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from factor_graphs.csv_log import NOT_DEFINITE
+from factor_graphs.measurements import WheelSpeeds, clean_wheels
 from factor_graphs.position_covariances import split_covariances
 from factor_graphs.receiver_rows import with_more
 from gnss_sem_map.datasets.ros.bag import Bag, Messages
 from gnss_sem_map.datasets.ros.decoding import decode
-from gnss_sem_map.datasets.ros.rig import HeadingTopic, VelocityTopic
+from gnss_sem_map.datasets.ros.kinds import IMU
+from gnss_sem_map.datasets.ros.rig import HeadingTopic, VelocityTopic, WheelTopic
 from gnss_sem_map.datasets.ros.stamps import stamps_of
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.sensor_log import Skip
 
 Array = NDArray[np.float64]
 
-QUATERNION, FLOAT, IMU = "geometry_msgs/msg/QuaternionStamped", "std_msgs/msg/Float64", "sensor_msgs/msg/Imu"
 ENU_OF_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -50,8 +51,7 @@ def heading_rows(bag: Bag, about: HeadingTopic, fixes: Array, epoch_ns: int) -> 
     A variance of pi² rad² or more says that there is no heading; one that is not above zero, that it is not known.
     """
     messages = bag.messages(about.topic)
-    is_plain = messages.kind == FLOAT
-    stamps, found, skips = _read(bag, messages, "received" if is_plain else about.stamps, _yaw)
+    stamps, found, skips = _read(bag, messages, about.stamps, _yaw)
     is_enu = messages.kind == IMU if about.axes is None else about.axes == "enu"
     headings, variances = 90 - found[:, 0] if is_enu else found[:, 0], found[:, 1]
     headings[variances >= np.pi**2] = np.nan
@@ -61,13 +61,36 @@ def heading_rows(bag: Bag, about: HeadingTopic, fixes: Array, epoch_ns: int) -> 
     return _rows(stamps, epoch_ns, fixes, headings_deg=headings, heading_stddevs_deg=stddevs), skips
 
 
+def wheels_of(bag: Bag, about: WheelTopic | None, epoch_ns: int) -> tuple[WheelSpeeds | None, list[Skip]]:
+    """The speed along x that a topic tells, in its unit, and what was skipped; None where the rig names none."""
+    if about is None:
+        return None, []
+    messages = bag.messages(about.topic)
+    stamps, found, skips = _read(bag, messages, about.stamps, _speed)
+    wheels, repairs = clean_wheels((stamps - epoch_ns) * 1e-9, found[:, 0])
+    if repairs.dropped:
+        skips.append(Skip("samples", messages.topic, str(repairs)))
+    return wheels, skips
+
+
+def _speed(message: Any) -> list[float]:
+    """Of a float, a report, a twist with or without a header and covariance, or the twist of an Odometry."""
+    if hasattr(message, "data"):
+        return [message.data]
+    if hasattr(message, "longitudinal_velocity"):
+        return [message.longitudinal_velocity]
+    while hasattr(message, "twist"):
+        message = message.twist
+    return [message.linear.x]
+
+
 def _read(
     bag: Bag, messages: Messages, clock: Any, read: Callable[[Any], list[float]]
 ) -> tuple[NDArray[np.int64], Array, list[Skip]]:
     """Unix times (n,) ns, what `read` takes from each message (n, c), and the skipped ones."""
     said, believed, skips = stamps_of(bag, messages, clock)
     if not believed.any():
-        raise DataError(f"rig.yaml: {messages.topic} has no messages; remove it from gnss")
+        raise DataError(f"rig.yaml: {messages.topic} has no messages; remove it")
     rows = [read(decode(bag, messages, k)) for k in np.flatnonzero(believed).tolist()]
     return said[believed], np.array(rows, np.float64), skips
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from factor_graphs.measurements import ImuNoise
 from factor_graphs.settings import SampleInstant
 from gnss_sem_map.datasets.gnss_files import GnssFile
+from gnss_sem_map.datasets.ros.clouds import Unit
 from gnss_sem_map.datasets.ros.stamps import Clock
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.structured import fault_of, read_yaml
@@ -39,6 +40,9 @@ class _Topic(_Section):
 class ImuTopic(_Topic):
     """The IMU; its frame is the body frame."""
 
+    force_topic: str | None = Field(
+        None, description="Topic of the accelerometer, where `topic` is that of the gyroscope alone."
+    )
     noise: ImuNoise | None = Field(None, description="Noise of the IMU; default: a good consumer unit.")
     sample_instant: SampleInstant | None = Field(
         None, description="What a stamp names of a sample's interval; default: found, else its middle."
@@ -68,8 +72,15 @@ class HeadingTopic(_Section):
     stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
 
 
+class WheelTopic(_Section):
+    """Speed of the vehicle along x: a topic of Odometry, a twist, an Autoware report or a float; `speed_unit`."""
+
+    topic: str = Field(description="Name of the topic.")
+    stamps: Clock = Field("header", description="When it was measured: its header, or its arrival.")
+
+
 class GnssTopic(_Section):
-    """The receiver: a topic of NavSatFix, or a file."""
+    """The receiver: a topic of NavSatFix, GPSFix or NMEA sentences, or a file."""
 
     topic: str | None = Field(None, description="Name of the topic.")
     file: GnssFile | None = Field(None, description="A file in place of a topic.")
@@ -79,7 +90,7 @@ class GnssTopic(_Section):
     stamps: Clock = Field("header", description="When a fix was measured: its header, or its arrival.")
     stddevs_m: tuple[float, float, float] | None = Field(
         None,
-        description="East, north, up, m, of fixes whose covariance is unknown; default: these are left out.",
+        description="East, north, up, m, of fixes whose covariance is unknown or zero; default: these are left out.",
     )
     p_imu_antenna: tuple[float, float, float] | None = Field(
         None, description="Antenna in the imu frame, m; default: by the static transforms."
@@ -99,6 +110,9 @@ class LidarTopic(_Topic):
     point_times: str | None = Field(
         None,
         description="Field of the points' times, or `compensated`; default: time, t, offset_time or timestamp.",
+    )
+    point_times_unit: Unit | None = Field(
+        None, description="Unit of the points' times; default: by their size, and the time between sweeps."
     )
     intensity_max: float | None = Field(
         None,
@@ -139,6 +153,7 @@ class Rig(SensorConventions):
 
     imu: ImuTopic | None = Field(None, description="The IMU.")
     gnss: GnssTopic | None = Field(None, description="The receiver.")
+    wheels: WheelTopic | None = Field(None, description="The speed of the wheels.")
     lidars: dict[str, LidarTopic] = Field({}, description="LiDARs by name.")
     cameras: dict[str, CameraTopic] = Field({}, description="Cameras by name.")
 

@@ -4,28 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from gnss_sem_map.datasets.ros import clouds, pictures
 from gnss_sem_map.datasets.ros.bag import Bag
+from gnss_sem_map.datasets.ros.imu_topics import part_of
+from gnss_sem_map.datasets.ros.kinds import INFO, KINDS, NAMED, unread
 from gnss_sem_map.datasets.ros.rig import CameraTopic, GnssTopic, ImuTopic, LidarTopic, Rig
 from gnss_sem_map.errors import DataError
 from gnss_sem_map.files.untrusted import shown
 from gnss_sem_map.sensor_log import SENSOR, Skip
-
-IMU, GNSS, INFO = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo"
-UNKNOWN_COVARIANCE, DIAGONAL_COVARIANCE = 0, 2
-"""NavSatFix.position_covariance_type."""
-KINDS = {
-    "IMU": (IMU,),
-    "receiver": (GNSS,),
-    "LiDAR": (clouds.KIND,),
-    "camera": (pictures.RAW, pictures.COMPRESSED),
-    "velocity": ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped"),
-    "heading": (
-        "geometry_msgs/msg/QuaternionStamped",
-        "std_msgs/msg/Float64",
-    ),  # and an Imu of orientations alone
-}
-"""Those of velocities and headings, which may also be a command or an angle of anything, are never taken unasked."""
 
 
 def completed(bag: Bag, rig: Rig) -> Rig:
@@ -37,8 +22,7 @@ def completed(bag: Bag, rig: Rig) -> Rig:
     update: dict[str, object] = {}
     if rig.imu is None:
         of_heading = rig.gnss.heading.topic if rig.gnss and rig.gnss.heading else None
-        topic = _only(bag, "IMU", "imu: {topic: ...}", but=of_heading)
-        update["imu"] = None if topic is None else ImuTopic(topic=topic)
+        update["imu"] = _imu(bag, [topic for topic in of_kind(bag, "IMU") if topic != of_heading])
     if rig.gnss is None or (rig.gnss.topic is None and rig.gnss.file is None):
         topic = _only(bag, "receiver", "gnss: {topic: ...}")
         known = {} if rig.gnss is None else rig.gnss.model_dump()
@@ -58,7 +42,10 @@ def completed(bag: Bag, rig: Rig) -> Rig:
 
 def of_kind(bag: Bag, sensor: str) -> list[str]:
     """The topics whose type is that of a sensor, sorted; of an image that is there twice the raw one."""
-    found = sorted(topic for topic, kind in bag.kinds.items() if kind in KINDS[sensor])
+    kinds = KINDS[sensor]
+    if sensor == "receiver":
+        kinds = next(((kind,) for kind in kinds if kind in bag.kinds.values()), kinds)
+    found = sorted(topic for topic, kind in bag.kinds.items() if kind in kinds)
     return [
         topic
         for topic in found
@@ -79,19 +66,50 @@ def info_beside(bag: Bag, topic: str) -> str | None:
 
 
 def missing(bag: Bag, rig: Rig) -> list[Skip]:
-    """That there is no IMU or no receiver."""
+    """That there is no IMU, no receiver or, where packets of one are there, no LiDAR."""
+    notes = [] if rig.lidars else [(topic, note) for topic, note in _notes(bag) if "LiDAR" in note]
+    skips = [Skip("scan", topic, note) for topic, note in notes]
     if rig.imu is not None and rig.gnss is not None:
-        return []
+        return skips
     what = "an IMU (sensor_msgs/Imu)" if rig.imu is None else "a receiver (sensor_msgs/NavSatFix)"
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(bag.kinds.items()))[:500] or "no topics"
     reason = (
         f"found no topic of {what}; it has {found}; set it, or a file of positions (gnss.file), in rig.yaml"
+        + "".join(f"; {topic}: {note}" for topic, note in _notes(bag))[:300]
     )
-    return [Skip(SENSOR, shown(bag.path), reason)]
+    return [*skips, Skip(SENSOR, shown(bag.path), reason)]
 
 
-def _only(bag: Bag, sensor: str, key: str, but: str | None = None) -> str | None:
-    found = [topic for topic in of_kind(bag, sensor) if topic != but]
+def _notes(bag: Bag) -> list[tuple[str, str]]:
+    """What is to be said of topics that are not read."""
+    return [(topic, note) for topic, kind in sorted(bag.kinds.items()) if (note := unread(kind))]
+
+
+def nothing_read(bag: Bag) -> DataError:
+    """The error that no topic of a bag is of a sensor, with what may be done about its types."""
+    notes = "; ".join(f"{topic}: {note}" for topic, note in _notes(bag))
+    found = ", ".join(sorted(set(bag.kinds.values())))[:300] or "no topics"
+    return DataError(
+        f"{shown(bag.path)}: nothing of it is read; found no topic of an IMU, a receiver, a LiDAR or a camera, but"
+        f" {found}; {notes[:300] or 'docs/your_own_log.md lists the types that are read'}"
+    )
+
+
+def _imu(bag: Bag, topics: list[str]) -> ImuTopic | None:
+    """The only IMU, or the only gyroscope with the only accelerometer."""
+    parts = {topic: part_of(bag, topic) for topic in topics} if len(topics) > 1 else {}
+    whole, turns, forces = (
+        [topic for topic, part in parts.items() if part == name]
+        for name in ("IMU", "gyroscope", "accelerometer")
+    )
+    if not whole and len(turns) == len(forces) == 1:
+        return ImuTopic(topic=turns[0], force_topic=forces[0])
+    topic = _only(bag, "IMU", "imu: {topic: ...}", whole or topics)
+    return None if topic is None else ImuTopic(topic=topic)
+
+
+def _only(bag: Bag, sensor: str, key: str, among: list[str] | None = None) -> str | None:
+    found = of_kind(bag, sensor) if among is None else among
     if len(found) > 1:
         raise DataError(
             f"{shown(bag.path)}: found {len(found)} topics of a {sensor}: {', '.join(found)[:500]}; say which one in"
@@ -103,6 +121,8 @@ def _only(bag: Bag, sensor: str, key: str, but: str | None = None) -> str | None
 def _check(bag: Bag, rig: Rig) -> None:
     named: list[tuple[str, str, str | None]] = [
         *([("imu", "IMU", rig.imu.topic)] if rig.imu else []),
+        *([("imu.force_topic", "IMU", rig.imu.force_topic)] if rig.imu else []),
+        *([("wheels", "wheels", rig.wheels.topic)] if rig.wheels else []),
         *([("gnss", "receiver", rig.gnss.topic)] if rig.gnss else []),
         *([("gnss.velocity", "velocity", rig.gnss.velocity.topic)] if rig.gnss and rig.gnss.velocity else []),
         *([("gnss.heading", "heading", rig.gnss.heading.topic)] if rig.gnss and rig.gnss.heading else []),
@@ -112,7 +132,7 @@ def _check(bag: Bag, rig: Rig) -> None:
     places: dict[str, str] = {}
     for place, sensor, topic in named:
         if topic is not None:
-            _check_kind(bag, place, topic, (*KINDS[sensor], IMU) if sensor == "heading" else KINDS[sensor])
+            _check_kind(bag, place, topic, (*KINDS[sensor], *NAMED.get(sensor, ())))
             if places.setdefault(topic, place) != place:
                 raise DataError(
                     f"rig.yaml: {place}: {topic} is {places[topic]} already, and would count twice; correct or remove"
@@ -133,6 +153,6 @@ def _check_kind(bag: Bag, place: str, topic: str, kinds: Iterable[str]) -> None:
         )
     if kind not in kinds:
         raise DataError(
-            f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)}; `gnss-sem-map inspect` lists the"
-            " topics"
+            f"rig.yaml: {place}: {topic} is of {kind}, expected {' or '.join(kinds)};"
+            f" {unread(kind) or '`gnss-sem-map inspect` lists the topics'}"
         )

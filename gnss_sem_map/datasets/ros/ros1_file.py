@@ -37,21 +37,13 @@ class Ros1File:
         reader = Reader(path)
         try:
             reader.open()
-        except (
-            ReaderError,
-            struct.error,
-            AssertionError,
-            UnicodeError,
-            IndexError,
-            ValueError,
-            OSError,
-        ) as error:
+        except (ReaderError, struct.error, AssertionError, IndexError, ValueError, OSError) as error:
             raise DataError(
                 f"{shown(path)}: truncated, damaged or not indexed ({one_line(error, 120)}); repair it: rosbag reindex"
                 f" {shown(path.name)}, and move the copy that it leaves (.orig.bag) to another folder"
             ) from None
         try:
-            self.topics = {one.topic: one.msgtype for one in reader.connections}
+            self.topics = {one.topic: (one.msgtype, "ros1") for one in reader.connections}
             names = {function: name for name, function in decompressors.items()}
             starts = sorted(reader.chunks)
             self._chunk = np.array(

@@ -33,7 +33,7 @@ class SqliteFile:
             )
             weakref.finalize(self, self._database.close)
             rows = self._database.execute("SELECT id, name, type FROM topics").fetchall()
-            self.topics = {str(name): str(kind) for _, name, kind in rows}
+            self.topics = {str(name): (str(kind), "cdr") for _, name, kind in rows}
             self._numbers = {str(name): int(number) for number, name, _ in rows}
         except DAMAGED as error:
             raise self._damaged(error) from None

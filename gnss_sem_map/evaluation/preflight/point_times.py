@@ -27,6 +27,7 @@ LONGEST_SWEEPS = 3.0
 FULL_CIRCLE = 0.75
 """A scanner that saw so much of the circle turned: its points cannot all have one time."""
 AT_ONCE_S = 1e-4
+OF_BAG = "; of a bag, point_times: compensated in rig.yaml"
 LEAST_MOTION_M = 0.1
 """What a sweep must be bent by before surfaces tell anything."""
 LEAST, RAW_SURE, COMPENSATED_SURE, CLEAR = 1.0, 3.0, 4.0, 3.0
@@ -89,7 +90,7 @@ def _as_numbers(points: Points, stamp: float, interval: float) -> Finding:
             f"{found}, that see {seen:.0%} of the circle",
             "point times are all zero, or all the same: nothing is deskewed",
             "write each point's time minus the scan's stamp, s, into the fifth column;"
-            " or say lidar_is_compensated: true where the scans are",
+            f" or say lidar_is_compensated: true where the scans are{OF_BAG}",
         )
     if span > LONGEST_SWEEPS * interval:
         factor = min(UNITS, key=lambda unit: abs(np.log(span / interval / unit)))
@@ -98,7 +99,7 @@ def _as_numbers(points: Points, stamp: float, interval: float) -> Finding:
             NAME,
             found,
             f"point times are in {UNITS[factor]}" if fits else "point times are no seconds of one sweep",
-            "give point times in seconds after the scan's stamp",
+            "give point times in seconds after the scan's stamp; of a bag, their point_times_unit in rig.yaml",
         )
     if abs(middle) > LONGEST_SWEEPS * interval:
         return red(
@@ -112,7 +113,7 @@ def _as_numbers(points: Points, stamp: float, interval: float) -> Finding:
             NAME,
             f"{found}, that see {seen:.0%} of the circle",
             "point times are of another unit",
-            "give point times in seconds after the scan's stamp",
+            "give point times in seconds after the scan's stamp; of a bag, their point_times_unit in rig.yaml",
         )
     return green(NAME, found)
 
@@ -151,7 +152,8 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
             THICKNESS,
             found,
             "raw scans are called compensated (lidar_is_compensated), or their times are lost",
-            "set lidar_is_compensated: false and give point times in a fifth column",
+            "set lidar_is_compensated: false and give point times in a fifth column; of a bag, the name of their field"
+            " as point_times in rig.yaml",
         )
     reverse = (
         "point times are reversed: the scanner turns the other way",
@@ -159,7 +161,7 @@ def _by_surfaces(sample: Sample, interval: float) -> Finding:
     )
     twice = (
         "compensated scans are called raw: they are deskewed twice",
-        "set lidar_is_compensated: true, with scans of four columns",
+        f"set lidar_is_compensated: true, with scans of four columns{OF_BAG}",
     )
     likely, other = (reverse, twice) if best is REVERSED else (twice, reverse)
     if extents + thicknesses - min(sum(both) for both in gains.values()) > CLEAR:

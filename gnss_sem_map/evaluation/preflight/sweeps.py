@@ -83,10 +83,11 @@ def _intensity(sample: Sample) -> Finding:
 def _why_unreadable(error: DataError) -> tuple[str, str, str]:
     """What was found, the probable mistake, and its remedy."""
     if isinstance(error, PointTimesError):
-        return error.found, error.mistake, "give each point's time minus the scan's stamp, s"
+        remedy = "give each point's time minus the scan's stamp, s; of a bag, point_times_unit in rig.yaml"
+        return error.found, error.mistake, remedy
     return (
         str(error),
         "scans are damaged, cut short, of another count of columns, or other bytes than points",
         "copy the scans again: little-endian float32 x y z intensity, m; of a CSV log also the time of each point,"
-        " unless lidar_is_compensated is true",
+        " unless lidar_is_compensated is true; of a bag, its message says what is to do",
     )

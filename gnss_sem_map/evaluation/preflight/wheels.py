@@ -21,6 +21,7 @@ MOVING_SPEED, LEAST_SAMPLES = 3.0, 10
 MOST_SCALE, SAME_UNIT = 1.25, 1.15
 # Wheels that are right differ from the speed by less than this share of it.
 MOST_MISFIT = 0.1
+REMEDY = "check wheels.csv, which has the clock of imu.csv; of a bag, topic and stamps of wheels in rig.yaml"
 
 
 def check(sample: Sample) -> Iterator[Finding]:
@@ -39,7 +40,7 @@ def _clock(wheels: WheelSpeeds, imu: ImuSamples) -> Finding:
     if inside.sum() > len(wheels) / 2:
         return green("wheel stamps", evidence)
     mistake = "the wheels have another clock, or are of another drive"
-    return amber("wheel stamps", evidence, mistake, "give stamp_s of wheels.csv on the clock of imu.csv")
+    return amber("wheel stamps", evidence, mistake, REMEDY)
 
 
 def _unit(wheels: WheelSpeeds, track: Trajectory, velocities: Array) -> Finding:
@@ -54,7 +55,7 @@ def _unit(wheels: WheelSpeeds, track: Trajectory, velocities: Array) -> Finding:
     evidence = f"the wheels say {ratio:.3g} times the speed, expected about 1"
     if ratio == 0.0 or np.median(np.abs(said / ratio - speed) / speed) > MOST_MISFIT:
         mistake = "they are of another clock or drive, or not in this column"
-        return amber("wheel speed", evidence, f"{mistake}: they are left out", "check wheels.csv")
+        return amber("wheel speed", evidence, f"{mistake}: they are left out", REMEDY)
     unit = next((name for name, size in SPEED_UNITS.items() if _factor(ratio * size) < SAME_UNIT), None)
     if _factor(ratio) < MOST_SCALE:
         return green("wheel speed", evidence)

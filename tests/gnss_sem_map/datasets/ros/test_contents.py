@@ -42,14 +42,14 @@ def test_what_would_stop_a_run_is_noted(tmp_path: Path) -> None:
     rig.messages = [one for one in rig.messages if one[0] == "/imu"]
     rig.cloud(START_NS, sweep(np.zeros(4), name="ring"))
     rig.fix(START_NS, kind=0)
-    rig.image(START_NS, np.zeros((4, 6), np.uint8), "bayer_rggb8")
+    rig.image(START_NS, np.zeros((4, 6), np.uint8), "32FC1")
     for k in range(5):
         rig.imu(START_NS + k, 0, topic="/imu_without_clock")
     found = topics_of(ros.write(tmp_path / "drive", rig))
     assert "no time per point among x, y, z, intensity, ring" in found["/points"].notes[0]
-    assert "its frame 'lidar' is not in /tf_static" in found["/points"].notes[1]
+    assert "its frame 'lidar' is in no fixed transform" in found["/points"].notes[1]
     assert found["/fix"].notes == ("its covariance is unknown: set stddevs_m",)
-    assert "encoding bayer_rggb8 is not read" in found["/image_rect"].notes[0]
+    assert "not read: its images have the encoding 32FC1" in found["/image_rect"].notes[0]
     assert found["/imu_without_clock"].notes == ("5 of 5 header stamps are zero: set stamps: received",)
 
 
@@ -110,7 +110,7 @@ def cameras_of(bag: Path) -> dict[str, str]:
 
 def test_an_image_that_is_recorded_raw_and_compressed_is_one_camera(tmp_path: Path) -> None:
     rig = ros.with_camera()
-    for name, encoding in (("left", "rgb8"), ("right", "bayer_rggb8")):
+    for name, encoding in (("left", "rgb8"), ("right", "32FC1")):
         pixels = np.zeros((4, 6, 3) if encoding == "rgb8" else (4, 6), np.uint8)
         rig.image(START_NS, pixels, encoding, topic=f"/{name}/image_raw")
         rig.compressed(START_NS, b"", f"/{name}/image_raw/compressed")

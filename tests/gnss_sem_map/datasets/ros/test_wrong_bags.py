@@ -43,8 +43,9 @@ def chunk_index(content: bytearray, at: int) -> int:
 def read_all(file: Path) -> None:
     bag = Bag(file)
     for topic in bag.kinds:
-        for _ in bag.each(bag.messages(topic)):
-            pass
+        messages = bag.messages(topic)
+        for k in range(len(messages)):
+            bag.read(messages, k)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "db3", "bag"])
@@ -264,7 +265,7 @@ def test_a_cloud_without_times_is_refused_unless_it_is_compensated(tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("times", "mistake"),
-    [(TIMES * 1e3, "in ms"), (START_NS * 1e-9 + 37.0 + TIMES, "of another clock")],
+    [(TIMES * 1e5, "no seconds of one sweep"), (START_NS * 1e-9 + 37.0 + TIMES, "of another clock")],
 )
 def test_times_of_no_sweep_are_named(tmp_path: Path, times: np.ndarray, mistake: str) -> None:
     rig = ros.drive()
@@ -295,15 +296,18 @@ def test_images_of_an_unknown_lens_are_refused(tmp_path: Path) -> None:
 
 def test_an_encoding_that_is_not_known_is_named(tmp_path: Path) -> None:
     rig = with_camera()
-    rig.image(START_NS, np.zeros((4, 6), np.uint8), "bayer_rggb8")
-    with pytest.raises(DataError, match=r"found encoding 'bayer_rggb8', expected rgb8, bgr8 or mono8"):
+    rig.image(START_NS, np.zeros((4, 6), np.uint8), "32FC1")
+    with pytest.raises(
+        DataError, match=r"found encoding '32FC1', expected PNG, JPEG, or one of rgb8, bgr8, .*convert"
+    ):
         open_drive(ros.write(tmp_path / "drive", rig)).images[0].read()
 
 
 def test_missing_and_circular_transforms(tmp_path: Path) -> None:
     bag = ros.write(tmp_path / "none", ros.drive(frames=False))
     with pytest.raises(
-        DataError, match=r"no static transform leads from 'lidar' to 'imu' \(frames in /tf_static: none\)"
+        DataError,
+        match=r"no fixed transform leads from 'lidar' to 'imu' \(frames of fixed transforms: none\)",
     ):
         open_drive(bag)
     rig = ros.drive(frames=False)

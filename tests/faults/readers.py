@@ -13,6 +13,7 @@ import numpy as np
 import street
 from faults import mutations
 from faults.fuzzing import Reader
+from pyproj import Transformer
 
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.tum import write_tum
@@ -160,6 +161,26 @@ def given(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     else:
         write(poses, file)
     return Reader(file, lambda: open_drive(drive, trajectory=file), mutate)
+
+
+def cloud(suffix: str, folder: Path) -> Reader:
+    """A georeferenced point cloud that drives are held onto."""
+    import laspy
+    from pyproj import CRS
+
+    from gnss_sem_map.datasets.laz_cloud import read_base
+
+    folder.mkdir(parents=True)
+    file, header = folder / f"cloud{suffix}", laspy.LasHeader(point_format=6, version="1.4")
+    header.add_crs(CRS.from_epsg(street.FRAME.utm_epsg))
+    x, y = Transformer.from_crs(4326, street.FRAME.utm_epsg, always_xy=True).transform(
+        street.FRAME.lon_deg, street.FRAME.lat_deg
+    )
+    header.scales, header.offsets = np.full(3, 1e-3), np.floor([x, y, 0.0])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.random.default_rng(0).normal([[x], [y], [street.FRAME.alt_m]], 20.0, (3, 500))
+    las.write(file)
+    return Reader(file, lambda: read_base(file, street.FRAME), mutations.binary)
 
 
 def settings(folder: Path) -> Reader:
@@ -360,6 +381,8 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "poses in TUM": functools.partial(given, "poses.tum", mutations.text),
     "poses in Parquet": functools.partial(given, "poses.parquet", mutations.parquet),
     "poses in SBET": functools.partial(given, "poses.sbet", mutations.floats),
+    "LAS": functools.partial(cloud, ".las"),
+    "LAZ": functools.partial(cloud, ".laz"),
     "settings": settings,
     "--set": one_setting,
     "segmenter": segmenter,

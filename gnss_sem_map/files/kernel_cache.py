@@ -1,9 +1,9 @@
 """Where numba keeps what it has compiled, when it may write neither beside the package nor into the user's cache.
 
 So it is of a user without a home, with an installation that belongs to root: a container with `--user`, a shared
-server. numba would not even import then. A folder of this user under the system's temporary one takes its place; a later
-process takes the same one. Its name cannot be foretold, and it is taken only where it is this user's, and no one else's:
-what lies in it is executed. Only the standard library is imported here: `--help` is to answer at once.
+server. numba would not even import then. A folder of this user under the system's temporary one takes its place, also
+for later processes. Its name cannot be foretold, and it is taken only where it is this user's alone: what lies in it is
+executed. Only the standard library is imported here: `--help` is to answer at once.
 """
 
 from __future__ import annotations

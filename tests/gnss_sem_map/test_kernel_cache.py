@@ -1,4 +1,4 @@
-"""A user without a home runs an installation of root's: what numba compiles is in a folder that is this user's alone."""
+"""A user without a home runs an installation of root's: what numba compiles is in a folder of this user alone."""
 
 from __future__ import annotations
 

@@ -215,7 +215,7 @@ def test_wheel_speeds_are_read_and_their_bad_rows_reported(small_drive: Street, 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ("stamp_s,speed\n0,1\n", "wheels.csv:.*columns stamp_s,speed_mps"),
+        ("stamp_s,gear\n0,1\n", "wheels.csv:.*columns stamp_s,speed_mps"),
         ("stamp_s,speed_mps\n", "wheels.csv: no rows"),
         ("stamp_s,speed_mps\n0,fast\n", "wheels.csv:.*expected numbers"),
         ("stamp_s,speed_mps\n" + "".join(f"{50 * k},1\n" for k in range(9)), "wheels.csv:.*milliseconds"),

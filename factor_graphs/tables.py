@@ -68,7 +68,7 @@ _NAMES: dict[str, dict[str, str]] = {
         "type": "type", "epsg": "epsg", "heading_deg": "headingdeg", "std_heading_deg": "stdheadingdeg",
         "corr_en": "corren", "corr_eu": "correu", "corr_nu": "corrnu",
         "week": "week gpsweek weekno", "sow": "gpstime corrtime sow tow gpstow gpssow",
-        "date": "date utcdate gpsdate yearmmdd", "clock": "hrmnssss utctime utc time timeutc",
+        "date": "date utcdate gpsdate yearmmdd", "clock": "hrmnssss hrmnsssss utctime utc time timeutc",
         "lat_d": "latdd", "lat_min": "latmn", "lat_s": "latss", "lon_d": "londd", "lon_min": "lonmn", "lon_s": "lonss",
     },
 }  # fmt: skip
@@ -143,7 +143,7 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
     at = _header_line(lines, wanted, most)
     header, header_separator = _split(COMMENT.sub("", lines[at]))
     rest = [k for k in range(at + 1, len(lines)) if lines[k].strip() and not COMMENT.match(lines[k])]
-    if rest and _are_units(_split(lines[rest[0]])[0]):
+    if rest and _are_units(lines[rest[0]]):
         header, at, rest = _with_units(lines[at], header, lines[rest[0]]), rest[0], rest[1:]
     separator, is_ended = _separator([lines[k] for k in rest], len(header), header_separator)
     cells = [cell for k in rest for cell in _cells(lines[k], separator)]
@@ -213,23 +213,24 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def _separator(rows: list[str], columns: int, of_header: str) -> tuple[str, bool]:
-    """What separates the cells of rows, and whether it ends them, too."""
+    """What separates the cells of rows, by the first; and whether it ends them, too."""
+    row = rows[0] if rows else of_header
     for separator in (of_header, *SEPARATORS, " "):
-        for row in rows[:1]:
-            cells = _cells(row, separator)
-            if len(cells) == columns:
-                return separator, False
-            if len(cells) == columns + 1 and not cells[-1].strip():
-                return separator, True
-    return of_header, False
+        cells = _cells(row, separator)
+        if len(cells) == columns:
+            return separator, False
+        if len(cells) == columns + 1 and not cells[-1].strip():
+            return separator, True
+    return (of_header if of_header in row else " "), False
 
 
-def _are_units(cells: list[str]) -> bool:
+def _are_units(line: str) -> bool:
     """Whether a line below the names tells their units."""
+    cells = _split(line)[0]
     known = {unit for units in UNITS.values() for unit in units}
     if any(map(NUMBER_CELL.match, cells)):
         return False
-    return any(re.fullmatch(r"[\[(].*[\])]", cell) or _letters(cell) in known for cell in cells)
+    return line.lstrip()[:1] in ("(", "[") or any(_letters(cell) in known for cell in cells)
 
 
 def _with_units(names: str, header: list[str], below: str) -> list[str]:

@@ -12,7 +12,7 @@ from gnss_sem_map.errors import ConfigError
 
 
 @lru_cache(maxsize=16)
-def undulation(geoid: Path) -> Transformer:
+def undulation(geoid: Path, key: str = "delivery.geoid") -> Transformer:
     """Longitude and latitude °, height above the ellipsoid m, to that above the geoid; raises ConfigError."""
     try:
         return Transformer.from_pipeline(
@@ -22,6 +22,6 @@ def undulation(geoid: Path) -> Transformer:
         )
     except ProjError:
         raise ConfigError(
-            f"delivery.geoid: {geoid}: expected a grid of geoid heights as PROJ reads them (.tif, .gtx),"
+            f"{key}: {geoid}: expected a grid of geoid heights as PROJ reads them (.tif, .gtx),"
             " in a path without quotes and commas"
         ) from None

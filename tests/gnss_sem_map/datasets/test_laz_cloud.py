@@ -8,10 +8,10 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-import rasterio
 from laspy.vlrs.known import GeoKeyDirectoryVlr
 from numpy.typing import NDArray
 from pyproj import CRS, Geod, Transformer
+from surfaces import write_geoid
 
 from factor_graphs.geodesy import LocalFrame
 from gnss_sem_map.datasets.laz_cloud import read_base
@@ -117,16 +117,6 @@ def test_heights_above_a_geoid_that_is_not_there_are_refused(tmp_path: Path) -> 
 
 FEET, SURVEY_FEET = 0.3048, 1200 / 3937
 IN_TEXAS = LocalFrame(30.27, -97.74, 150.0)
-
-
-def write_geoid(path: Path, lat_deg: float, lon_deg: float, height_m: float) -> Path:
-    """A grid as PROJ reads it: a geoid so high above the ellipsoid around a place."""
-    heights = np.full((5, 5), height_m, np.float32)
-    profile = {"driver": "GTiff", "height": 5, "width": 5, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
-    corner = rasterio.Affine(0.5, 0, lon_deg - 1.25, 0, -0.5, lat_deg + 1.25)
-    with rasterio.open(path, "w", transform=corner, **profile) as grid:
-        grid.write(heights, 1)
-    return path
 
 
 def write_in(

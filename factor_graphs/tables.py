@@ -17,6 +17,7 @@ import numpy as np
 from factor_graphs.errors import MeasurementError
 
 HEADER_BYTES, HEADER_LINES = 100_000, 100
+MOST_COLUMNS, LONGEST_NAME = 1000, 200
 SEPARATORS = ";\t|,"
 COMMENT = re.compile(r"^\s*(?:#|%|//)+\s*")
 BRACKETS = re.compile(r"^(.*?)\s*[\[(<{]\s*([^\])>}]*)[\])>}]?\s*$")
@@ -98,7 +99,7 @@ class Layout:
     @cached_property
     def _plain(self) -> list[tuple[str, str | None]]:
         """Name and unit of each column, if it tells one."""
-        cells = [BRACKETS.match(text) for text in self.header]
+        cells = [BRACKETS.match(text[:LONGEST_NAME]) for text in self.header]
         return [
             (_letters(text), None) if cell is None else (_letters(cell[1]), _letters(cell[2]))
             for text, cell in zip(self.header, cells, strict=True)
@@ -200,7 +201,7 @@ def _has(layout: Layout, name: str) -> bool:
 def _split(line: str) -> tuple[list[str], str]:
     """The cells of a line that may be of names, and what separates them."""
     separator = next((mark for mark in SEPARATORS if mark in line.strip()), " ")
-    return [cell.strip().strip('"') for cell in _cells(line, separator)], separator
+    return [cell.strip().strip('"') for cell in _cells(line, separator)[:MOST_COLUMNS]], separator
 
 
 def _cells(line: str, separator: str) -> list[str]:

@@ -14,11 +14,14 @@ import street
 from faults import mutations
 from faults.fuzzing import Reader
 from pyproj import Transformer
+from receivers import LEAP_NS, gga, moment, pos_row, rmc
+from ros import START_NS
 
 from factor_graphs.trajectory import Trajectory
 from factor_graphs.tum import write_tum
 from gnss_sem_map import config
 from gnss_sem_map.datasets import open_drive
+from gnss_sem_map.datasets.gnss_files.time_systems import GPS_EPOCH_NS, WEEK_NS
 from gnss_sem_map.export.navigation import write_sbet
 from gnss_sem_map.labels import label_set, sensor_model
 from gnss_sem_map.voxels import tiles
@@ -161,6 +164,16 @@ def given(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     else:
         write(poses, file)
     return Reader(file, lambda: open_drive(drive, trajectory=file), mutate)
+
+
+def positions(name: str, content: str, folder: Path) -> Reader:
+    """Positions of a receiver in a file of its own."""
+    from receivers import read
+
+    folder.mkdir(parents=True)
+    file = folder / name
+    file.write_text(content)
+    return Reader(file, lambda: read(file), mutations.text)
 
 
 def cloud(suffix: str, folder: Path) -> Reader:
@@ -355,6 +368,16 @@ def checkpoint(suffix: str, folder: Path) -> Reader:
     return Reader(file, lambda: read_checkpoint(file), mutations.binary)
 
 
+FIXES = [START_NS + k * 10**9 for k in range(20)]
+SOLUTION = (
+    "% GPST latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m) sdne(m) sdeu(m) sdun(m) age(s)\n"
+)
+EXPORT = """Project:     loop
+   Week   GPSTime       Latitude      Longitude     H-Ell SDNorth SDEast SDHeight Q
+(weeks)     (sec)     (+/-D M S)     (+/-D M S)       (m)     (m)    (m)      (m)
+"""
+WEEK, SECONDS = divmod((START_NS + LEAP_NS - GPS_EPOCH_NS) // 10**9, WEEK_NS // 10**9)
+
 READERS: dict[str, Callable[[Path], Reader]] = {
     "oxts row": functools.partial(kitti, "oxts/data/0000000002.txt", mutations.text),
     "oxts stamps": functools.partial(kitti, "oxts/timestamps.txt", mutations.text),
@@ -381,6 +404,24 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "poses in TUM": functools.partial(given, "poses.tum", mutations.text),
     "poses in Parquet": functools.partial(given, "poses.parquet", mutations.parquet),
     "poses in SBET": functools.partial(given, "poses.sbet", mutations.floats),
+    "RTKLIB": functools.partial(
+        positions, "a.pos", SOLUTION + "\n".join(pos_row(ns + LEAP_NS) for ns in FIXES)
+    ),
+    "NMEA": functools.partial(positions, "a.nmea", "".join(rmc(ns) + gga(ns) for ns in FIXES)),
+    "Inertial Explorer": functools.partial(
+        positions,
+        "a.txt",
+        EXPORT
+        + "".join(
+            f"{WEEK} {SECONDS + k} 49 00 0{k % 10}.5 8 24 00.1 160.1 0.1 0.1 0.2 1\n" for k in range(20)
+        ),
+    ),
+    "CSV of positions": functools.partial(
+        positions,
+        "a.csv",
+        "Time;Lat;Lon;H-Ell;sdE;sdN;sdU\n"
+        + "".join(f"{moment(ns).isoformat()};49,0;8,4;160,1;0,1;0,1;0,2\n" for ns in FIXES),
+    ),
     "LAS": functools.partial(cloud, ".las"),
     "LAZ": functools.partial(cloud, ".laz"),
     "settings": settings,

@@ -41,6 +41,8 @@ EXPECTED = (
     " H-Ell"
 )
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
+LARGEST, LATEST_S = 1e19, (LAST_YEAR - 1970) * 366 * DAY_S
+"""No number of a table is larger, and no time of a drive is later."""
 MONTHS_FIRST = (2, 0, 1)
 """Month, day, year, as Inertial Explorer has a date that does not begin with the year."""
 
@@ -77,7 +79,7 @@ def read(path: Path, near_ns: int | None, has_stddevs: bool) -> Positions:
     """Positions of a table, at most ten a second; raises DataError where it is none, or tells no accuracy."""
     table = _opened(path)
     moments, system = _moments(table, near_ns, path)
-    count, usable = len(moments), np.isfinite(moments)
+    count, usable = len(moments), np.abs(moments) < LATEST_S
     rows = np.flatnonzero(usable)
     if len(rows) and (np.diff(moments[rows]) > 0).all():
         rows = rows[thinned(moments[rows])]
@@ -169,7 +171,7 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
         return np.where(clock >= DAY_S, sundays, days) + clock, "gps" if is_gps else "utc"
     column = table.columns[name]
     clock = clock * (column.scale if column.unit else unix_scale(clock))
-    known = np.isfinite(clock)
+    known = np.abs(clock) < LATEST_S
     if not known.any() or np.median(clock[known]) > 2 * WEEK_S:
         return clock, "utc"
     return _nearest(clock, known, is_of_day=":" in texts[int(np.argmax(known))], near_ns=near_ns, path=path)
@@ -239,6 +241,7 @@ def _degrees(text: str) -> float:
 
 def _number(text: str) -> float:
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return float("nan")
+    return number if abs(number) < LARGEST else float("nan")

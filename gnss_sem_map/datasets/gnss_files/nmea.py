@@ -33,7 +33,12 @@ MODES = {"R": 4, "F": 5, "P": 2, "D": 2, "A": 1}
 """Quality of a mode of GNS, of which each system has one, and of RMC; the best counts. Others are no measurements."""
 FLAT_STDDEV_M = 100.0
 """Of the height 0 m of a fix without one."""
-USED = ("GGA", "GNS", "RMC", "ZDA", "GST", "VTG", "HDT", "THS")
+USED = {
+    "GGA": "time lat lon quality HDOP alt sep", "GNS": "time lat lon posMode HDOP alt sep",
+    "RMC": "time status lat lon spd cog date", "ZDA": "time day month year", "GST": "time stdLat stdLong stdAlt",
+    "VTG": "cogt sogn", "HDT": "headingT", "THS": "headt mi",
+}  # fmt: skip
+"""Sentences, and their fields that are read; one without some of them was cut."""
 SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{2}}))?")
 """What stands between $ and *, and the checksum behind it, if there is one."""
 TIMELESS = ("VTG", "HDT", "THS")
@@ -205,7 +210,10 @@ def _sentence(body: str, checksum: str) -> Any:
     from pynmeagps import NMEAReader, exceptions
 
     try:
-        return NMEAReader.parse(f"${body}*{checksum}\r\n")
+        sentence = NMEAReader.parse(f"${body}*{checksum}\r\n")
+        return (
+            sentence if all(map(sentence.__dict__.__contains__, USED[sentence.msgID].split())) else "damaged"
+        )
     except (
         exceptions.NMEAParseError,
         exceptions.NMEAMessageError,
@@ -253,7 +261,8 @@ def _quality(sentence: Any) -> int | None:
 
 def _fault(sentence: Any, clock: int | None) -> str:
     """Why a sentence is no fix; empty if it is one."""
-    if clock is None or _quality(sentence) is None or not isinstance(sentence.lat, float):
+    is_placed = isinstance(sentence.lat, float) and isinstance(sentence.lon, float)
+    if clock is None or _quality(sentence) is None or not is_placed:
         return f"no fix (quality {getattr(sentence, 'quality', getattr(sentence, 'posMode', ''))})"
     if sentence.msgID != "RMC" and not isinstance(sentence.alt, float):
         return "no height"

@@ -45,6 +45,8 @@ BEHIND = 17
 of the velocity as of the position. Deviations and covariances are of the axes 1, 2, 3, 12, 23 and 31."""
 VELOCITIES, LEAST_VELOCITY_STDDEV = re.compile(r"v[nx]\(m/s\)"), 0.01
 """Name of the first column of velocities; no velocity is believed more than by the second, m/s."""
+LARGEST = 1e9
+"""No number of a solution is larger."""
 ENU_OF_NEU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 JST_NS = 9 * 3600 * 10**9
 FIELDS = re.compile(r"[;,\s]+")
@@ -126,6 +128,8 @@ def _row(line: str, form: Form) -> tuple[int, tuple[float, ...]] | None:
         best = BEST_M[float(words[end])]  # tools write 1.0
         behind = [float(word) for word in words[end + 2 : end + 2 + BEHIND] if word]
     except (ValueError, IndexError, KeyError, OverflowError):
+        return None
+    if not all(abs(number) < LARGEST for number in (*place, *behind)):
         return None
     if len(behind) < 3:
         behind = []

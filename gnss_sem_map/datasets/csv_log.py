@@ -10,7 +10,8 @@
                                                        or by `speed_unit` in log.yaml
     control_points.csv  optional: surveyed points, see `factor_graphs.csv_log.read_points`
     log.yaml            optional: see `log_yaml.LogFile`
-    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp];
+    lidar/stamps.csv    number,stamp_s             lidar/<number>.bin     float32 rows x y z intensity [time - stamp],
+                                                       or text in <number>.txt;
                                                        intensity from 0 to 1, or to `intensity_max` in log.yaml
     images/stamps.csv   number,stamp_s             images/<number>.png    or .jpg
 
@@ -277,7 +278,7 @@ def _lidars(drive: Path, about: LogFile) -> tuple[tuple[Lidar, ...], list[Skip]]
 
 
 def _scans(folder: Path, about: LidarFile, epoch_ns: int) -> tuple[tuple[Scan, ...], list[Skip]]:
-    found, skips = _stamped("scan", folder, epoch_ns, ".bin")
+    found, skips = _stamped("scan", folder, epoch_ns, *frames.SCAN_SUFFIXES)
     scans = [
         Scan(path.stem, n, t, partial(_read_scan, path, t, about, frames.state_of(path)))
         for n, t, path in found

@@ -51,6 +51,15 @@ def kitti(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     return Reader((drive / name).resolve(), _whole_drive(drive), mutate)
 
 
+def scan_of_text(folder: Path) -> Reader:
+    """A scan as `_extract` drives of KITTI have it."""
+    drive = small_street(folder).drive
+    scan = min((drive / "velodyne_points/data").glob("*.bin"))
+    np.savetxt(scan.with_suffix(".txt"), np.fromfile(scan, "<f4").reshape(-1, 4), fmt="%.6g")
+    scan.unlink()
+    return Reader(scan.with_suffix(".txt"), _whole_drive(drive), mutations.text)
+
+
 def odometry(name: str, mutate: Callable[..., bytes], folder: Path) -> Reader:
     """A file of an odometry sequence."""
     sequence = street.write_odometry(folder, small_street(folder / "street"))
@@ -395,6 +404,7 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "stamps.csv": functools.partial(table, "lidar/stamps.csv", mutations.text),
     "scan of four columns": functools.partial(kitti, "velodyne_points/data/0000000000.bin", mutations.floats),
     "scan of five columns": scan,
+    "scan of text": scan_of_text,
     "PNG": functools.partial(picture, ".png", mutations.png),
     "JPEG": functools.partial(picture, ".jpg", mutations.binary),
     "label PNG": label_image,

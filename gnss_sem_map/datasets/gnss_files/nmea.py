@@ -39,7 +39,7 @@ USED = {
     "VTG": "cogt sogn", "HDT": "headingT", "THS": "headt mi",
 }  # fmt: skip
 """Sentences, and their fields that are read; one without some of them was cut."""
-SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{2}}))?")
+SENTENCE = re.compile(rf"\$([A-Z]{{2}}(?:{'|'.join(USED)}),[^$*\r\n]*)(?:\*([0-9A-Fa-f]{{1,2}}))?")
 """What stands between $ and *, and the checksum behind it, if there is one."""
 TIMELESS = ("VTG", "HDT", "THS")
 MPS_PER_KNOT = 1852 / 3600
@@ -209,8 +209,12 @@ def _sentences(lines: list[str]) -> Iterator[Any]:
 def _sentence(body: str, checksum: str) -> Any:
     from pynmeagps import NMEAReader, exceptions
 
+    if int(checksum, 16) != reduce(xor, body.encode("utf-8"), 0):
+        return "wrong checksum"
+    if body[2:5] == "GGA":  # the name of a station behind, which is to be a number, is not of interest
+        body = ",".join(body.split(",")[:13]) + ",,"
     try:
-        sentence = NMEAReader.parse(f"${body}*{checksum}\r\n")
+        sentence = NMEAReader.parse(f"${body}*{checksum}\r\n", validate=0)
         return (
             sentence if all(map(sentence.__dict__.__contains__, USED[sentence.msgID].split())) else "damaged"
         )
@@ -219,8 +223,8 @@ def _sentence(body: str, checksum: str) -> Any:
         exceptions.NMEAMessageError,
         exceptions.NMEATypeError,
         ValueError,
-    ) as error:
-        return "wrong checksum" if "checksum" in str(error) else "damaged"
+    ):
+        return "damaged"
 
 
 def _moment_ns(sentence: Any) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -202,6 +203,25 @@ def test_sentences_in_a_log_of_android(tmp_path: Path, ending: str) -> None:
     ]
     path.write_text("\n".join(lines) + "\n")
     np.testing.assert_allclose(read(path).rows[:, :4], [[k, 49, 8.4, 160.1] for k in range(3)], atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "change", [str.lower, lambda end: end.replace("*0", "*")], ids=["lower case", "one digit"]
+)
+def test_a_right_checksum_is_one_however_it_is_written(tmp_path: Path, change: Callable[[str], str]) -> None:
+    found = [rmc(START_NS)]
+    for k in range(40):
+        body, _, end = gga(START_NS + k * 10**9).partition("*")
+        found.append(body + change("*" + end))
+    path = nmea(tmp_path, *found)
+    assert len(read(path).rows) == 40
+
+
+def test_the_name_of_a_base_station_does_no_harm(tmp_path: Path) -> None:
+    body = gga(START_NS).partition("*")[0].rstrip(",") + ",1.0,TOWN"
+    checksum = reduce(xor, body[1:].encode())
+    path = nmea(tmp_path, rmc(START_NS), f"{body}*{checksum:02X}\n")
+    np.testing.assert_allclose(read(path).rows[:, :4], [[0, 49, 8.4, 160.1]], atol=1e-7)
 
 
 def test_heights_of_nmea_above_a_geoid_that_the_log_tells(tmp_path: Path) -> None:

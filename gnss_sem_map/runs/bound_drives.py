@@ -96,7 +96,7 @@ def bind_drives(
     """Locate the drives that may have passed the same places, and bind those that did, and what is near a `base`.
 
     `tracks` are of drives by name; a drive without one, or that cannot be located, is left as it is. Raises DataError
-    where the base holds none of them, unless by `force`: then it is a warning.
+    where the base fits to none of them, unless by `force`: then it is a warning.
     """
     settings = run.settings
     if not (settings.trajectory.revisits.enabled and settings.trajectory.lidar_odometry):
@@ -126,7 +126,7 @@ def bind_drives(
 def _with_unheld(
     names: Sequence[str], tracks: Mapping[str, KnownTrack], bound: BoundDrives, base: BaseCloud, force: bool
 ) -> BoundDrives:
-    """With a warning for each drive that a base does not hold; raises DataError where it holds none."""
+    """With a warning for each drive that a base does not hold; raises DataError where it fits to none."""
     held, before = {base.name}, 0
     while len(held) > before:  # by others, too
         before = len(held)
@@ -134,23 +134,21 @@ def _with_unheld(
             name for row in bound.passes if row.bound and held & {row.first, row.second}
             for name in (row.first, row.second)
         }  # fmt: skip
-    warnings = []
+    warnings, fits = [], len(held) > 1
     for name in [name for name in names if name not in held]:
         found = max(
             (row.places for row in bound.passes if {row.first, row.second} == {name, base.name}), default=0
         )
-        fit = (
-            f"{found} of its {bound.places[name]} places fit"
-            if name in bound.places
-            else "none of its places is near"
-        )
+        tried = bound.places.get(name, 0)
+        fits |= 0 < tried <= 2 * found  # of the right place, but too short a drive to hold it
+        fit = f"{found} of its {tried} places fit" if tried else "none of its places is near"
         aside_m, below_m = base.beside(tracks[name].positions) if name in tracks else (np.nan, np.nan)
         warnings.append(
             f"{name}: not held onto {base.name}: {fit}; the cloud begins {aside_m:.1f} m"
             f" aside of its track, and lies {abs(below_m):.1f} m {'above' if below_m < 0 else 'below'} it; is it of"
             " this place, with heights above the ellipsoid, or the CRS of its heights?"
         )
-    if warnings and len(held) == 1 and not force:
+    if warnings and not fits and not force:
         raise DataError(f"{warnings[0]} correct it, leave --align-to out, or run with --force")
     return replace(bound, warnings=(*bound.warnings, *warnings))
 

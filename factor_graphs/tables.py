@@ -22,7 +22,10 @@ SEPARATORS = ";\t|,"
 COMMENT = re.compile(r"^\s*(?:#|%|//)+\s*")
 BRACKETS = re.compile(r"^(.*?)\s*[\[(<{]\s*([^\])>}]*)[\])>}]?\s*$")
 NUMBER_CELL = re.compile(r"^\s*[+-]?(nan|inf|[0-9]*[.,]?[0-9]+[.,]?(e[+-]?[0-9]+)?)\s*$", re.IGNORECASE)
+SPELLED = str.maketrans({"²": "2", "µ": "u", "μ": "u", "°": "deg"})
 DECIMAL_COMMA = re.compile(r"^\s*[+-]?[0-9]*,[0-9]+\s*$")
+
+DECIMAL_POINT = re.compile(r"^\s*[+-]?[0-9]*\.[0-9]+\s*$")
 
 _SCALES: dict[str, dict[float, str]] = {
     "time": {
@@ -148,15 +151,14 @@ def layout_of(content: bytes, wanted: Collection[str], most: Collection[str] = (
         header, at, rest = _with_units(lines[at], header, lines[rest[0]]), rest[0], rest[1:]
     separator, is_ended = _separator([lines[k] for k in rest], len(header), header_separator)
     cells = [cell for k in rest for cell in _cells(lines[k], separator)]
-    decimal = "," if separator != "," and any(map(DECIMAL_COMMA.match, cells)) else "."
+    has_commas = any(map(DECIMAL_COMMA.match, cells)) and not any(map(DECIMAL_POINT.match, cells))
+    decimal = "," if separator != "," and has_commas else "."
     rows = memoryview(content)[_end_of_line(content, at - 1) :]
     if any(b"\n" + mark in content for mark in (b"#", b"%", b"//", b" #", b"\t#")):
         rows = memoryview(re.sub(rb"(?<=\n)[ \t]*(?:#|%|//).*\n?", b"", rows))
     if separator == " ":
-        rows, separator = (
-            memoryview(b"\n".join(b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))),
-            "\t",
-        )
+        by_tabs = b"\n".join(b"\t".join(row.split()) for row in bytes(rows).split(b"\n"))
+        rows, separator = memoryview(by_tabs), "\t"
     return Layout([*header, ""] if is_ended else header, rows, separator, decimal)
 
 
@@ -181,9 +183,7 @@ def _header_line(lines: list[str], wanted: Collection[str], most: Collection[str
     scores = []
     for line in lines:
         layout = Layout(_split(COMMENT.sub("", line))[0], memoryview(b""))
-        scores.append(
-            sum(_has(layout, name) for name in wanted) + 1e-3 * sum(_has(layout, name) for name in most)
-        )
+        scores.append(sum(_has(layout, n) for n in wanted) + 1e-3 * sum(_has(layout, n) for n in most))
         if scores[-1] >= len(wanted) > 0:
             return len(scores) - 1
     if max(scores) >= 1:
@@ -249,15 +249,7 @@ def _with_units(names: str, header: list[str], below: str) -> list[str]:
 
 def _letters(text: str) -> str:
     """Letters, digits and percent signs of a name or a unit, in lower case; units are spelled out."""
-    text = (
-        text.strip()
-        .strip('"')
-        .lower()
-        .replace("²", "2")
-        .replace("µ", "u")
-        .replace("μ", "u")
-        .replace("°", "deg")
-    )
+    text = text.strip().strip('"').lower().translate(SPELLED)
     return re.sub("[^a-z0-9%]", "", text.removeprefix("field."))
 
 

@@ -146,7 +146,11 @@ def _fix_rows(drive: Path, about: LogFile, imu_stamps: Array | None) -> tuple[Ar
     """The rows of the receiver that are valid fixes, in file order, and the skipped rows."""
     path, skips = drive / "gnss.csv", []
     if about.gnss_file is None:
-        given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
+        try:
+            given = _numbers(path, GNSS_COLUMNS, LONGEST_FIX_STEP_S, about, MORE_COLUMNS)
+        except DataError as error:
+            other = f"a table without deviations, or above a geoid: `gnss_file: {{path: {path.name}}}` in log.yaml"
+            raise DataError(f"{error}; {other}") from None
     elif is_file(path) and about.gnss_file.path != path.name:
         raise DataError(f"{shown(path)}: there is a gnss_file in log.yaml as well; remove one of the two")
     else:

@@ -87,3 +87,23 @@ def test_a_bag_may_have_its_positions_in_a_file(tmp_path: Path) -> None:
     assert len(positions_of(log)) == 4
     assert log.epoch_ns == pytest.approx(START_NS, abs=1000)
     assert log.scans[0].stamp == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_gnss_csv_without_deviations_names_the_setting_with_which_it_is_read(tmp_path: Path) -> None:
+    rows = "".join(f"{t:.2f},0.1,0,9.81,0,0,0.01\n" for t in np.arange(0, 20, 0.01))
+    (tmp_path / "imu.csv").write_text("stamp_s,ax,ay,az,wx,wy,wz\n" + rows)
+    fixes = "".join(f"{START_NS / 1e9 + k:.3f};49.00{k:02d}1;8.4;111.6\n" for k in range(20))
+    (tmp_path / "gnss.csv").write_text("Time;Latitude;Longitude;H-MSL\n" + fixes)
+    about: dict[str, object] = {"epoch_ns": START_NS}
+    (tmp_path / "log.yaml").write_text(json.dumps(about))
+    with pytest.raises(
+        DataError, match=r"column alt_m is missing.*`gnss_file: \{path: gnss\.csv\}` in log\.yaml"
+    ):
+        open_drive(tmp_path)
+    about["gnss_file"] = {"path": "gnss.csv", "stddevs_m": [2, 2, 4], "geoid": 48.5}
+    (tmp_path / "log.yaml").write_text(json.dumps(about))
+    log = open_drive(tmp_path)
+    assert log.frame is not None
+    assert log.frame.alt_m == pytest.approx(160.1)
+    assert log.gnss is not None
+    np.testing.assert_allclose(log.gnss.stamps, np.arange(20.0), atol=1e-5)

@@ -417,6 +417,15 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "RTKLIB": functools.partial(
         positions, "a.pos", SOLUTION + "\n".join(pos_row(ns + LEAP_NS) for ns in FIXES)
     ),
+    "RTKLIB, baselines": functools.partial(
+        positions,
+        "a.LLH",
+        "% ref pos : 49.0 8.4 150.0\n%  GPST;e-baseline(m);n-baseline(m);u-baseline(m);Q\n"
+        + "".join(
+            f"{moment(ns + LEAP_NS):%Y/%m/%d %H:%M:%S.000};1.5;2.5;3.5;1;9;0.1;0.1;0.1;0;0;0\n"
+            for ns in FIXES
+        ),
+    ),
     "NMEA": functools.partial(positions, "a.nmea", "".join(rmc(ns) + gga(ns) for ns in FIXES)),
     "Inertial Explorer": functools.partial(
         positions,

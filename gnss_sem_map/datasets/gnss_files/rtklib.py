@@ -165,14 +165,12 @@ def _base(path: Path, header: list[str]) -> LocalFrame:
     """The frame of baselines, at the place that the header tells."""
     for line in header:
         if "ref pos" in line and ":" in line:
-            numbers = [float(word) for word in re.findall(r"[-+]?[0-9.]+", line.partition(":")[2])]
-            if len(numbers) == 7:  # with minutes and seconds
-                words = re.findall(r"[-+]?[0-9.]+", line.partition(":")[2])
-                numbers = [_degrees(words[:3]), _degrees(words[3:6]), numbers[6]]
-            if len(numbers) == 3 and abs(numbers[0]) > 90:
-                numbers = geodetic_of_ecef(np.array([numbers]))[0].tolist()
-            if len(numbers) == 3:
-                return LocalFrame(*numbers)
+            words = re.findall(r"[-+]?[0-9]+\.?[0-9]*", line.partition(":")[2])
+            if len(words) == 7:  # with minutes and seconds
+                return LocalFrame(_degrees(words[:3]), _degrees(words[3:6]), float(words[6]))
+            if len(words) == 3:
+                place = np.array([[float(word) for word in words]])
+                return LocalFrame(*(geodetic_of_ecef(place) if abs(place[0, 0]) > 90 else place)[0].tolist())
     raise DataError(
         f"{shown(path)}: its positions are baselines, and no `ref pos` in its header says from where; add the line"
         " `% ref pos : LAT LON HEIGHT`, or solve with out-solformat=llh"

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from laspy import LasHeader
 
 HEADER_BYTES, VLR_BYTES, EVLR_BYTES = 375, 54, 60
+MOST_CHUNK_BYTES = 256 << 20
+"""Of points, expanded: a chunk is expanded as a whole."""
 LAYERS, MORE_LAYERS = 9, {7: 1, 8: 2, 9: 1, 10: 3}
 """Of compressed points of format 6, and further ones of other formats; each extra byte has one of its own."""
 
@@ -44,26 +46,30 @@ def checked(file: BinaryIO, path: Path) -> BinaryIO:
     return file
 
 
-def check_layers(file: BinaryIO, header: LasHeader, path: Path) -> None:
-    """Raise DataError where the layers of a chunk, in which LAZ of LAS 1.4 has its points, are larger than it is.
+def check_chunks(file: BinaryIO, header: LasHeader, path: Path) -> None:
+    """Raise DataError where chunks of a LAZ are larger than it, or the layers of one, from LAS 1.4 on, than the chunk.
 
     Raises LazrsError for a table of chunks that is damaged.
     """
     import lazrs
 
-    if not header.are_points_compressed or header.point_format.id < 6:
+    if not header.are_points_compressed:
         return
     [about] = header.vlrs.get("LasZipVlr")[:1] or [None]
     if about is None:
         raise DataError(f"{shown(path)}: is compressed and has no LASzip record; is it damaged?")
-    record = header.point_format.size
+    vlr, record, before = lazrs.LazVlr(about.record_data), header.point_format.size, file.tell()
     layers = LAYERS + MORE_LAYERS.get(header.point_format.id, 0) + header.point_format.num_extra_bytes
-    before = file.tell()
     file.seek(header.offset_to_point_data)
-    table, at = lazrs.read_chunk_table(file, lazrs.LazVlr(about.record_data)), header.offset_to_point_data + 8
-    for _, there in table:
-        file.seek(at + record + 4)
-        _refuse("layers of points", sum(struct.unpack(f"<{layers}I", file.read(4 * layers))), there, path)
+    table, at = lazrs.read_chunk_table(file, vlr), header.offset_to_point_data + 8
+    size = os.fstat(file.fileno()).st_size
+    for points, there in [(0 if vlr.uses_variable_size_chunks() else vlr.chunk_size(), 0), *table]:
+        _refuse("points of a chunk", points * record, MOST_CHUNK_BYTES, path)
+        _refuse("chunks", at + there, size, path)
+        if there and header.point_format.id >= 6:
+            file.seek(at + record + 4)
+            sizes = struct.unpack(f"<{layers}I", file.read(4 * layers))
+            _refuse("layers of points", sum(sizes), there, path)
         at += there
     file.seek(before)
 

@@ -16,7 +16,7 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
 
 from factor_graphs.geodesy import LocalFrame
-from gnss_sem_map.datasets.las_sizes import check_layers, checked
+from gnss_sem_map.datasets.las_sizes import check_chunks, checked
 from gnss_sem_map.errors import DataError, one_line
 from gnss_sem_map.files.geoid import undulation
 from gnss_sem_map.files.untrusted import open_file, shown
@@ -53,7 +53,7 @@ def read_base(path: Path, frame: LocalFrame, geoid: Path | None = None) -> BaseC
             os.fdopen(open_file(path), "rb") as file,
             laspy.open(checked(file, path), closefd=False) as reader,
         ):
-            check_layers(file, reader.header, path)
+            check_chunks(file, reader.header, path)
             placing = _Placing.of(reader.header, path, frame, geoid)
             for points in reader.chunk_iterator(max(CHUNK_BYTES // reader.header.point_format.size, 1)):
                 some = (

@@ -185,7 +185,7 @@ def positions(name: str, content: str, folder: Path) -> Reader:
     return Reader(file, lambda: read(file), mutations.text)
 
 
-def cloud(suffix: str, folder: Path) -> Reader:
+def cloud(suffix: str, point_format: int, folder: Path) -> Reader:
     """A georeferenced point cloud that drives are held onto."""
     import laspy
     from pyproj import CRS
@@ -193,7 +193,7 @@ def cloud(suffix: str, folder: Path) -> Reader:
     from gnss_sem_map.datasets.laz_cloud import read_base
 
     folder.mkdir(parents=True)
-    file, header = folder / f"cloud{suffix}", laspy.LasHeader(point_format=6, version="1.4")
+    file, header = folder / f"cloud{suffix}", laspy.LasHeader(point_format=point_format, version="1.4")
     header.add_crs(CRS.from_epsg(street.FRAME.utm_epsg))
     x, y = Transformer.from_crs(4326, street.FRAME.utm_epsg, always_xy=True).transform(
         street.FRAME.lon_deg, street.FRAME.lat_deg
@@ -441,8 +441,9 @@ READERS: dict[str, Callable[[Path], Reader]] = {
         "Time;Lat;Lon;H-Ell;sdE;sdN;sdU\n"
         + "".join(f"{moment(ns).isoformat()};49,0;8,4;160,1;0,1;0,1;0,2\n" for ns in FIXES),
     ),
-    "LAS": functools.partial(cloud, ".las"),
-    "LAZ": functools.partial(cloud, ".laz"),
+    "LAS": functools.partial(cloud, ".las", 6),
+    "LAZ": functools.partial(cloud, ".laz", 7),
+    "LAZ before 1.4": functools.partial(cloud, ".laz", 1),
     "settings": settings,
     "--set": one_setting,
     "segmenter": segmenter,

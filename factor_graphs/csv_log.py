@@ -253,7 +253,7 @@ def _in_our_units(
 
     for name, column in columns.items():
         if name == STAMP and epoch_ns is not None:
-            values = seconds_of_dates(table[name], epoch_ns)
+            values = seconds_of_dates(table[name].to_pylist(), epoch_ns)
         elif kinds[name] == "string":
             continue
         else:

@@ -160,10 +160,8 @@ def _moments(table: _Table, near_ns: int | None, path: Path) -> tuple[Array, Sys
     texts = table.texts(name)
     label = table.layout.header[table.columns[name].at].lower()
     is_gps = name == "sow" or label.startswith(("gps", "hr"))  # CSRS-PPP has GPS time
-    if any(re.match(DATE, text) for text in texts[:100]):
-        import pyarrow as pa
-
-        return seconds_of_dates(pa.chunked_array([texts]), 0), "gps" if is_gps else "utc"
+    if any(map(DATE.fullmatch, texts[:100])):
+        return seconds_of_dates(texts, 0), "gps" if is_gps else "utc"
     clock = np.array([_clock(text) for text in texts])
     if table.has("date"):
         days = _days(table.texts("date"))
